@@ -20,7 +20,6 @@ COVERED_BY = {
     "envs/experts/noise.py": "envs/experts/test_avoiding.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/experts/recording_report.py": "envs/experts/test_demonstrations.py",
-    "envs/mujoco/inverse_kinematics.py": "envs/experts/test_stacking.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
     "envs/mujoco/linear_algebra.py": "envs/mujoco/test_controller.py",
     "envs/mujoco/mjcf.py": "envs/mujoco/test_panda.py",

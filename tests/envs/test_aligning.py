@@ -8,15 +8,19 @@ import math
 import numpy as np
 import pytest
 import torch
-from env_test_base import ContextTestBase, act, recorded_contexts, recorded_state
-from shared_data import SHARED
+from env_test_base import (
+    ContextTestBase,
+    act,
+    assert_starts_as_recorded,
+    contexts_of,
+    recordings_of,
+    replay,
+    start_recorded,
+)
 
 from torchrl_koap.envs import AligningEnv
 from torchrl_koap.envs.aligning import INSIDE_REACH, WALLS, mode_index
 from torchrl_koap.envs.contexts import yaw_quaternions
-
-RECORDINGS = SHARED / "d3il_reference" / "aligning.npz"
-needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
 
 SENSITIVE = 1  # the recorded episode in which a start error of 1e-8 rad grows to millimetres
 CONTEXT = np.array([[(0.5, -0.15, 0.3), (0.55, 0.3, -0.7)]])
@@ -35,35 +39,29 @@ def put(env, tray, tcp=None):
         env.sims._tcp_views[0][:] = tcp
 
 
-@needs_recordings
 def test_parity_with_the_original():
-    recorded = np.load(RECORDINGS)
-    lengths, names = recorded["n_steps"], range(4)
+    recorded = recordings_of("aligning")
     env = AligningEnv(4, max_steps=1000, dtype=torch.float64)
-    first = env.reset(contexts=recorded_contexts(recorded, 2))
-    for i in names:
-        np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
-        np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
+    first = env.reset(contexts=contexts_of(recorded, 2))
+    assert_starts_as_recorded(env, recorded)
+    for i in range(4):
         np.testing.assert_allclose(first["observation"][i, 3:], recorded[f"ep{i}_init_obs"], rtol=0, atol=1e-7)
-        env.set_physics(i, **recorded_state(recorded, i))
+    start_recorded(env, recorded)
     first_contact = np.append(np.flatnonzero(recorded[f"ep{SENSITIVE}_robot_touches_object"]), 10**6)[0]
     success_told = np.zeros(4, dtype=bool)
-    for k in range(max(lengths)):
-        running = lengths > k
-        targets = np.stack([recorded[f"ep{i}_action"][min(k, lengths[i] - 1), :3] for i in names])
-        out = act(env, torch.as_tensor(targets - env.commands[:, :3]), running)
-        for i in np.flatnonzero(running):
-            where = f"episode {i}, step {k}"
-            assert out["done"][i].item() == bool(recorded[f"ep{i}_done"][k]), where
-            assert out["mode"][i].item() == recorded[f"ep{i}_mode"][k], where
-            success_told[i] = recorded[f"ep{i}_success"][k]
-            if i == SENSITIVE and k >= first_contact:
-                continue
-            assert np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max() < 1e-6, where
-            qpos = np.abs(env.sims.data[i].qpos - recorded[f"ep{i}_qpos"][k])
-            assert qpos[:3].max() < 1e-5 and qpos[3:].max() < 1e-5, where  # tray (m); its rotation and the joints
-            observed = np.abs(out["observation"][i, 3:].numpy() - recorded[f"ep{i}_obs_step"][k]).max()
-            assert observed < 1e-6, where  # recorded in float32
+
+    def check(i, k, out, where):
+        assert out["done"][i].item() == bool(recorded[f"ep{i}_done"][k]), where
+        assert out["mode"][i].item() == recorded[f"ep{i}_mode"][k], where
+        success_told[i] = recorded[f"ep{i}_success"][k]
+        if i == SENSITIVE and k >= first_contact:
+            return
+        assert np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max() < 1e-6, where
+        assert np.abs(env.sims.data[i].qpos - recorded[f"ep{i}_qpos"][k]).max() < 1e-5, where
+        observed = np.abs(out["observation"][i, 3:].numpy() - recorded[f"ep{i}_obs_step"][k]).max()
+        assert observed < 1e-6, where  # recorded in float32
+
+    out = replay(env, recorded, check, 3)
     # the original tells success with the step that reaches it, this environment with the one that ends the episode
     assert out["success"][:, 0].tolist() == success_told.tolist() == [True, False, False, False]
 

@@ -9,16 +9,14 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from env_test_base import EnvTestBase, act, recorded_state
-from shared_data import HUMAN, SHARED
+from env_test_base import EnvTestBase, act, assert_starts_as_recorded, recordings_of, replay, start_recorded
+from shared_data import HUMAN
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import StepCounter
 
 from torchrl_koap.envs.avoiding import OBSTACLES, AvoidingEnv, mode_index
 
-RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
-needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
 needs_human = pytest.mark.skipif(not HUMAN.exists(), reason=f"no human demonstrations at {HUMAN}")
 
 # head on into the cylinder of the first row
@@ -33,40 +31,29 @@ class TestAvoidingEnv(EnvTestBase):
     STEPS = 40  # one of them touches a cylinder by then
 
 
-def commanded(env, targets, mask):
-    """One step whose commands are ``targets`` [n, 2], given as absolute positions."""
-    return act(env, torch.as_tensor(targets - env.commands[:, :2]), mask)
-
-
-@needs_recordings
 @pytest.mark.parametrize("start", ["reset", "recorded state"])
 def test_parity_with_the_original(start):
-    recorded = np.load(RECORDINGS)
-    lengths, names = recorded["n_steps"], range(4)
+    recorded = recordings_of("avoiding")
     env = AvoidingEnv(4, max_steps=1000, dtype=torch.float64)
     first = env.reset()
     if start == "recorded state":
-        for i in names:
-            env.set_physics(i, **recorded_state(recorded, i))
-    for i in names:
-        np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
-        np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
+        start_recorded(env, recorded)
+    assert_starts_as_recorded(env, recorded)
+    for i in range(4):
         np.testing.assert_allclose(first["observation"][i, 2:], recorded[f"ep{i}_init_obs"], rtol=0, atol=1e-7)
-    for k in range(max(lengths)):
-        running = lengths > k
-        targets = np.stack([recorded[f"ep{i}_action"][min(k, lengths[i] - 1), :2] for i in names])
-        out = commanded(env, targets, running)
-        contacts = env.obstacle_contacts()
-        for i in np.flatnonzero(running):
-            where = f"episode {i}, step {k}"
-            deviation = np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max()
-            assert deviation < 1e-9, where  # 1e-6 mm, whole episodes, the collision included
-            observed = np.abs(out["observation"][i, 2:].numpy() - recorded[f"ep{i}_obs_step"][k]).max()
-            assert observed < 1e-7, where  # recorded in float32
-            assert out["success"][i].item() == bool(recorded[f"ep{i}_success"][k]), where
-            assert out["done"][i].item() == bool(recorded[f"ep{i}_done"][k]), where
-            assert out["mode"][i].int().tolist() == recorded[f"ep{i}_mode"][k].tolist(), where
-            assert contacts[i].astype(int).tolist() == recorded[f"ep{i}_obstacle_contact"][k].tolist(), where
+
+    def check(i, k, out, where):
+        deviation = np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max()
+        assert deviation < 1e-9, where  # 1e-6 mm, whole episodes, the collision included
+        observed = np.abs(out["observation"][i, 2:].numpy() - recorded[f"ep{i}_obs_step"][k]).max()
+        assert observed < 1e-7, where  # recorded in float32
+        assert out["success"][i].item() == bool(recorded[f"ep{i}_success"][k]), where
+        assert out["done"][i].item() == bool(recorded[f"ep{i}_done"][k]), where
+        assert out["mode"][i].int().tolist() == recorded[f"ep{i}_mode"][k].tolist(), where
+        contacts = env.obstacle_contacts()[i].astype(int).tolist()
+        assert contacts == recorded[f"ep{i}_obstacle_contact"][k].tolist(), where
+
+    replay(env, recorded, check, 2)
 
 
 @needs_human
@@ -80,7 +67,7 @@ def test_human_demonstrations_replay_to_their_own_logs():
     deviation = {}
     for k in range(lengths.max()):
         targets = np.stack([log["des_c_pos"][min(k, len(log["c_pos"]) - 1), :2] for log in logs])
-        out = commanded(env, targets, lengths > k)
+        out = act(env, torch.as_tensor(targets - env.commands[:, :2]), lengths > k)
         row = env.raw_log()
         for i in np.flatnonzero(lengths > k):
             for name, value in row.items():

@@ -9,16 +9,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from env_test_base import ContextTestBase, act, recorded_contexts, recorded_state
-from shared_data import SHARED
+from env_test_base import ContextTestBase, act, contexts_of, recordings_of, replay, start_recorded
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import SortingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.sorting import BIN_X, BIN_Y, box_colours, mode_colours, mode_index
 
-RECORDINGS = SHARED / "d3il_reference" / "sorting.npz"
-needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
 SENSITIVE = (1, 2)  # episodes in which a change of 1e-8 rad grows to millimetres
 INTO_BOXES = torch.tensor([0.001, 0.010], dtype=torch.float64)
 
@@ -28,34 +25,20 @@ class TestSortingEnv(ContextTestBase):
     PUSH = INTO_BOXES.tolist()
 
 
-def replay(env, recorded, check):
-    """Sends the recorded commands; ``check(episode, step, leaves)`` after every control step."""
-    lengths = recorded["n_steps"]
-    for k in range(max(lengths)):
-        running = lengths > k
-        targets = np.stack([recorded[f"ep{i}_action"][min(k, lengths[i] - 1), :2] for i in range(4)])
-        out = act(env, torch.as_tensor(targets - env.commands[:, :2]), running)
-        for i in np.flatnonzero(running):
-            check(i, k, out)
-
-
 def packed(mode):
     """The byte the original shows: unfilled entries are -1, which packs as 1; four more bits are 0."""
     return int(np.packbits(np.append(np.asarray(mode) != 0, np.zeros(4, bool)))[0])
 
 
-@needs_recordings
 def test_parity_with_the_original_from_its_state():
-    recorded = np.load(RECORDINGS)
-    env = SortingEnv(4, max_steps=1000, dtype=torch.float64, contexts=recorded_contexts(recorded, 4))
+    recorded = recordings_of("sorting")
+    env = SortingEnv(4, max_steps=1000, dtype=torch.float64, contexts=contexts_of(recorded, 4))
     env.reset()
-    for i in range(4):
-        env.set_physics(i, **recorded_state(recorded, i))
+    start_recorded(env, recorded)
     touched = [False] * 4
     worst = {"tcp": np.zeros(4), "objects": np.zeros(4)}
 
-    def check(i, k, out):
-        where = f"episode {i}, step {k}"
+    def check(i, k, out, where):
         touched[i] |= bool(recorded[f"ep{i}_robot_touches_object"][k])
         if not (i in SENSITIVE and touched[i]):
             tcp = np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max()
@@ -70,28 +53,27 @@ def test_parity_with_the_original_from_its_state():
         third = recorded[f"ep{i}_min_inds"][k]  # there blue boxes count from 3
         assert env.arrivals[i].tolist() == np.where(third >= 3, third - 1, third)[:4].tolist(), where
 
-    replay(env, recorded, check)
+    replay(env, recorded, check, 2)
     assert worst["tcp"].max() < 1e-9, worst  # 1e-6 mm
     assert worst["objects"].max() < 1e-6, worst  # 1e-3 mm
     assert env._seen[:, 0].tolist() == [bool(recorded[f"ep{i}_success"][-1]) for i in range(4)]
     assert touched[:3] == [True, True, True]
 
 
-@needs_recordings
 def test_reset_from_the_recorded_context():
-    recorded = np.load(RECORDINGS)
+    recorded = recordings_of("sorting")
     env = SortingEnv(4, max_steps=1000, dtype=torch.float64)
-    first = env.reset(contexts=recorded_contexts(recorded, 4))
+    first = env.reset(contexts=contexts_of(recorded, 4))
     for i in range(4):
         np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-6)
         expected = recorded[f"ep{i}_init_obs"]
         np.testing.assert_allclose(first["observation"][i, 2:], expected, rtol=1e-5, atol=1e-5)
     outcome = {}
 
-    def check(i, k, out):
+    def check(i, k, out, where):
         outcome[i] = (out["success"][i].item(), packed(out["mode"][i]))
 
-    replay(env, recorded, check)
+    replay(env, recorded, check, 2)
     assert [outcome[i] for i in (0, 3)] == [(True, 80), (False, 240)]
 
 

@@ -8,15 +8,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from env_test_base import ContextTestBase, act, recorded_contexts
-from shared_data import SHARED
+from env_test_base import ContextTestBase, act, assert_starts_as_recorded, contexts_of, recordings_of, replay
 
 from torchrl_koap.envs import StackingEnv
 from torchrl_koap.envs.stacking import mode_index
 from torchrl_koap.tasks import get_task
-
-RECORDINGS = SHARED / "d3il_reference" / "stacking.npz"
-needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
 
 STILL_OPEN = torch.tensor([0.0] * 7 + [0.08], dtype=torch.float64)
 STILL_CLOSED = torch.zeros(8, dtype=torch.float64)
@@ -44,41 +40,34 @@ def put_boxes(env, positions, index=0):
     env.set_physics(index, qpos)
 
 
-@needs_recordings
 def test_parity_with_the_original():
-    recorded = np.load(RECORDINGS)
-    lengths = recorded["n_steps"]
+    recorded = recordings_of("stacking")
     env = StackingEnv(4, max_steps=5000, dtype=torch.float64)
-    env.reset(contexts=recorded_contexts(recorded, 3))
-    for i in range(4):
-        np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
-        np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
+    env.reset(contexts=contexts_of(recorded, 3))
+    assert_starts_as_recorded(env, recorded)
     succeeded = np.zeros(4, dtype=bool)
-    for k in range(max(lengths)):
-        running = lengths > k
-        commands = np.stack([recorded[f"ep{i}_action"][min(k, lengths[i] - 1)] for i in range(4)])
-        commands[:, :7] -= env.commands[:, :7]
-        out = act(env, commands, running)
-        for i in np.flatnonzero(running):
-            where = f"episode {i}, step {k}"
-            assert np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max() < 1e-7, where  # 1e-4 mm
-            assert np.abs(env.sims.object_poses[i] - recorded[f"ep{i}_obj_pose"][k]).max() < 1e-6, where
-            assert np.abs(env.sims.joint_positions[i] - recorded[f"ep{i}_j_pos"][k]).max() < 1e-6, where
-            assert np.abs(env.sims.gripper_width[i] - recorded[f"ep{i}_gripper_width"][k]) < 1e-6, where
-            seen = out["observation"][i, 8:20].reshape(3, 4).numpy()
-            wanted = recorded[f"ep{i}_obs_step"][k].reshape(3, 4)
-            np.testing.assert_allclose(seen[:, :3], wanted[:, :3], rtol=0, atol=1e-6, err_msg=where)
-            turn = np.arctan(seen[:, 3]) - np.arctan(wanted[:, 3].astype(np.float64))
-            assert np.abs(np.sin(turn)).max() < 1e-5, where  # the tangent has poles, its angle has none
-            assert out["mode"][i].tolist() == recorded[f"ep{i}_mode"][k].tolist(), where
-            done = bool(recorded[f"ep{i}_done"][k])
-            assert out["done"][i].item() == out["success"][i].item() == done, where
-            # the original's success flag is that of the state after the step: ours, told a step later
-            assert env._seen[i, 0] == bool(recorded[f"ep{i}_success"][k]), where
-            succeeded[i] |= done
-            arrived = (out["mode"][i] >= 0).sum().item()
-            first, second, _ = recorded[f"ep{i}_success1_success2_meandist"][k]
-            assert (arrived >= 1, arrived >= 2) == (bool(first), bool(second)), where
+
+    def check(i, k, out, where):
+        assert np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max() < 1e-7, where  # 1e-4 mm
+        assert np.abs(env.sims.object_poses[i] - recorded[f"ep{i}_obj_pose"][k]).max() < 1e-6, where
+        assert np.abs(env.sims.joint_positions[i] - recorded[f"ep{i}_j_pos"][k]).max() < 1e-6, where
+        assert np.abs(env.sims.gripper_width[i] - recorded[f"ep{i}_gripper_width"][k]) < 1e-6, where
+        seen = out["observation"][i, 8:20].reshape(3, 4).numpy()
+        wanted = recorded[f"ep{i}_obs_step"][k].reshape(3, 4)
+        np.testing.assert_allclose(seen[:, :3], wanted[:, :3], rtol=0, atol=1e-6, err_msg=where)
+        turn = np.arctan(seen[:, 3]) - np.arctan(wanted[:, 3].astype(np.float64))
+        assert np.abs(np.sin(turn)).max() < 1e-5, where  # the tangent has poles, its angle has none
+        assert out["mode"][i].tolist() == recorded[f"ep{i}_mode"][k].tolist(), where
+        done = bool(recorded[f"ep{i}_done"][k])
+        assert out["done"][i].item() == out["success"][i].item() == done, where
+        # the original's success flag is that of the state after the step: ours, told a step later
+        assert env._seen[i, 0] == bool(recorded[f"ep{i}_success"][k]), where
+        succeeded[i] |= done
+        arrived = (out["mode"][i] >= 0).sum().item()
+        first, second, _ = recorded[f"ep{i}_success1_success2_meandist"][k]
+        assert (arrived >= 1, arrived >= 2) == (bool(first), bool(second)), where
+
+    replay(env, recorded, check, 7)
     assert succeeded.tolist() == [True, False, False, False]
 
 

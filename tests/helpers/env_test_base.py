@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from shared_data import SHARED
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -21,16 +22,50 @@ def act(env, action, mask=None):
     return env.step(tensordict)["next"]
 
 
-def recorded_state(recorded, episode):
-    """Arguments of ``set_physics`` for the first state of a recorded episode."""
-    return {name: recorded[f"ep{episode}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+def recordings_of(task):
+    """What the original simulator did in four episodes, see :func:`start_recorded` and :func:`replay`."""
+    file = SHARED / "d3il_reference" / f"{task}.npz"
+    if not file.exists():
+        pytest.skip(f"no recordings at {file}")
+    return np.load(file)
 
 
-def recorded_contexts(recorded, objects):
+def contexts_of(recorded, objects):
     """Contexts of the four recorded episodes, yaw in rad."""
     contexts = np.stack([recorded[f"ep{episode}_context"][:objects, :3] for episode in range(4)]).astype(np.float64)
     contexts[..., 2] = np.radians(contexts[..., 2])
     return contexts
+
+
+def start_recorded(env, recorded):
+    """Puts four environments into the first states of the recorded episodes."""
+    for episode in range(4):
+        state = {name: recorded[f"ep{episode}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+        env.set_physics(episode, **state)
+
+
+def assert_starts_as_recorded(env, recorded):
+    """The physics after a reset."""
+    for episode, data in enumerate(env.sims.data):
+        np.testing.assert_allclose(data.qpos, recorded[f"ep{episode}_init_qpos"], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(data.qvel, recorded[f"ep{episode}_init_qvel"], rtol=0, atol=1e-12)
+
+
+def replay(env, recorded, check, moved):
+    """Sends the recorded commands, of which the first ``moved`` entries are changed by the actions.
+
+    ``check(episode, step, leaves, where)`` is called after every control step of an episode; the last leaves return.
+    """
+    lengths = recorded["n_steps"]
+    for step in range(max(lengths)):
+        running = lengths > step
+        action = np.stack([recorded[f"ep{i}_action"][min(step, lengths[i] - 1)] for i in range(4)])
+        action = action[:, : env.task.action_dim].astype(np.float64)
+        action[:, :moved] -= env.commands[:, :moved]
+        out = act(env, action, running)
+        for episode in np.flatnonzero(running):
+            check(episode, step, out, f"episode {episode}, step {step}")
+    return out
 
 
 class EnvTestBase:

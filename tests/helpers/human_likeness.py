@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
-from torchrl_koap.envs.experts.avoiding import ROD_RADIUS
+from torchrl_koap.envs.experts.avoiding import clearance
+from torchrl_koap.tasks.avoiding import FINISH_Y
 
 MOVING = 3.0  # mm per step
 LOOK_AHEAD = 8
@@ -17,7 +17,7 @@ LOOK_AHEAD = 8
 
 def statistics(episode: np.ndarray) -> dict[str, float]:
     """Quantities of one demonstration ``[T, 4]``, by name."""
-    command, measured = paths(episode)
+    command, measured = episode[:, :2], episode[:, 2:]
     steps = np.diff(command, axis=0) * 1e3
     speed = np.linalg.norm(steps, axis=1)
     size = np.abs(steps)
@@ -33,7 +33,7 @@ def statistics(episode: np.ndarray) -> dict[str, float]:
         "rows after the finish line": len(command) - end,
         "length of the measured path (m)": np.linalg.norm(np.diff(measured, axis=0), axis=1).sum(),
         "last measured y (m)": measured[-1, 1],
-        "least clearance (mm)": clearance(measured),
+        "least clearance (mm)": 1e3 * clearance(episode),
         "speed, mean while moving (mm/step)": speed[run].mean(),
         "speed, variation (std / mean)": speed[run].std() / speed[run].mean(),
         "command to measured, median (mm)": np.median(lag),
@@ -58,17 +58,6 @@ def statistics(episode: np.ndarray) -> dict[str, float]:
             f"{name} autocorrelation of steps, lag 10": autocorrelation(steps[run, axis], 10),
         }
     return values
-
-
-def paths(episode: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Commanded and measured xy [T, 2] (m)."""
-    return episode[:, :2], episode[:, 2:]
-
-
-def clearance(measured: np.ndarray) -> float:
-    """Least distance between rod and any cylinder (mm)."""
-    distances = [np.linalg.norm(measured - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
-    return 1e3 * (min(distances) - ROD_RADIUS)
 
 
 def wobble(path: np.ndarray, width: float = 4.0) -> float:
@@ -102,7 +91,7 @@ def ridge_error(episodes: list[np.ndarray], strength: float = 1e-6) -> float:
     """
     features, targets = [], []
     for episode in episodes:
-        command, measured = paths(episode)
+        command, measured = episode[:, :2], episode[:, 2:]
         now = np.arange(1, len(command) - 1)
         ahead = np.minimum(now + LOOK_AHEAD, len(measured) - 1)
         seen = np.concatenate([measured[now - 1], measured[now], measured[ahead], np.ones((len(now), 1))], axis=1)

@@ -62,7 +62,7 @@ def test_the_environment_is_what_torchrl_expects():
 def test_the_expert_records_both_modes(demonstrations):
     data, report = demonstrations
     validate(data)
-    assert report.modes == [0, 1] * 6 and report.num_modes == 2
+    assert report.modes == [0, 1] * 6 and report.task.num_modes == 2
     assert trajectory_lengths(data).tolist() == report.rows  # every step is kept, none lost to a conversion
     # the robot moves as told, inside every trajectory
     moved = data["next", "observation"][:, :2] - data["observation"][:, :2]

@@ -45,7 +45,6 @@ class AligningEnv(ManipulationEnv):
     ``success``     [n, 1]    bool              the tray is in the target pose, see :meth:`errors`
     ``mode``        [n, 1]    int64             0 pushed from inside, 1 from outside, -1 before the first step
     ``context``     [n, 2, 3] ``dtype``         start of the tray, and target: x, y (m), yaw (rad)
-    ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
     =============== ========= ================= ===============================================================
 
     The order of events is that of :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one
@@ -81,9 +80,6 @@ class AligningEnv(ManipulationEnv):
         for row, pose in zip(rows, self.targets[rows], strict=True):
             self.sims.data[row].mocap_pos[0], self.sims.data[row].mocap_quat[0] = pose[:3], pose[3:]
             self.sims.set_state(row, self.sims.get_state(row))  # the first picture shows the target in its new place
-
-    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
-        self._commands[rows, :3] += action
 
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         parts = (self._commands[:, :3], self.sims.tcp_position, self.sims.object_poses[:, 0], self.targets)

@@ -10,9 +10,7 @@ import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import PANDA, scene
-from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_Y
-
-ROW_REACH = 0.03
+from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_REACH, ROW_Y
 
 
 def mode_index(flags: torch.Tensor) -> torch.Tensor:
@@ -54,9 +52,6 @@ class AvoidingEnv(ManipulationEnv):
     ``success``     [n, 1]    bool              the rod has crossed y = 0.35 before any collision was seen
     ``collision``   [n, 1]    bool              the rod was seen touching a cylinder before it crossed
     ``mode``        [n, 9]    bool              passage flags, see :func:`mode_index`
-    ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
-    ``terminated``  [n, 1]    bool              ``success`` or ``collision``
-    ``truncated``   [n, 1]    bool              ``max_steps`` control steps are over
     =============== ========= ================= ===============================================================
 
     Kept from the original because policies experience it: the measured xy is one control step old (the first step
@@ -97,9 +92,6 @@ class AvoidingEnv(ManipulationEnv):
         self._rod = model.geom(f"{PANDA}rod").id
         self._obstacles = np.array([model.geom(name).id for name, *_ in OBSTACLES])
 
-    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
-        self._commands[rows, :2] += action
-
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         return np.concatenate([self._commands[rows, :2], self.sims.tcp_position[rows, :2]], axis=1)
 
@@ -114,18 +106,13 @@ class AvoidingEnv(ManipulationEnv):
 
     def _update_mode(self, rows: np.ndarray) -> None:
         x, y = self.sims.tcp_position[rows, 0], self.sims.tcp_position[rows, 1]
-        mode = self._mode[rows]
-        at = (abs(y - ROW_Y[0]) <= ROW_REACH) & ~mode[:, 0:2].any(1)
-        mode[:, 0] |= at & (x < 0.5)
-        mode[:, 1] |= at & (x > 0.5)
-        at = (abs(y - ROW_Y[1]) <= ROW_REACH) & ~mode[:, 2:5].any(1)
-        mode[:, 2] |= at & (x < 0.425)
-        mode[:, 3] |= at & (x > 0.425) & (x < 0.575)
-        mode[:, 4] |= at & (x > 0.575)
-        at = (y >= ROW_Y[2]) & ~mode[:, 5:9].any(1)
-        mode[:, 5] |= at & (x < 0.35)
-        mode[:, 6] |= at & (x > 0.35) & (x < 0.5)
-        mode[:, 7] |= at & (x > 0.5) & (x < 0.65)
+        mode, first = self._mode[rows], 0
+        for row_y in ROW_Y:
+            bounds = np.array([-np.inf, *(at for _, at, its_row, *_ in OBSTACLES if its_row == row_y), np.inf])
+            flags = mode[:, first : first + len(bounds) - 1]  # a view
+            at = (y >= row_y if row_y == ROW_Y[-1] else abs(y - row_y) <= ROW_REACH) & ~flags.any(1)
+            flags |= at[:, None] & (x[:, None] > bounds[:-1]) & (x[:, None] < bounds[1:])
+            first += flags.shape[1]
         # the original compares with 0.35 here, so exactly 0.5 and 0.65 count as the outermost passage too
         mode[:, 8] |= at & (x > 0.35) & ~mode[:, 5:8].any(1)
         self._mode[rows] = mode

@@ -41,7 +41,14 @@ class ManipulationEnv(EpisodeState, EnvBase):
     A task with objects has *contexts*, where they are when an episode starts (:mod:`torchrl_koap.envs.contexts`): drawn
     at random at every reset, taken from a table in turn, or handed over by ``reset(contexts=...)``.
 
-    Success and collision are *latched*: the first that is seen is the outcome and stays until the reset.
+    What a task's table of keys does not list is the same everywhere::
+
+        success     [n, 1] bool               latched: the first outcome that is seen stays until the reset
+        collision   [n, 1] bool               likewise, where an episode can end by one
+        context     [n, objects, 3] dtype     where the objects start, x, y (m), yaw (rad); not where there are none
+        reward      [n, 1] dtype              1 where ``success`` else 0
+        terminated  [n, 1] bool               ``success`` or ``collision``
+        truncated   [n, 1] bool               ``max_steps`` control steps are over
 
     Args:
         num_envs (int): number of environments, the batch size.
@@ -164,6 +171,9 @@ class ManipulationEnv(EpisodeState, EnvBase):
     def _scene(self) -> Any:
         """Scene of the task, an ``mjcf.RootElement``."""
         raise NotImplementedError
+
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        self._commands[rows, : action.shape[1]] += action
 
     @abc.abstractmethod
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -29,12 +29,7 @@ def _scene(task: Task) -> Scene:
 
 
 def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | int | None = None) -> np.ndarray:
-    """Draws random contexts from the ranges of a task, float64 ``[num, objects, 3]``.
-
-    Args:
-        task (Task or str): the task.
-        num (int): number of contexts.
-        generator (np.random.Generator or int, optional): random generator or seed.
+    """Draws random contexts from the ranges of a task, float64 ``[num, objects, 3]``; ``generator`` may be a seed.
 
     Raises:
         ValueError: if the task is unknown or has no contexts, or the number is below 1.
@@ -44,7 +39,7 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
         >>> draw_contexts("sorting", 5, 0).shape
         (5, 4, 3)
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     scene = _scene(task)
     if num < 1:
         raise ValueError(f"the number of contexts must be at least 1, got {num}")
@@ -73,14 +68,10 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
     The table (``evaluation_contexts.json``) never changes. Contexts of a task that is not in it are drawn with a seed
     that its name alone decides.
 
-    Args:
-        task (Task or str): the task.
-        num (int): how many, at most 60.
-
     Raises:
         ValueError: if the task is unknown or has no contexts, or more are asked for than the table holds.
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     _scene(task)
     rows = _table()["contexts"].get(task.source)
     if rows is None:  # not D3IL's: the same ones every time
@@ -92,11 +83,7 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
 
 
 def check_contexts(task: Task, contexts) -> np.ndarray:
-    """Returns contexts as an array, or an error that names what is wrong with them.
-
-    Args:
-        task (Task): tells the objects and where each may start.
-        contexts (array): ``[C, objects, 3]``: x, y (m) and yaw (rad).
+    """Returns contexts as a float64 array, or an error that names what is wrong with them.
 
     Raises:
         ValueError: if the task has none, the shape is not ``[C, objects, 3]``, or an object lies where the task never
@@ -126,17 +113,13 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
 def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
     """Reads D3IL's own context file, a pickled list of contexts, as float64 ``[C, objects, 3]``.
 
-    D3IL's degrees become rad, its further entries are left out.
-
-    Args:
-        file (str or Path): the pickle; read by the restricted unpickler.
-        task (Task or str): the task.
+    D3IL's degrees become rad, its further entries are left out. The restricted unpickler reads it.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if the file does not hold contexts of this task.
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     _scene(task)
     contexts = load_pickle(Path(file))
     if not isinstance(contexts, (list, tuple)) or not contexts:
@@ -171,11 +154,6 @@ def yaw_quaternions(yaw: np.ndarray) -> np.ndarray:
 
 
 def poses_of(contexts: np.ndarray, height: float) -> np.ndarray:
-    """Computes positions (m) and quaternions (w, x, y, z), ``[..., objects, 7]``, of objects on a level.
-
-    Args:
-        contexts (np.ndarray): x, y (m) and yaw (rad), ``[..., objects, 3]``.
-        height (float): z of all objects (m).
-    """
+    """Computes positions (m) and quaternions (w, x, y, z), ``[..., objects, 7]``, of objects at one ``height``."""
     level = np.full((*contexts.shape[:-1], 1), height)
     return np.concatenate([contexts[..., :2], level, yaw_quaternions(contexts[..., 2])], -1)

@@ -39,7 +39,7 @@ class EpisodeState(abc.ABC):
 
     @abc.abstractmethod
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
-        """Turns actions [len(rows), act] into new commands ``self._commands[rows]``."""
+        """Turns actions [len(rows), act] into new commands ``self._commands[rows]``; by default they are changes."""
 
     @abc.abstractmethod
     def _advance(self, rows: np.ndarray) -> None: ...

@@ -50,7 +50,7 @@ def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
         >>> make_env("sorting_2", 3).batch_size
         torch.Size([3])
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     if task.env is None:
         raise ValueError(
             f"task {task.name!r} has no environment (Task.env is None): it can be trained on data, but not rolled out,"
@@ -95,7 +95,7 @@ def mode_index_of(task: Task | str) -> Callable[[torch.Tensor], torch.Tensor]:
         >>> mode_index_of("sorting_2")(torch.tensor([[1, 0], [-1, -1]]))
         tensor([ 1, -1])
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     if task.modes.index is None:
         return _only_mode
     return resolve(task.modes.index, f"modes.index of task {task.name!r}")

@@ -87,8 +87,6 @@ class SortingEnv(ManipulationEnv):
     ``success``     [n, 1]    bool              every box is in its bin, at the same time
     ``mode``        [n, 4]    int64             colours in order of arrival, 0 red, 1 blue, -1 not arrived yet (2 or
                                                 6 columns with as many boxes)
-    ``context``     [n, 4, 3] ``dtype``         start of the boxes: x, y (m), yaw (rad)
-    ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
     =============== ========= ================= ===============================================================
 
     The order of events is that of :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one
@@ -135,9 +133,6 @@ class SortingEnv(ManipulationEnv):
     def _begin(self, rows: np.ndarray) -> None:
         super()._begin(rows)
         self._noted[rows] = -1
-
-    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
-        self._commands[rows, :2] += action
 
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         poses = self.sims.object_poses[rows]

@@ -74,8 +74,6 @@ class StackingEnv(ManipulationEnv):
                                                 (m): above 0.075 the fingers open, else they close and press
     ``success``     [n, 1]    bool              ``num_boxes`` boxes are in place, see below
     ``mode``        [n, 3]    int64             boxes in the order of their arrival: 0 red, 1 green, 2 blue, -1 none
-    ``context``     [n, 3, 3] ``dtype``         start of red, green and blue: x, y (m), yaw (rad)
-    ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
     =============== ========= ================= ===============================================================
 
     The first 20 columns of the observation are those of D3IL's recordings. A box has *arrived* once its centre has

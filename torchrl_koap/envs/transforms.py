@@ -38,7 +38,7 @@ class PartialObservation(ObservationTransform):
     """
 
     def __init__(self, task: Task | str, drop: Sequence[str] | None = None, *, in_key: NestedKey = OBSERVATION):
-        task = get_task(task) if isinstance(task, str) else task
+        task = get_task(task)
         if drop is None:
             drop = [name for name in (task.command, *task.hidden) if name is not None]
         unknown = [name for name in drop if name not in task.observation]
@@ -101,7 +101,7 @@ class EndEffectorNoise(ObservationTransform):
         if not sigma >= 0:
             raise ValueError(f"sigma must be >= 0, got {sigma}")
         super().__init__(in_keys=[in_key], out_keys=[in_key])
-        task = get_task(task) if isinstance(task, str) else task
+        task = get_task(task)
         self.sigma, self.part = sigma, task.observation[task.position]
         self._generators = [torch.Generator().manual_seed(seed)]
 

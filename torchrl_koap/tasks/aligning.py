@@ -27,14 +27,10 @@ _POSES = dict(zip((*_BOX, *_TARGET), (3, 4, 3, 4), strict=True))  # their column
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether the tray lies in the target pose, bool ``[*B]``.
+    """Says whether the tray lies in the target pose, bool ``[*B]`` of states ``[*B, d]``.
 
     Within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
     :data:`ROTATION_TOLERANCE` half turns.
-
-    Args:
-        task (Task): the task.
-        state (Tensor): states ``[*B, d]``.
     """
     part = {name: state[..., columns] for name, columns in task.state_slices.items()}
     distance = (part["box_position"] - part["target_position"]).norm(dim=-1)

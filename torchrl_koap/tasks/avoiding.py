@@ -17,7 +17,7 @@ from torchrl_koap.tasks.task import Defaults, Task
 FINISH_Y = 0.35  # m
 ROD_RADIUS = 0.01  # m
 ROW_Y = (-0.1, 0.08, 0.26)  # y of the rows of cylinders (m)
-_ROW_REACH = 0.03  # m before and behind a row of cylinders: the gap is the one at the first frame within it
+ROW_REACH = 0.03  # m before and behind a row of cylinders: the gap is the one at the first frame within it
 # name, x, y, radius, half height (m)
 OBSTACLES = (
     ("row1", 0.5, ROW_Y[0], 0.03, 0.07),
@@ -30,12 +30,7 @@ OBSTACLES = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether the tool is behind the finish line, bool ``[*B]``.
-
-    Args:
-        task (Task): the task.
-        state (Tensor): states ``[*B, d]``.
-    """
+    """Says whether the tool is behind the finish line, bool ``[*B]`` of states ``[*B, d]``."""
     return state[..., 1] > FINISH_Y
 
 
@@ -54,7 +49,7 @@ def mode_of_path(path: np.ndarray) -> int:
     mode = 0
     for y in ROW_Y:
         cylinders = [x for _, x, row, *_ in OBSTACLES if row == y]
-        near = path[:, 1] >= y if y == ROW_Y[-1] else abs(path[:, 1] - y) <= _ROW_REACH
+        near = path[:, 1] >= y if y == ROW_Y[-1] else abs(path[:, 1] - y) <= ROW_REACH
         if not near.any():
             return -1
         mode = mode * (len(cylinders) + 1) + int((path[near.argmax(), 0] > cylinders).sum())

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 # offset along the parent's axes (m) and the fixed quarter turns about x that follow it, for joints 1 to 7
-_LINKS = (
+LINKS = (
     ((0.0, 0.0, 0.333), 0),
     ((0.0, 0.0, 0.0), -1),
     ((0.0, -0.316, 0.0), 1),
@@ -35,7 +35,7 @@ def tool_position(joints: Tensor) -> Tensor:
         raise ValueError(f"seven joints are needed on the last axis, got shape {list(joints.shape)}")
     x, y, z = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(*joints.shape[:-1], 3, 3).unbind(-1)
     position = torch.zeros_like(x)
-    for index, ((along_x, along_y, along_z), turn) in enumerate(_LINKS):
+    for index, ((along_x, along_y, along_z), turn) in enumerate(LINKS):
         position = position + along_x * x + along_y * y + along_z * z
         if turn:
             y, z = turn * z, -turn * y

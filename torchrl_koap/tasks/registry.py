@@ -47,8 +47,8 @@ def register_task(task: Task) -> Task:
     return known
 
 
-def get_task(name: str) -> Task:
-    """Looks a task up by name; installed packages are asked for theirs if it is not known yet.
+def get_task(name: Task | str) -> Task:
+    """Looks a task up by name, a task being itself; installed packages are asked if the name is not known yet.
 
     Returns:
         Task: the registered task.
@@ -61,6 +61,8 @@ def get_task(name: str) -> Task:
         >>> get_task("avoiding").state_columns, get_task("sorting").state_dim, get_task("po_sorting").state_dim
         ((2, 3), 18, 10)
     """
+    if isinstance(name, Task):
+        return name
     if not (isinstance(name, str) and name in TASKS):
         load_entry_points()
     return lookup(TASKS, name, "task")

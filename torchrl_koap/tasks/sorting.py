@@ -49,12 +49,7 @@ _CAPTION = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether every box is in the bin of its colour, bool ``[*B]``.
-
-    Args:
-        task (Task): the task.
-        state (Tensor): states ``[*B, d]``.
-    """
+    """Says whether every box is in the bin of its colour, bool ``[*B]`` of states ``[*B, d]``."""
     done = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
     for box in task.objects:
         x, y = state[..., task.state_slices[f"{box}_xy"]].unbind(-1)
@@ -151,9 +146,8 @@ register_task(
         hidden=tuple(f"{box}_tan_yaw" for box in _BY_BOXES[4].objects),
         noise=PO_NOISE,
         data_from="sorting",
-        defaults=Defaults(
-            demonstrations=1000,
-            planner={"steps": 24000, "network": "mlp", "frames": 1},
+        defaults=replace(
+            _BY_BOXES[4].defaults,
             controller={"preset": "semi_supervised"},  # positions are noisy
             execution={"lead": COMMAND_LEAD, "gain": ACTION_GAIN},
         ),

@@ -34,13 +34,9 @@ def _boxes_of(task: Task, state: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether all boxes are piled in the zone, bool ``[*B]``.
+    """Says whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``.
 
     All within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
-
-    Args:
-        task (Task): the task.
-        state (Tensor): states ``[*B, d]``.
     """
     boxes, near = _boxes_of(task, state)
     height = boxes[..., 2].sort(-1).values
@@ -48,12 +44,7 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def first_box_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether any box is in the zone, bool ``[*B]``.
-
-    Args:
-        task (Task): the task.
-        state (Tensor): states ``[*B, d]``.
-    """
+    """Says whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``."""
     return _boxes_of(task, state)[1].any(-1)
 
 

@@ -70,7 +70,7 @@ def test_it_lets_go_when_the_tray_lies_there():
 
 def test_bad_input():
     contexts = draw_contexts("aligning", 2, 0)
-    with pytest.raises(ValueError, match="got 1, 2 and 2"):
+    with pytest.raises(ValueError, match=r"1 modes, 2 seeds and contexts of shape \[2, 2, 3\]"):
         AligningExpert([0], contexts, [0, 1])
     with pytest.raises(ValueError, match=r"got \[2\]"):
         AligningExpert([0, 2], contexts, [0, 1])

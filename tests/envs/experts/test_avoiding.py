@@ -76,7 +76,7 @@ def test_it_lingers_behind_the_line_and_finishes():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="2 and 1"):
+    with pytest.raises(ValueError, match="2 modes and 1 seeds"):
         AvoidingExpert([0, 1], [0])
     with pytest.raises(ValueError, match="at least one"):
         AvoidingExpert([], [])

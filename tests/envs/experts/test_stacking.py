@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl_koap.envs import StackingEnv
 from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.stacking import ORDERS, StackingExpert
-from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
+from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
 from torchrl_koap.envs.stacking import mode_index
 
 LIMIT = 1000
@@ -103,7 +103,7 @@ def test_inverse_kinematics_reaches_poses():
 def test_bad_arguments_are_named(modes, contexts, seeds, message):
     with pytest.raises(ValueError, match=message):
         StackingExpert(modes, contexts, seeds)
-    with pytest.raises(ValueError, match=r"\[1, 31\], got \[1, 20\]"):
+    with pytest.raises(ValueError, match=r"shape \[1, 31\], got \[1, 20\]"):
         StackingExpert([0], np.zeros((1, 3, 3)), [0]).act(np.zeros((1, 20)))
 
 

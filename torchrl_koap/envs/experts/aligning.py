@@ -25,7 +25,7 @@ import numpy as np
 from torchrl_koap.envs.contexts import check_contexts
 from torchrl_koap.envs.experts.noise import ar1_noise
 from torchrl_koap.envs.experts.push_planning import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 
@@ -67,38 +67,22 @@ class AligningExpert(Expert):
     """Scripted expert of Aligning for a batch of episodes: pushes trays into their target poses, each in its mode.
 
     Args:
-        modes (sequence of int): per episode 0 (from inside) or 1 (from outside).
-        contexts (array): start of the tray and target [n, 2, 3]: x, y (m), yaw (rad).
-        seeds (sequence): per episode a seed for ``numpy.random.default_rng``: a number or a tuple of numbers.
+        modes (sequence of int): 0 (from inside) or 1 (from outside); contexts and seeds as
+            :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
 
     Raises:
         ValueError: if the numbers of modes, contexts and seeds differ, or a mode or context is wrong.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs import AligningEnv
-        >>> from torchrl_koap.envs.experts.aligning import AligningExpert
-        >>> from torchrl_koap.envs.contexts import evaluation_contexts
-        >>> contexts = evaluation_contexts("aligning", 2)
-        >>> env, expert = AligningEnv(2, dtype=torch.float64), AligningExpert([0, 1], contexts, seeds=[0, 0])
-        >>> first = env.reset(contexts=contexts)
-        >>> expert.act(first["observation"].numpy()).shape, expert.finished.tolist()
-        ((2, 3), [False, False])
     """
 
     rules = RecordingRules(most_rows=399)
 
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
-        modes, seeds = [int(mode) for mode in modes], list(seeds)
         contexts = check_contexts(get_task("aligning"), contexts)
-        if not len(modes) == len(contexts) == len(seeds):
-            raise ValueError(
-                f"one mode, context and seed per episode are needed, got {len(modes)}, {len(contexts)} and {len(seeds)}"
-            )
+        check_episodes(modes, seeds, contexts, 2)
         if not set(modes) <= {_INSIDE, _OUTSIDE}:
             raise ValueError(f"modes are 0 (inside) or 1 (outside), got {sorted(set(modes) - {_INSIDE, _OUTSIDE})}")
         self._players = [
-            _Player(mode, context, np.random.default_rng(seed))
+            _Player(int(mode), context, np.random.default_rng(seed))
             for mode, context, seed in zip(modes, contexts, seeds, strict=True)
         ]
 
@@ -108,14 +92,8 @@ class AligningExpert(Expert):
         return np.array([player.finished for player in self._players])
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step: change of the commanded TCP position [n, 3] (m) under observations [n, 20].
-
-        Raises:
-            ValueError: if the shape is wrong.
-        """
-        observation = np.asarray(observation, dtype=np.float64)
-        if observation.shape != (len(self._players), 20):
-            raise ValueError(f"observation must have shape [{len(self._players)}, 20], got {list(observation.shape)}")
+        """Decides the next control step: change of the commanded TCP position [n, 3] (m) under observations [n, 20]."""
+        observation = self._checked(observation, 20)
         return np.stack([player.act(row) for player, row in zip(self._players, observation, strict=True)])
 
 

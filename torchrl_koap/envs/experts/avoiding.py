@@ -22,7 +22,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS, ROW_Y
 
 FULL_PUSH = 0.0124  # m per control step at full deflection
@@ -77,9 +77,7 @@ class AvoidingExpert(Expert):
     """Scripted expert of Avoiding for a batch of episodes, one mode and one seed each.
 
     Args:
-        modes (sequence of int): the mode each episode shall take, ``n`` numbers of 0 to 23.
-        seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
-        contexts (None): every episode starts the same.
+        modes (sequence of int): 0 to 23; seeds as :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
 
     Raises:
         ValueError: if a mode does not exist or the numbers of modes and seeds differ.
@@ -105,9 +103,7 @@ class AvoidingExpert(Expert):
     )
 
     def __init__(self, modes: Sequence[int], seeds: Sequence, contexts: None = None):
-        modes, seeds = list(modes), list(seeds)
-        if not modes or len(modes) != len(seeds):
-            raise ValueError(f"as many seeds as modes are needed, at least one, got {len(modes)} and {len(seeds)}")
+        check_episodes(modes, seeds)
         drawn = [_draw(mode, np.random.default_rng(seed)) for mode, seed in zip(modes, seeds, strict=True)]
         self._habits = SimpleNamespace(**{name: np.stack([each[name] for each in drawn]) for name in drawn[0]})
         count = len(modes)
@@ -127,14 +123,8 @@ class AvoidingExpert(Expert):
         return (self._crossed >= 0) & (self._time >= self._crossed + self._habits.linger)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step: change of the commanded xy [n, 2] (m) under observations [n, 4].
-
-        Raises:
-            ValueError: if the shape is wrong.
-        """
-        observation = np.asarray(observation, dtype=np.float64)
-        if observation.shape != (len(self._row), 4):
-            raise ValueError(f"observation must have shape [{len(self._row)}, 4], got {list(observation.shape)}")
+        """Decides the next control step: change of the commanded xy [n, 2] (m) under observations [n, 4]."""
+        observation = self._checked(observation, 4)
         seen = self._look(observation)
         decision = self._decide(seen, observation[:, 3])
         self._decisions = np.concatenate([decision[:, None], self._decisions[:, :-1]], axis=1)

@@ -5,7 +5,7 @@
 
     folder/
       ted/          all demonstrations as one data set (see torchrl_koap.data.ted)
-      unfinished/   while recording: what was asked for, a line on every demonstration so far, and its file
+      unfinished/   while recording: what was asked for, and a file for every demonstration so far
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.files import one_at_a_time, replacing_file
 from torchrl_koap.tasks import Task, get_task
 
-_REQUEST, _LOG = "request.json", "takes.jsonl"
+_REQUEST = "request.json"
 
 
 def record_to_folder(
@@ -62,7 +62,7 @@ def record_to_folder(
         iterate_takes, task, episodes, seed, num_threads, batch_size=batch_size, disturbance=disturbance
     )
     iterating()  # looks at the arguments before anything is written
-    files = _Files(Path(folder), task, episodes)
+    files = _Files(Path(folder), episodes)
     files.refuse_others(request)
     with one_at_a_time(files.unfinished / ".lock", busy=f"another process records into {folder}"):
         done = files.begin(request)
@@ -70,9 +70,9 @@ def record_to_folder(
             progress(len(done), episodes)
         for take in iterating(progress, done=done):
             files.add(take)
-        log, seconds = files.log(), time.perf_counter() - start
-        report = RecordingReport.of(task, seed, [log[index] for index in range(episodes)], seconds, disturbance)
-        files.finish(report)
+        frames, actions, accounts = files.read()
+        report = RecordingReport(task, seed, accounts, time.perf_counter() - start, disturbance)
+        save_ted(flatten_trajectories(frames, actions), files.ted, task, report.notes)
     shutil.rmtree(files.unfinished)
     return report
 
@@ -80,14 +80,13 @@ def record_to_folder(
 class _Files:
     """Files of one recording."""
 
-    def __init__(self, folder: Path, task: Task, episodes: int):
-        self._folder, self._task, self._episodes = folder, task, episodes
-        self.unfinished = folder / "unfinished"
+    def __init__(self, folder: Path, episodes: int):
+        self.ted, self.unfinished, self._episodes = folder / "ted", folder / "unfinished", episodes
 
     def refuse_others(self, request: dict) -> None:
         begun = self.unfinished / _REQUEST
-        if (self._folder / "ted").exists():
-            raise FileExistsError(f"{self._folder / 'ted'} exists already; choose another --out")
+        if self.ted.exists():
+            raise FileExistsError(f"{self.ted} exists already; choose another --out")
         there = json.loads(begun.read_text()) if begun.exists() else request
         other = [
             f"{key} {there.get(key)!r}, not {value!r}" for key, value in request.items() if there.get(key) != value
@@ -103,37 +102,21 @@ class _Files:
         self.unfinished.mkdir(parents=True, exist_ok=True)
         with replacing_file(self.unfinished / _REQUEST) as aside:
             aside.write_text(json.dumps(request))
-        log = self.log()
-        with replacing_file(self.unfinished / _LOG) as aside:  # without a half-written last line
-            aside.write_text("".join(json.dumps(take) + "\n" for take in log.values()))
-        return set(log)
+        return {index for index in range(self._episodes) if self._file(index).exists()}
 
     def add(self, take: Take) -> None:
         with replacing_file(self._file(take.index)) as aside, open(aside, "wb") as file:
-            np.savez(file, frames=take.frames, actions=take.actions)
-        line = {name: value for name, value in vars(take).items() if name not in ("frames", "actions")}
-        with open(self.unfinished / _LOG, "a") as file:
-            file.write(json.dumps(line) + "\n")
+            np.savez(file, frames=take.frames, actions=take.actions, account=json.dumps(take.account))
 
-    def log(self) -> dict[int, dict]:
-        """The line on every demonstration whose file is there."""
-        path, log = self.unfinished / _LOG, {}
-        for line in path.read_text().splitlines() if path.exists() else ():
-            try:
-                take = json.loads(line)
-            except json.JSONDecodeError:  # the process ended while it wrote this line
-                continue
-            if self._file(take["index"]).exists():
-                log[take["index"]] = take
-        return log
-
-    def finish(self, report: RecordingReport) -> None:
-        frames, actions = [], []
+    def read(self) -> tuple[list[torch.Tensor], list[torch.Tensor], list[dict]]:
+        """Frames, actions and account of all demonstrations."""
+        frames, actions, accounts = [], [], []
         for index in range(self._episodes):
             with np.load(self._file(index), allow_pickle=False) as held:
                 frames.append(torch.from_numpy(held["frames"]).float())
                 actions.append(torch.from_numpy(held["actions"]).float())
-        save_ted(flatten_trajectories(frames, actions), self._folder / "ted", self._task, report.notes)
+                accounts.append(json.loads(held["account"].item()))
+        return frames, actions, accounts
 
     def _file(self, index: int) -> Path:
         return self.unfinished / f"{index:0{max(3, len(str(self._episodes - 1)))}d}.npz"

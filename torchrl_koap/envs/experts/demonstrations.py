@@ -28,13 +28,6 @@ MAX_ATTEMPTS = 20
 BATCH_SIZE = 50  # episodes that are played at once: few enough that the first are over within seconds
 _PER_CONTEXT = 4  # attempts before an episode gets another context
 _CONTEXT_STREAM = 1  # keeps the draws of contexts apart from those of the players
-_MEANING = {
-    "collision": "something forbidden was touched",
-    "unfinished": "no success within the step limit",
-    "mode": "success in another mode than asked for",
-    "close": "passed nearer than any human demonstration",
-    "slow": "took longer than any human demonstration",
-}
 
 
 class RecordingError(RuntimeError):
@@ -42,7 +35,7 @@ class RecordingError(RuntimeError):
 
 
 def record_demonstrations(
-    task: str = "avoiding",
+    task: Task | str = "avoiding",
     episodes: int = 96,
     seed: int = 0,
     num_threads: int = 2,
@@ -58,7 +51,7 @@ def record_demonstrations(
     seed chooses.
 
     Args:
-        task (str): name of the task.
+        task (Task or str): the task.
         episodes (int): number of demonstrations.
         seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
         num_threads (int): threads that advance the physics.
@@ -81,12 +74,12 @@ def record_demonstrations(
         >>> data["action"].shape[1], data["has_action"].all().item(), len(report.modes)
         (2, True, 3)
     """
-    start, facts = time.perf_counter(), get_task(get_task(task).source)
-    disturbance = share_disturbed(get_task(task), disturbance)
+    task, start = get_task(task), time.perf_counter()
     takes = list(
-        iterate_takes(facts, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance)
+        iterate_takes(task, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance)
     )
-    report = RecordingReport.of(facts, seed, takes, time.perf_counter() - start, disturbance)
+    seconds, share = time.perf_counter() - start, share_disturbed(task, disturbance)
+    report = RecordingReport(get_task(task.source), seed, [take.account for take in takes], seconds, share)
     frames = [torch.from_numpy(take.frames) for take in takes]
     return flatten_trajectories(frames, [torch.from_numpy(take.actions) for take in takes], dtype=dtype), report
 
@@ -120,17 +113,13 @@ def iterate_takes(
         >>> [take.index for take in iterate_takes("avoiding", 4, done=[0, 2])]
         [1, 3]
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     disturbance = share_disturbed(task, disturbance)
     task = get_task(task.source)
     expert_of(task)
-    limits = (
-        ("episodes", episodes, 1),
-        ("seed", seed, 0),
-        ("num_threads", num_threads, 1),
-        ("batch_size", batch_size, 1),
-    )
-    for option, value, least in limits:
+    numbers = {"episodes": episodes, "seed": seed, "num_threads": num_threads, "batch_size": batch_size}
+    for option, value in numbers.items():
+        least = 0 if option == "seed" else 1
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")
     disturbed = choose_disturbed(episodes, disturbance, seed)
@@ -140,13 +129,7 @@ def iterate_takes(
 
 
 def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
-    """Returns the mode of every demonstration: each as often as any other, a remainder drawn without repetition.
-
-    Args:
-        episodes (int): number of demonstrations.
-        num_modes (int): modes of the task.
-        seed (int): seed of the remainder.
-    """
+    """Returns the mode of every demonstration: each as often as any other, a remainder drawn without repetition."""
     full, rest = divmod(episodes, num_modes)
     extra = np.random.default_rng(seed).permutation(num_modes)[:rest]
     return [*range(num_modes)] * full + sorted(extra.tolist())
@@ -225,7 +208,7 @@ def _play_batches(
                 raise RecordingError(
                     f"{task.expert} never succeeded: no good attempt out of {MAX_ATTEMPTS} for episodes {missing} of"
                     f" task {task.name!r}, seed {seed}: {counts}; the last one, episode {last[0]} in mode"
-                    f" {modes[last[0]]}, ended as {last[1]!r}: {_MEANING[last[1]]}"
+                    f" {modes[last[0]]}, ended as {last[1]!r}: {FAULTS[last[1]]}"
                 )
             for row in batch:
                 yield takes.pop(row)

@@ -34,22 +34,12 @@ _MEMORY = 0.98  # of the size of the operator's own steps
 
 
 def share_disturbed(task: Task, share: float | None) -> float:
-    """Returns the share of the demonstrations in which the operator is disturbed.
-
-    Args:
-        task (Task): the task, whose own share is taken where none was asked for.
-        share (float, optional): what was asked for.
-    """
+    """Returns the share of the demonstrations in which the operator is disturbed: the task's if none is asked for."""
     return task.defaults.disturbance if share is None else share
 
 
 def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
-    """Draws which episodes of a recording are disturbed, bool ``[episodes]``.
-
-    Args:
-        episodes (int): number of demonstrations.
-        share (float): share of them that is disturbed, 0 to 1.
-        seed (int): seed of the recording. Whether an episode is disturbed does not depend on how many there are.
+    """Draws which episodes of a recording are disturbed, bool ``[episodes]``; none depends on how many there are.
 
     Raises:
         ValueError: if the share is not between 0 and 1.

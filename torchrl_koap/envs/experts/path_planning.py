@@ -20,13 +20,9 @@ FAR = 1e3  # cost of a place that is not reached
 
 @njit(cache=True)
 def square_distance(x, y, square, half):
-    """Computes the signed distance (m) of a point to a square; negative inside.
+    """Computes the signed distance (m) of the point ``x, y`` (m) to a square; negative inside.
 
-    Args:
-        x (float): x of the point (m).
-        y (float): y of the point (m).
-        square (np.ndarray): centre x, y (m), cosine and sine of the yaw [4].
-        half (float): half the width (m).
+    The square is its centre x, y (m), cosine and sine of its yaw [4], and ``half`` its width (m).
     """
     x, y = x - square[0], y - square[1]
     along = abs(square[2] * x + square[3] * y) - half
@@ -65,13 +61,7 @@ def solve_eikonal(slowness, cost, sweeps=2):
 
 @njit(cache=True)
 def value_at(field, x, y):
-    """Interpolates a field bilinearly, constant beyond the border of the grid, NaN for a point that is NaN.
-
-    Args:
-        field (np.ndarray): values on the grid [X, Y].
-        x (float): x of the point (m).
-        y (float): y of the point (m).
-    """
+    """Interpolates a field [X, Y] at ``x, y`` (m): bilinear, constant beyond the border, NaN where they are."""
     if np.isnan(x + y):
         return np.nan
     u = min(max((x - ORIGIN[0]) / STEP, 0.0), field.shape[0] - 1.001)
@@ -92,8 +82,7 @@ def descent(field, x, y, reach=0.016, softness=0.002):
 
     Args:
         field (np.ndarray): values on the grid [X, Y].
-        x (float): x of the point (m).
-        y (float): y of the point (m).
+        x, y (float): the point (m).
         reach (float): the distance (m).
         softness (float): how much above the least one a value still counts, in the unit of the field.
     """

@@ -14,7 +14,8 @@ A *contact* is a row of eight numbers: ``x, y`` of the touched point, direction 
 friction cone, half width of the cone (rad), ``x, y`` of the rod's axis, ``a``, ``delta``; lengths in m, all in the
 tray's frame. A *plan* ``[4]`` for a contact holds the slant of the force against the middle of its cone at the
 beginning, in the middle and at the end of the way (as ``atanh`` of its share of the half width), and the logarithm of
-the length of the rod's way (m).
+the length of the rod's way (m). ``pose`` and ``target`` are where the tray lies now and shall come to lie, ``[3]``:
+x, y (m), yaw (rad).
 """
 
 from __future__ import annotations
@@ -40,12 +41,8 @@ _SHORTEST, _LONGEST = math.log(0.002), math.log(1.2)
 def motion(contact, share):
     """Computes the motion of tray and rod, per metre of the rod's way, in the tray's frame.
 
-    Args:
-        contact (np.ndarray): the contact [8].
-        share (float): slant of the force, -1 to 1 times the half width of the cone.
-
-    Returns:
-        tuple of float: ``vx, vy`` of the tray's centre, its turn (rad/m), ``ux, uy`` of the rod.
+    The force is slanted by ``share``, -1 to 1 times the half width of the cone. Returns ``vx, vy`` of the tray's
+    centre, its turn (rad/m), ``ux, uy`` of the rod.
     """
     angle = contact[2] + contact[3] * share
     fx, fy = math.cos(angle), math.sin(angle)
@@ -58,13 +55,7 @@ def motion(contact, share):
 
 @njit(cache=True)
 def arrive(pose, contact, plan):
-    """Computes the pose of the tray, x, y (m), yaw (rad), at the end of a plan.
-
-    Args:
-        pose (np.ndarray): pose at the beginning [3].
-        contact (np.ndarray): the contact [8].
-        plan (np.ndarray): the plan [4].
-    """
+    """Computes the pose of the tray, x, y (m), yaw (rad), at the end of a plan."""
     x, y, yaw = pose[0], pose[1], pose[2]
     step = math.exp(plan[LENGTH]) / _PIECES
     for piece in range(_PIECES):
@@ -99,14 +90,7 @@ def _residuals(pose, target, contact, plan, out):
 
 @njit(cache=True)
 def improve(pose, target, contact, plan, iterations):
-    """Betters a plan in place by damped Gauss-Newton steps.
-
-    Args:
-        pose (np.ndarray): x, y (m), yaw (rad) of the tray now [3].
-        target (np.ndarray): where it should come to lie [3].
-        contact (np.ndarray): the contact [8].
-        plan (np.ndarray): the plan [4].
-        iterations (int): number of steps.
+    """Betters a plan in place by so many damped Gauss-Newton steps.
 
     Returns:
         float: cost of the plan: squared errors at its end (4 mm and 3 deg cost 1 each), slants, bends and length.
@@ -151,14 +135,7 @@ def improve(pose, target, contact, plan, iterations):
 
 @njit(cache=True)
 def search(pose, target, contact, plan):
-    """Searches the best plan for one contact, from 18 first guesses; returns its cost.
-
-    Args:
-        pose (np.ndarray): x, y (m), yaw (rad) of the tray now [3].
-        target (np.ndarray): where it should come to lie [3].
-        contact (np.ndarray): the contact [8].
-        plan (np.ndarray): receives the plan [4].
-    """
+    """Searches the best plan for one contact, from 18 first guesses, and writes it into ``plan``; returns its cost."""
     least = 1e300
     distance = max(math.hypot(target[0] - pose[0], target[1] - pose[1]), 0.01)
     guess = np.empty(PLAN_SIZE)
@@ -181,8 +158,6 @@ def two_pushes(pose, target, contacts, bounds, aim):
     """Looks for a first push after which a second one, from another contact, leads straight to the target.
 
     Args:
-        pose (np.ndarray): x, y (m), yaw (rad) of the tray now [3].
-        target (np.ndarray): where it should come to lie [3].
         contacts (np.ndarray): contacts to choose from [C, 8].
         bounds (np.ndarray): least and greatest x, least and greatest y of the tray in between [4] (m).
         aim (np.ndarray): the pose between the pushes is written here [3].

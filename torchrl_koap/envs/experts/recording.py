@@ -23,24 +23,22 @@ from torchrl_koap.envs.registry import mode_index_of
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task
 
-FAULTS = ("collision", "unfinished", "mode", "close", "slow")
+FAULTS = {  # why an attempt is discarded; of several the first one is told
+    "collision": "something forbidden was touched",
+    "unfinished": "no success within the step limit",
+    "mode": "success in another mode than asked for",
+    "close": "passed nearer than any human demonstration",
+    "slow": "took longer than any human demonstration",
+}
 
 
 class Attempt(NamedTuple):
-    """What is kept of one attempt.
+    """What is kept of one attempt."""
 
-    Args:
-        frames (np.ndarray): float64 ``[T, obs]``.
-        actions (np.ndarray): float64 ``[T - 1, act]``.
-        steps (int): control steps that were played; one more than actions where D3IL's log was recorded, whose first
-            row is the state after the first of them.
-        fault (str): what went wrong, one of ``FAULTS``; empty if nothing did.
-    """
-
-    frames: np.ndarray
-    actions: np.ndarray
-    steps: int
-    fault: str = ""
+    frames: np.ndarray  # [T, obs]
+    actions: np.ndarray  # [T - 1, act]
+    steps: int  # played; one more than actions in D3IL's log, whose first row is the state after the first of them
+    fault: str = ""  # what went wrong, one of FAULTS; empty if nothing did
 
 
 @dataclass(frozen=True)
@@ -71,8 +69,8 @@ class Expert(abc.ABC):
 
     Args:
         modes (sequence of int): mode of each episode.
-        contexts (np.ndarray, optional): context ``[n, bodies, 3]``; None in a task without bodies.
-        seeds (sequence): seed of each episode.
+        contexts (np.ndarray, optional): context ``[n, bodies, 3]``: x, y (m), yaw (rad); None in a task without bodies.
+        seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
 
     Examples:
         >>> import numpy as np
@@ -96,7 +94,33 @@ class Expert(abc.ABC):
 
     @abc.abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step."""
+        """Decides actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step.
+
+        Raises:
+            ValueError: if the observations have another shape.
+        """
+
+    def _checked(self, observation: np.ndarray, columns: int) -> np.ndarray:
+        """The observations in float64; refused if they are not ``[n, columns]``."""
+        observation = np.asarray(observation, dtype=np.float64)
+        wanted = (len(self.finished), columns)
+        if observation.shape != wanted:
+            raise ValueError(f"observation must have shape {list(wanted)}, got {list(observation.shape)}")
+        return observation
+
+
+def check_episodes(modes: Sequence, seeds: Sequence, contexts: Any = None, objects: int = 0) -> None:
+    """Checks that an expert is told as much about every episode.
+
+    Raises:
+        ValueError: if there is no mode, or the numbers of modes, seeds and, with objects, contexts differ.
+    """
+    asked, got = "seeds", f"{len(modes)} modes and {len(seeds)} seeds"
+    if objects:
+        asked = f"contexts [n, {objects}, 3] and seeds"
+        got = f"{len(modes)} modes, {len(seeds)} seeds and contexts of shape {list(np.shape(contexts))}"
+    if not len(modes) or len(modes) != len(seeds) or (objects and np.shape(contexts) != (len(modes), objects, 3)):
+        raise ValueError(f"as many {asked} as modes are needed, at least one, got {got}")
 
 
 def expert_of(task: Task) -> type[Expert]:

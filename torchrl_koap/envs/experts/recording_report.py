@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,17 +18,6 @@ from torchrl_koap.tasks import Task
 class Take:
     """One demonstration and what it took.
 
-    Args:
-        index (int): number of the demonstration.
-        frames (np.ndarray): float64 ``[T, obs]``.
-        actions (np.ndarray): float64 ``[T - 1, act]``.
-        mode (int): its mode.
-        rows (int): its control steps.
-        attempts (int): attempts it took, 1 if the first one was good.
-        failures (dict): discarded attempts by reason.
-        disturbed (bool): whether the operator was disturbed.
-        spells (tuple): disturbances of the attempt that was kept: first control step, the one after the last, kind.
-
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import iterate_takes
         >>> take = next(iterate_takes("avoiding", 1))
@@ -36,15 +25,21 @@ class Take:
         (0, 1, {}, False)
     """
 
-    index: int
-    frames: np.ndarray
-    actions: np.ndarray
+    index: int  # number of the demonstration
+    frames: np.ndarray  # [T, obs]
+    actions: np.ndarray  # [T - 1, act]
     mode: int
-    rows: int
-    attempts: int
-    failures: dict[str, int]
-    disturbed: bool = False
+    rows: int  # control steps
+    attempts: int  # that it took, 1 if the first one was good
+    failures: dict[str, int]  # discarded attempts by reason
+    disturbed: bool = False  # whether the operator was
+    # disturbances of the attempt that was kept: first control step, the one after the last, kind
     spells: tuple[tuple[int, int, str], ...] = ()
+
+    @property
+    def account(self) -> dict[str, Any]:
+        """All but frames and actions."""
+        return {name: value for name, value in vars(self).items() if name not in ("frames", "actions")}
 
 
 @dataclass(frozen=True)
@@ -52,85 +47,69 @@ class RecordingReport:
     """What was recorded, and what it took.
 
     Args:
-        task (str): name of the task.
+        task (Task): the task.
         seed (int): seed of the recording.
-        modes, rows, attempts (list of int): of each demonstration, as :class:`Take` has them.
-        failures (dict): number of discarded attempts by reason: ``collision``, ``mode``, ``unfinished``,
-            ``close`` (nearly touched a cylinder), ``slow``.
+        takes (sequence of dict): :attr:`Take.account` of each demonstration, in their order.
         seconds (float): wall-clock time.
-        num_modes (int): modes the task has.
         disturbance (float): share of the demonstrations that was to be disturbed.
-        disturbed, spells (list): of each demonstration.
 
     Examples:
-        >>> from torchrl_koap.envs.experts.demonstrations import RecordingReport
-        >>> report = RecordingReport("avoiding", 0, modes=[3, 7], rows=[80, 95], attempts=[1, 2], failures={"mode": 1})
-        >>> str(report)[:39]
-        '2 demonstrations of avoiding in 2 modes'
+        >>> from torchrl_koap.envs.experts.demonstrations import record_demonstrations
+        >>> data, report = record_demonstrations("avoiding", 2)
+        >>> str(report)[:39], len(report.modes)
+        ('2 demonstrations of avoiding in 2 modes', 2)
     """
 
-    task: str
+    task: Task
     seed: int
-    modes: list[int]
-    rows: list[int]
-    attempts: list[int]
-    failures: dict[str, int] = field(default_factory=dict)
+    takes: Sequence[Mapping[str, Any]]
     seconds: float = 0.0
-    num_modes: int = 0
     disturbance: float = 0.0
-    disturbed: list[bool] = field(default_factory=list)
-    spells: list[list[tuple[int, int, str]]] = field(default_factory=list)
 
-    @classmethod
-    def of(cls, task: Task, seed: int, takes: Sequence[Take | dict], seconds: float, disturbance: float = 0.0):
-        """Sums up all demonstrations of a recording.
+    @property
+    def modes(self) -> list[int]:
+        """Mode of each demonstration."""
+        return [take["mode"] for take in self.takes]
 
-        Args:
-            task (Task): the task.
-            seed (int): seed of the recording.
-            takes (sequence of Take, or of mappings with its entries): in the order of the demonstrations.
-            seconds (float): wall-clock time.
-            disturbance (float): share of the demonstrations that was to be disturbed.
-        """
-        rows = [take if isinstance(take, dict) else vars(take) for take in takes]
-        return cls(
-            task.name,
-            seed,
-            modes=[row["mode"] for row in rows],
-            rows=[row["rows"] for row in rows],
-            attempts=[row["attempts"] for row in rows],
-            failures={name: sum(row["failures"].get(name, 0) for row in rows) for name in FAULTS},
-            seconds=seconds,
-            num_modes=task.num_modes,
-            disturbance=disturbance,
-            disturbed=[bool(row["disturbed"]) for row in rows],
-            spells=[[tuple(spell) for spell in row["spells"]] for row in rows],
-        )
+    @property
+    def rows(self) -> list[int]:
+        """Control steps of each demonstration."""
+        return [take["rows"] for take in self.takes]
+
+    @property
+    def attempts(self) -> list[int]:
+        """Attempts that each demonstration took."""
+        return [take["attempts"] for take in self.takes]
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """Number of discarded attempts by reason."""
+        return {name: sum(take["failures"].get(name, 0) for take in self.takes) for name in FAULTS}
 
     @property
     def notes(self) -> dict[str, Any]:
         """What ``about.json`` says of the recording. Disturbances are told only where there are any."""
-        notes = {"seed": self.seed, "modes": list(self.modes), "attempts": list(self.attempts)}
-        notes["discarded_attempts"] = dict(self.failures)
+        notes = {"seed": self.seed, "modes": self.modes, "attempts": self.attempts}
+        notes["discarded_attempts"] = self.failures
         if not self.disturbance:
             return notes
-        chosen = [attempts for attempts, disturbed in zip(self.attempts, self.disturbed, strict=True) if disturbed]
+        chosen = [take["attempts"] for take in self.takes if take["disturbed"]]
         return notes | {
             "disturbance": {
                 "share": self.disturbance,
                 "disturbed_demonstrations": len(chosen),
                 "attempts_under_disturbance": sum(chosen),
                 "recovered_at_the_first_attempt": chosen.count(1),
-                "kept": count_spells(self.spells),
-                "spells": [[list(spell) for spell in spells] for spells in self.spells],
+                "kept": count_spells([take["spells"] for take in self.takes]),
+                "spells": [[list(spell) for spell in take["spells"]] for take in self.takes],
             }
         }
 
     def __str__(self) -> str:
         discarded = ", ".join(f"{count} {reason}" for reason, count in self.failures.items() if count) or "none"
-        counts = [self.modes.count(mode) for mode in range(self.num_modes or max(self.modes) + 1)]
+        counts = [self.modes.count(mode) for mode in range(self.task.num_modes)]
         return (
-            f"{len(self.modes)} demonstrations of {self.task} in {len(set(self.modes))} modes"
+            f"{len(self.modes)} demonstrations of {self.task.name} in {len(set(self.modes))} modes"
             f" ({', '.join(map(str, counts))}), {min(self.rows)} to {max(self.rows)} rows, {self.seconds:.1f} s;"
             f" {self.attempts.count(1)} good at the first attempt; discarded attempts: {discarded}{self._disturbances}"
         )

@@ -22,7 +22,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
 from torchrl_koap.envs.experts.sorting_decision import decide, pushing_cost
 from torchrl_koap.envs.sorting import box_colours, mode_colours
 from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X
@@ -42,37 +42,18 @@ class SortingExpert(Expert):
     """Scripted expert of Sorting for a batch of episodes, one mode and one seed each.
 
     Args:
-        modes (sequence of int): the order of colours each episode shall take, numbers as
-            :func:`~torchrl_koap.envs.sorting.mode_index` gives them.
-        contexts (array): contexts of the episodes [n, num_boxes, 3]; only their numbers are looked at, the player sees
-            the boxes themselves.
-        seeds (sequence): for each episode a tuple of integers, as for ``numpy.random.default_rng``.
+        modes (sequence of int): orders of colours, see :func:`~torchrl_koap.envs.sorting.mode_index`; contexts and
+            seeds as :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
 
     Raises:
         ValueError: if a mode does not exist or the numbers of modes, contexts and seeds differ.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs import SortingEnv
-        >>> from torchrl_koap.envs.contexts import evaluation_contexts
-        >>> from torchrl_koap.envs.experts.sorting import SortingExpert
-        >>> contexts = evaluation_contexts("sorting_2", 2)
-        >>> env = SortingEnv(2, num_boxes=2, contexts=contexts, dtype=torch.float64)
-        >>> expert = SortingExpert([0, 1], contexts, [(1, 0), (1, 1)])
-        >>> expert.act(env.reset()["observation"].numpy()).shape, expert.finished.tolist()
-        ((2, 2), [False, False])
     """
 
     rules = RecordingRules(most_rows=699)
 
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
-        modes, seeds, contexts = list(modes), list(seeds), np.asarray(contexts)
-        num_boxes = contexts.shape[1] if contexts.ndim == 3 else 0
-        if not modes or len(modes) != len(seeds) or contexts.shape != (len(modes), num_boxes, 3):
-            raise ValueError(
-                f"as many modes, contexts [num_boxes, 3] and seeds are needed, at least one, got {len(modes)} modes,"
-                f" contexts of shape {list(contexts.shape)}, {len(seeds)} seeds"
-            )
+        num_boxes = np.shape(contexts)[1] if np.ndim(contexts) == 3 else 2
+        check_episodes(modes, seeds, contexts, num_boxes)
         self._colours = box_colours(num_boxes)
         self._orders = np.array([mode_colours(mode, num_boxes) for mode in modes])
         drawn = [_draw(np.random.default_rng(seed), num_boxes) for seed in seeds]
@@ -95,15 +76,8 @@ class SortingExpert(Expert):
         return self._rest > _LINGER
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step: change of the commanded xy [n, 2] (m) under observations [n, 4 + 3 num_boxes].
-
-        Raises:
-            ValueError: if the shape is wrong or something is NaN.
-        """
-        observation = np.asarray(observation, dtype=np.float64)
-        wanted = (len(self._target), 4 + 3 * len(self._colours))
-        if observation.shape != wanted:
-            raise ValueError(f"observation must have shape {list(wanted)}, got {list(observation.shape)}")
+        """Decides changes of the commanded xy [n, 2] (m) under observations [n, 4 + 3 num_boxes], which hold no NaN."""
+        observation = self._checked(observation, 4 + 3 * len(self._colours))
         if np.isnan(observation).any():
             raise ValueError(f"observation must not hold NaN, row {int(np.isnan(observation).any(1).argmax())} does")
         boxes = observation[:, 4:].reshape(len(observation), -1, 3)

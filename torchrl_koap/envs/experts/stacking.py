@@ -22,8 +22,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules
-from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
+from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.stacking import BOXES, TARGET
 
@@ -49,34 +49,17 @@ class StackingExpert(Expert):
     """Scripted expert of Stacking for a batch of episodes, one order and one seed each.
 
     Args:
-        modes (sequence of int): order of the boxes of each episode, 0 to 5, see
-            :func:`~torchrl_koap.envs.stacking.mode_index`.
-        contexts (array): contexts [n, 3, 3] of the episodes. The expert looks at the observed boxes only.
-        seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
+        modes (sequence of int): orders of the boxes, 0 to 5, see :func:`~torchrl_koap.envs.stacking.mode_index`;
+            contexts and seeds as :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
 
     Raises:
         ValueError: if a mode does not exist or the numbers of modes, contexts and seeds differ.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs import StackingEnv
-        >>> from torchrl_koap.envs.contexts import evaluation_contexts
-        >>> from torchrl_koap.envs.experts.stacking import StackingExpert
-        >>> contexts = evaluation_contexts("stacking", 1)
-        >>> env, expert = StackingEnv(1, contexts=contexts, dtype=torch.float64), StackingExpert([3], contexts, [0])
-        >>> expert.act(env.reset()["observation"].numpy()).shape, expert.finished.tolist()
-        ((1, 8), [False])
     """
 
     rules = RecordingRules(most_rows=999)
 
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
-        modes, seeds, shape = list(modes), list(seeds), np.shape(contexts)
-        if not modes or len(modes) != len(seeds) or shape != (len(modes), 3, 3):
-            raise ValueError(
-                "as many contexts [n, 3, 3] and seeds as modes are needed, at least one, got"
-                f" {len(modes)} modes, {len(seeds)} seeds and contexts of shape {list(shape)}"
-            )
+        check_episodes(modes, seeds, contexts, 3)
         for mode in modes:
             if mode not in range(6):
                 raise ValueError(f"mode must be 0 to 5, got {mode}")
@@ -91,14 +74,8 @@ class StackingExpert(Expert):
         return np.array([person.finished for person in self._people])
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step: change of the commanded joints (rad) and gripper command (m) [n, 8].
-
-        Raises:
-            ValueError: if the observation is not [n, 31].
-        """
-        observation = np.asarray(observation, dtype=np.float64)
-        if observation.shape != (len(self._people), 31):
-            raise ValueError(f"observation must be [{len(self._people)}, 31], got {list(observation.shape)}")
+        """Decides the next control step: change of the commanded joints (rad) and gripper command (m) [n, 8]."""
+        observation = self._checked(observation, 31)
         seen = {name: observation[:, columns] for name, columns in self._parts.items()}
         commanded = seen["desired_joints_and_gripper"][:, :7]
         _, turned = tcp_pose(seen["measured_joints"])

@@ -31,7 +31,6 @@ FINGER_RESET = 0.001
 
 # Columns of the pointer table: addresses of one simulation's arrays inside its mjData.
 QPOS, QVEL, CTRL, BIAS, TCP_POS, TCP_QUAT, ANCHORS, JOINT_AXES, OBJECTS = range(9)
-NUM_POINTERS = 9
 # Columns of the log row written after the first substep of a control step; the free bodies' poses follow them.
 LOG_COLUMNS = {
     "j_pos": slice(0, 7),
@@ -128,7 +127,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
         step (int): address of ``mj_step``.
         model (int): address of the shared mjModel.
         data (np.ndarray): addresses of the mjData [n], int64.
-        pointers (np.ndarray): addresses of their arrays [n, NUM_POINTERS], int64.
+        pointers (np.ndarray): addresses of their arrays [n, 9], int64.
         rows (np.ndarray): indices of the simulations to advance, int64.
         commands (np.ndarray): TCP position (m) and quaternion [n, 7], float64.
         widths (np.ndarray): finger targets [n] (m).

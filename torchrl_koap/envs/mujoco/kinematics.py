@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Compiled kinematics of the Panda arm: the pose of the tool, and the damped steps towards a pose of the original.
+"""Compiled kinematics of the Panda arm: the pose of its tool centre point (TCP), and damped steps towards a pose.
 
 Plain float64 arithmetic in a fixed order (docs/d3il.md, Controller).
 """
@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from torchrl_koap.envs.mujoco.linear_algebra import clip, solve_clipped
+from torchrl_koap.tasks.panda_kinematics import LINKS
 
 TIMESTEP = 0.001
 # Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973.
@@ -18,7 +19,7 @@ Q_MAX = np.array([2.8973, 1.7628, 2.0, -0.0698, 2.8973, 3.7525, 2.8973])
 Q_REST = np.array([0.0, 0.174, 0.0, -0.872, 0.0, 1.222, 0.785])
 
 IK_ITERATIONS = 3
-
+_OFFSETS, _TURNS = np.array([offset for offset, _ in LINKS]), np.array([turn for _, turn in LINKS])
 _COS45 = 0.5**0.5
 
 
@@ -65,19 +66,7 @@ def forward_kinematics(q, axes, origins, tcp, quat):
             axes[0, i, k] = 1.0 if i == k else 0.0
     origins[0, 0], origins[0, 1], origins[0, 2] = 0.0, 0.0, 0.0
     for index in range(1, 8):
-        along_x, along_y, along_z, turn = 0.0, 0.0, 0.0, 1
-        if index == 1:
-            along_z, turn = 0.333, 0
-        elif index == 2:
-            turn = -1
-        elif index == 3:
-            along_y = -0.316
-        elif index == 4:
-            along_x = 0.0825
-        elif index == 5:
-            along_x, along_y, turn = -0.0825, 0.384, -1
-        elif index == 7:
-            along_x = 0.088
+        along_x, along_y, along_z = _OFFSETS[index - 1]
         for k in range(3):
             origins[index, k] = (
                 origins[index - 1, k]
@@ -85,7 +74,7 @@ def forward_kinematics(q, axes, origins, tcp, quat):
                 + axes[index - 1, 1, k] * along_y
                 + axes[index - 1, 2, k] * along_z
             )
-        _next_frame(axes, index, turn)
+        _next_frame(axes, index, _TURNS[index - 1])
         _rotate(axes, index, q[index - 1])
     for k in range(3):
         tcp[k] = origins[7, k] + 0.212 * axes[7, 2, k]
@@ -164,3 +153,66 @@ def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, ta
         scale = 3.0 / np.sqrt(square) if square > 9.0 else 1.0
         for j in range(7):
             q[j] = clip(q[j] + TIMESTEP * scale * null[j], Q_MIN[j], Q_MAX[j])
+
+
+@njit(cache=True)
+def _poses(joints, positions, quaternions):
+    axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
+    for row in range(len(joints)):
+        forward_kinematics(joints[row], axes, origins, positions[row], quaternions[row])
+
+
+@njit(cache=True)
+def _follow(joints, poses, iterations):
+    axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
+    tcp, quat = np.empty(3), np.empty(4)
+    jacobian, matrix, factor, vectors = np.empty((6, 7)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    task, null = np.empty(6), np.empty(7)
+    for row in range(len(joints)):
+        for _ in range(iterations):
+            scratch = (axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors)
+            inverse_kinematics(poses[row], joints[row], *scratch)
+
+
+def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Computes positions [n, 3] (m) and quaternions [n, 4] (w, x, y, z) of the TCP for joint angles [n, 7] (rad)."""
+    joints = _rows(joints, "joints")
+    positions, quaternions = np.empty((len(joints), 3)), np.empty((len(joints), 4))
+    _poses(joints, positions, quaternions)
+    return positions, quaternions
+
+
+def follow_pose(joints: np.ndarray, poses: np.ndarray, substeps: int = 30) -> np.ndarray:
+    """Computes the joint targets [n, 7] that the controller reaches when it tracks poses for one control step.
+
+    D3IL's Stacking data were recorded so: a person commanded poses, policies learn the joint targets that followed.
+
+    Args:
+        joints (np.ndarray): present joint targets [n, 7] (rad).
+        poses (np.ndarray): wanted TCP position (m) and unit quaternion [n, 7]. In 30 ms positions some centimetres
+            away are reached, and turns for about three quarters.
+        substeps (int): milliseconds of tracking.
+
+    Raises:
+        ValueError: if a shape is wrong.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
+        >>> from torchrl_koap.envs import StackingEnv
+        >>> joints = follow_pose([StackingEnv.START_JOINTS], [[0.53, 0.01, 0.29, 0, 1, 0, 0]])
+        >>> tcp_pose(joints)[0].round(4).tolist()
+        [[0.53, 0.01, 0.29]]
+    """
+    joints, poses = _rows(joints, "joints").copy(), _rows(poses, "poses")
+    if len(joints) != len(poses):
+        raise ValueError(f"as many poses as rows of joints are needed, got {len(poses)} and {len(joints)}")
+    _follow(joints, poses, substeps)
+    return joints
+
+
+def _rows(array, name: str) -> np.ndarray:
+    array = np.ascontiguousarray(array, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 7:
+        raise ValueError(f"{name} must be [n, 7], got shape {list(array.shape)}")
+    return array

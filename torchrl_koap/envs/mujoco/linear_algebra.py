@@ -14,13 +14,7 @@ EIGENVALUE_MIN, EIGENVALUE_MAX = 0.01, 100.0
 
 @njit(cache=True)
 def clip(value, low, high):
-    """Returns the value, or the bound that it lies beyond.
-
-    Args:
-        value (float): the value.
-        low (float): least value returned.
-        high (float): greatest value returned.
-    """
+    """Returns the value, or the bound that it lies beyond."""
     return min(max(value, low), high)
 
 

@@ -66,17 +66,11 @@ class SimulationBatch:
         self._executor_pid: int | None = None
 
     def _arrays(self, data: mujoco.MjData) -> list[int]:
-        arrays: list[np.ndarray | None] = [None] * controller.NUM_POINTERS
-        arrays[controller.QPOS] = data.qpos[self._qpos_start :]
-        arrays[controller.QVEL] = data.qvel[self._qvel_start :]
-        arrays[controller.CTRL] = data.ctrl
-        arrays[controller.BIAS] = data.qfrc_bias[self._qvel_start :]
-        arrays[controller.TCP_POS] = data.xpos[self._tcp]
-        arrays[controller.TCP_QUAT] = data.xquat[self._tcp]
-        arrays[controller.ANCHORS] = data.xanchor[self._joint :]
-        arrays[controller.JOINT_AXES] = data.xaxis[self._joint :]
-        arrays[controller.OBJECTS] = data.qpos
-        return [array.ctypes.data for array in arrays]
+        """Addresses of what the controller reads and writes, in the order of its pointer table."""
+        joints, speeds = data.qpos[self._qpos_start :], data.qvel[self._qvel_start :]
+        bias, tcp = data.qfrc_bias[self._qvel_start :], (data.xpos[self._tcp], data.xquat[self._tcp])
+        axes = (data.xanchor[self._joint :], data.xaxis[self._joint :])
+        return [array.ctypes.data for array in (joints, speeds, data.ctrl, bias, *tcp, *axes, data.qpos)]
 
     def __len__(self) -> int:
         return len(self.data)

@@ -39,7 +39,6 @@ class ScoopingEnv(ManipulationEnv):
     ``success``     [n, 1]       bool              the spoon has left the bowl with a piece on it
     ``mode``        [n, 1]       bool              the spoon has reached over the rim
     ``context``     [n, 1, 3]    ``dtype``         where the spoon starts, x, y (m); how the pieces lie (rad)
-    ``reward``      [n, 1]       ``dtype``         1 where ``success`` else 0
     =============== ============ ================= ============================================================
 
     A step is a frame of 100 ms, in which the joints' servos are commanded three times (30 Hz), on a straight line from

@@ -16,30 +16,15 @@ from torchrl_koap.tasks.scooping import FRAME_HZ, START_HEIGHT, STARTS
 
 @dataclass(frozen=True)
 class Habits:
-    """Speed, path and height of an embodiment that moves the spoon.
+    """Speed, path and height of an embodiment that moves the spoon."""
 
-    Args:
-        speed (float): of the spoon in the air (m/s).
-        drag (float): of the spoon in the bowl (m/s).
-        headings (tuple of float): direction of the stroke from each start position (rad).
-        heading_sigma (float): its spread (rad).
-        wander (float): typical deviation from the planned path (m).
-        tilt (float): typical roll of the spoon (rad).
-        above (float): height at which it comes over the bowl (m).
-
-    Examples:
-        >>> from torchrl_koap.envs.scooping.expert import HABITS
-        >>> HABITS["hand"].speed > HABITS["robot"].speed
-        True
-    """
-
-    speed: float
-    drag: float
-    headings: tuple[float, ...]
-    heading_sigma: float
-    wander: float
-    tilt: float
-    above: float
+    speed: float  # of the spoon in the air (m/s)
+    drag: float  # of the spoon in the bowl (m/s)
+    headings: tuple[float, ...]  # direction of the stroke from each start position (rad)
+    heading_sigma: float  # its spread (rad)
+    wander: float  # typical deviation from the planned path (m)
+    tilt: float  # typical roll of the spoon (rad)
+    above: float  # height at which it comes over the bowl (m)
 
 
 HABITS = {
@@ -155,10 +140,7 @@ class ScoopingExpert:
 def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics | None = None) -> np.ndarray:
     """Returns the joints with which an episode begins: ``[7]`` (rad), of the hand ``[6]`` (m, rad).
 
-    Args:
-        context (np.ndarray): context ``[bodies, 3]``; its first row says where the spoon is, x, y (m).
-        embodiment (str): ``"robot"`` or ``"hand"``.
-        arm (SpoonKinematics, optional): where there is one already.
+    The first row of a context ``[bodies, 3]`` says where the spoon is, x, y (m).
     """
     position = np.array([context[0, 0], context[0, 1], START_HEIGHT])
     if embodiment == "hand":

@@ -13,12 +13,9 @@ _DAMPING, _PULL = 1e-4, 0.05
 
 
 def rotation_of(yaw: float, pitch: float, roll: float = 0.0) -> np.ndarray:
-    """Computes the axes of a spoon ``[3, 3]``, in columns, turned by yaw, then pitch (nose down), then roll.
+    """Computes the axes of a spoon ``[3, 3]``, in columns.
 
-    Args:
-        yaw (float): about z (rad).
-        pitch (float): about the turned y, positive nose down (rad).
-        roll (float): about the turned x (rad).
+    It is turned by yaw, then by pitch about the turned y, positive nose down, then by roll about the turned x (rad).
     """
     (cy, sy), (cp, sp), (cr, sr) = ((np.cos(angle), np.sin(angle)) for angle in (yaw, pitch, roll))
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])

@@ -29,51 +29,31 @@ CAMERA = "third_person"
 class VideoReport:
     """What a recording came to.
 
-    Args:
-        embodiment (str): who was recorded.
-        episodes (int): demonstrations that were kept.
-        attempts (int): demonstrations that were played.
-        frames (int): frames of those that were kept.
-        again (int): how many of those scooped more than once.
-
     Examples:
         >>> from torchrl_koap.envs.scooping.recording import VideoReport
         >>> print(VideoReport("hand", episodes=2, attempts=3, frames=130, again=1))
         2 demonstrations by a hand, 130 frames; 3 were played to get them, 1 scoop more than once
     """
 
-    embodiment: str
-    episodes: int
-    attempts: int
-    frames: int
-    again: int
+    embodiment: str  # who was recorded
+    episodes: int  # demonstrations that were kept
+    attempts: int  # demonstrations that were played
+    frames: int  # of those that were kept
+    again: int  # how many of those scooped more than once
 
     def __str__(self) -> str:
         kept = f"{self.episodes} demonstrations by a {self.embodiment}, {self.frames} frames"
         return f"{kept}; {self.attempts} were played to get them, {self.again} scoop more than once"
 
 
-def play_episodes(
-    embodiment: str, episodes: int, seed: int = 0, *, task: str = "scooping"
-) -> Iterator[tuple[ImageEpisode, int, int]]:
+def _play_episodes(embodiment: str, episodes: int, seed: int, task: str) -> Iterator[tuple[ImageEpisode, int, int]]:
     """Plays demonstrations in their order; one that does not succeed is played again, from another place.
 
     They begin at the start positions in turn, so that the first few of them have seen them all.
 
-    Args:
-        embodiment (str): ``"robot"`` or ``"hand"``.
-        episodes (int): number of demonstrations.
-        seed (int): of starts and players.
-        task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
-
     Yields:
         tuple: the demonstration, how often it was played, and how often the spoon went into the bowl.
-
-    Raises:
-        ValueError: for another embodiment, or a number out of range.
-        RuntimeError: if nothing can be drawn, or the expert fails again and again.
     """
-    _check(embodiment, episodes, seed)
     sims, arm = ScoopingSimulations(embodiment, 1), SpoonKinematics()
     renderer = Renderer(sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)
     stream, rows = sorted(HABITS).index(embodiment), np.zeros(1, dtype=np.int64)
@@ -86,25 +66,18 @@ def play_episodes(
                 sims.reset(rows, start_joints(context, embodiment, arm)[None], [context[0, 2]], bowls)
                 expert = ScoopingExpert(sims, 0, start_of(context), own)
                 episode = _play(sims, expert, lambda: renderer.render(sims.data[0], CAMERA))
-                if episode is not None and bowls is not None:
+                if episode is None:
+                    continue
+                if bowls is not None:
                     stands = np.repeat(bowls, len(episode.frames), axis=0)
                     episode = replace(episode, state=np.concatenate([episode.state, stands], axis=1))
-                if episode is not None:
-                    yield episode, attempt + 1, expert.attempts
-                    break
+                yield episode, attempt + 1, expert.attempts
+                break
             else:
                 raise RuntimeError(f"the {embodiment} never succeeded in {MAX_ATTEMPTS} attempts, episode {number}")
     finally:
         renderer.close()
         sims.close()
-
-
-def _check(embodiment: str, episodes: int, seed: int) -> None:
-    lookup(HABITS, embodiment, "embodiment")
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
-    if seed < 0:
-        raise ValueError(f"seed must be at least 0, got {seed}")
 
 
 def _context_at(task: str, start: int, generator: np.random.Generator) -> np.ndarray:
@@ -159,8 +132,11 @@ def record_videos(
         ValueError: for another embodiment, or a number out of range.
         RuntimeError: if there is no OpenGL library, pyarrow is missing, or the expert fails again and again.
     """
-    task = get_task(task) if isinstance(task, str) else task
-    _check(embodiment, episodes, seed)
+    task = get_task(task)
+    lookup(HABITS, embodiment, "embodiment")
+    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0)):
+        if value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}")
     writer = LeRobotWriter(
         folder,
         fps=FRAME_HZ,
@@ -171,7 +147,7 @@ def record_videos(
         task="take a piece out of the bowl with the spoon",
     )
     attempts, frames, again = 0, 0, 0
-    for number, (episode, played, scooped) in enumerate(play_episodes(embodiment, episodes, seed, task=task.name), 1):
+    for number, (episode, played, scooped) in enumerate(_play_episodes(embodiment, episodes, seed, task.name), 1):
         writer.add(episode.state, episode.action, frames=episode.frames)
         attempts, frames, again = attempts + played, frames + len(episode.frames), again + int(scooped > 1)
         if progress is not None:

@@ -8,11 +8,11 @@ is only roughly that of the meshes (``docs/results/scooping.md``).
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import mujoco
 
 from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks.panda_kinematics import LINKS
 from torchrl_koap.tasks.scooping import BOWL, BOWL_RADIUS, EMBODIMENTS, NUM_PIECES, PIECE_RADIUS, RIM_HEIGHT, RIM_RADIUS
 
 TIMESTEP = 1 / 180
@@ -133,19 +133,15 @@ def _spoon() -> str:
 <site name="spoon" size="0.002" rgba="0 0 0 0"/>"""
 
 
-# offset (m), quarter turn about x, and capsules (from, to, radius, dark) of the links
-_LINKS: tuple[tuple[Any, ...], ...] = (
-    ((0, 0, 0.333), 0, [((0, 0, -0.19), (0, 0, -0.03), 0.06, False)]),
-    ((0, 0, 0), -1, [((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)]),
-    ((0, -0.316, 0), 1, [((0, 0, -0.13), (0, 0, -0.03), 0.055, False), ((0.0, 0, 0), (0.08, 0, 0), 0.05, True)]),
-    ((0.0825, 0, 0), 1, [((0, 0, -0.04), (0, 0, 0.04), 0.055, False), ((0, 0, 0), (-0.08, 0.09, 0), 0.055, False)]),
-    (
-        (-0.0825, 0.384, 0),
-        -1,
-        [((0, 0, -0.26), (0, 0.03, -0.14), 0.05, False), ((0, 0.05, -0.12), (0, 0.03, 0), 0.04, False)],
-    ),
-    ((0, 0, 0), 1, [((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)]),
-    ((0.088, 0, 0), 1, [((0, 0, 0.0), (0, 0, 0.08), 0.045, False)]),
+# capsules of the links: from, to, radius, whether dark
+_CAPSULES: tuple[tuple[tuple, ...], ...] = (
+    (((0, 0, -0.19), (0, 0, -0.03), 0.06, False),),
+    (((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)),
+    (((0, 0, -0.13), (0, 0, -0.03), 0.055, False), ((0.0, 0, 0), (0.08, 0, 0), 0.05, True)),
+    (((0, 0, -0.04), (0, 0, 0.04), 0.055, False), ((0, 0, 0), (-0.08, 0.09, 0), 0.055, False)),
+    (((0, 0, -0.26), (0, 0.03, -0.14), 0.05, False), ((0, 0.05, -0.12), (0, 0.03, 0), 0.04, False)),
+    (((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)),
+    (((0, 0, 0.0), (0, 0, 0.08), 0.045, False),),
 )
 _LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
 _HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
@@ -157,7 +153,7 @@ FLANGE = 0.107  # m, along the last joint's axis
 
 def _arm() -> str:
     xml, closing = '<geom type="capsule" size="0.07" fromto="-0.06 0 0.06 0 0 0.06" rgba="0.93 0.93 0.93 1"/>', ""
-    for index, (offset, turn, capsules) in enumerate(_LINKS, 1):
+    for index, ((offset, turn), capsules) in enumerate(zip(LINKS, _CAPSULES, strict=True), 1):
         quat = {0: "1 0 0 0", -1: "0.707107 -0.707107 0 0", 1: "0.707107 0.707107 0 0"}[turn]
         place = " ".join(str(v) for v in offset)
         armature = 0.6 if index <= 4 else 0.25
