@@ -51,7 +51,7 @@ def test_parity_with_the_original_from_its_state():
         assert out["success"][i].item() == bool(recorded[f"ep{i}_success"][k - 1] if k else False), where
         assert packed(out["mode"][i]) == recorded[f"ep{i}_mode"][k], where
         third = recorded[f"ep{i}_min_inds"][k]  # there blue boxes count from 3
-        assert env.arrivals[i].tolist() == np.where(third >= 3, third - 1, third)[:4].tolist(), where
+        assert env._noted[i].tolist() == np.where(third >= 3, third - 1, third)[:4].tolist(), where
 
     replay(env, recorded, check, 2)
     assert worst["tcp"].max() < 1e-9, worst  # 1e-6 mm
@@ -153,7 +153,7 @@ def test_one_arrival_per_step_nearest_first_and_never_taken_back():
     red, blue = (0.41, 0.32), (0.625, 0.32)
     assert put(env, [red, away, away, blue]) == (False, [1, -1, -1, -1])  # the blue one lies nearer to its centre
     assert put(env, [red, away, away, blue])[1] == [1, 0, -1, -1]
-    assert env.arrivals[0].tolist() == [3, 0, -1, -1]
+    assert env._noted[0].tolist() == [3, 0, -1, -1]
     assert put(env, [away, (0.4, 0.215), (0.7, 0.40), away])[1] == [1, 0, -1, -1]  # the nearest is not inside: nothing
     assert put(env, [away, away, (0.7, 0.40), away])[1] == [1, 0, 1, -1]
     assert put(env, [away, (0.625, 0.32), away, away])[1] == [1, 0, 1, -1]  # red in the blue bin
@@ -161,9 +161,9 @@ def test_one_arrival_per_step_nearest_first_and_never_taken_back():
     assert put(env, [red, red, blue, blue]) == (True, [1, 0, 1, 0])
     assert mode_index(torch.as_tensor(env._mode)).tolist() == [4, -1]
     env.set_state(1, env.get_state(0))
-    assert env.arrivals[1].tolist() == [3, 0, 2, 1] and env._mode[1].tolist() == [1, 0, 1, 0]
+    assert env._noted[1].tolist() == [3, 0, 2, 1] and env._mode[1].tolist() == [1, 0, 1, 0]
     env.reset()
-    assert env._mode.tolist() == [[-1] * 4] * 2 and env.arrivals.tolist() == [[-1] * 4] * 2
+    assert env._mode.tolist() == [[-1] * 4] * 2 and env._noted.tolist() == [[-1] * 4] * 2
 
 
 def test_success_is_told_one_step_late():

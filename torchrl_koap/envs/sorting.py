@@ -11,7 +11,7 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import scene
-from torchrl_koap.tasks.features import tan_yaw
+from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.sorting import (
     BIN_HALF,
     BIN_RANGE,
@@ -124,7 +124,7 @@ class SortingEnv(ManipulationEnv):
         self._noted = self._episode["noted"]
 
     def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:
-        noted = np.full((num_envs, len(self._colours)), -1)  # boxes in order of arrival
+        noted = np.full((num_envs, len(self._colours)), -1)  # boxes in order of arrival, by their number in the state
         return super()._episode_arrays(num_envs) | {"noted": noted}
 
     def _place(self, rows: np.ndarray) -> np.ndarray:
@@ -140,11 +140,6 @@ class SortingEnv(ManipulationEnv):
         return np.concatenate(
             [self._commands[rows, :2], self.sims.tcp_position[rows, :2], boxes.reshape(len(rows), -1)], axis=1
         )
-
-    @property
-    def arrivals(self) -> np.ndarray:
-        """Boxes noted so far, in order of arrival: their number in the state, -1 where none, int64 [n, num_boxes]."""
-        return self._noted.copy()
 
     def _inside(self, rows: np.ndarray) -> np.ndarray:
         """Which boxes are in their bins, height not considered, bool [len(rows), num_boxes]."""

@@ -13,7 +13,7 @@ from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.features import tan_yaw
+from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
 
 OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them

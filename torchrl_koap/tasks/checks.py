@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, get_args
 
 from torchrl_koap.tasks.action_rules import Action, ActionKind
-from torchrl_koap.tasks.features import FEATURES
+from torchrl_koap.tasks.columns import FEATURES
 
 if TYPE_CHECKING:
     from torchrl_koap.tasks.task import Task

@@ -1,5 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Observation columns, and what of them makes up the state that planner and controller see."""
+"""Observation columns, and what of them makes up the state that planner and controller see: angles without poles.
+
+D3IL hands out ``tan(yaw)``, which has poles, and whole quaternions, of which a box on a table uses one angle. Both
+become a point on the unit circle; ``tan(yaw)`` tells the yaw up to half a turn only.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,49 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_koap.lookup import resolve
-from torchrl_koap.tasks.features import FEATURE_COLUMNS, FEATURES
+
+
+def plain(columns: Tensor) -> Tensor:
+    """Returns the columns as they are."""
+    return columns
+
+
+def plane(position: Tensor) -> Tensor:
+    """Returns ``x, y`` of a position ``[*B, 3]`` whose height is that of the surface it lies on."""
+    return position[..., :2]
+
+
+def double_yaw(tan_yaw: Tensor) -> Tensor:
+    """Computes ``cos 2 yaw, sin 2 yaw`` from ``tan(yaw)`` ``[*B, 1]``: continuous where the tangent has its poles."""
+    double = 2 * tan_yaw.atan()
+    return torch.cat([double.cos(), double.sin()], -1)
+
+
+def yaw_of(quaternion: Tensor) -> Tensor:
+    """Computes ``cos yaw, sin yaw`` from quaternions ``[*B, 4]`` (w, x, y, z), whose sign does not matter."""
+    w, x, y, z = quaternion.unbind(-1)
+    direction = torch.stack([1 - 2 * (y * y + z * z), 2 * (w * z + x * y)], -1)
+    return direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+
+
+def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
+    """Computes the tangent of the yaw ``[...]`` of quaternions ``[..., 4]`` (w, x, y, z) as D3IL does.
+
+    The sign of ``x y`` is the original's, which matters for tilted boxes only.
+    """
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2)))
+
+
+# names that a feature gives to its columns; those of a plain part, and of a feature of one's own, are numbered
+FEATURE_COLUMNS = {"plane": ("x", "y"), "tan_yaw": ("cos_2yaw", "sin_2yaw"), "quaternion": ("cos_yaw", "sin_yaw")}
+# a feature of one's own is named by its import string
+FEATURES = {"plain": plain, "plane": plane, "tan_yaw": double_yaw, "quaternion": yaw_of}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +67,7 @@ class Columns:
         observation_units (tuple of str): unit of every observation column; empty: m for positions, rad for angles.
         command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
             never shown to planner or controller. None: the observation holds no command.
-        state (dict): part of the observation to name of its feature (:mod:`torchrl_koap.tasks.features`) or its import
+        state (dict): part of the observation to name of its feature (:data:`FEATURES`) or its import
             string, in the order of the state. Empty: every part but the command and the hidden ones, unchanged.
         hidden (tuple of str): further parts that planner and controller must not see.
 

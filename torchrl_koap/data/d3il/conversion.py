@@ -29,7 +29,7 @@ import torch
 from torchrl_koap.data.d3il.unpickling import load_pickle
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks.action_rules import gripper_command
-from torchrl_koap.tasks.features import tan_yaw
+from torchrl_koap.tasks.columns import tan_yaw
 
 ROBOT_COLUMNS: dict[str, tuple[int, ...]] = {
     **dict.fromkeys(("time_stamp", "sim_step", "wall_clock", "gripper_width"), ()),

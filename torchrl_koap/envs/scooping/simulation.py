@@ -70,16 +70,6 @@ class ScoopingSimulations:
         return np.stack([data.site_xpos[self._site] for data in self.data])
 
     @property
-    def spoon_rotation(self) -> np.ndarray:
-        """Axes of the spoon ``[n, 3, 3]``, in columns: its open front, its left, up."""
-        return np.stack([data.site_xmat[self._site].reshape(3, 3) for data in self.data])
-
-    @property
-    def joint_positions(self) -> np.ndarray:
-        """Measured joints ``[n, nu]`` (rad; the hand's first three in m)."""
-        return np.stack([data.qpos[self._pieces :] for data in self.data])
-
-    @property
     def piece_positions(self) -> np.ndarray:
         """Positions of the pieces ``[n, pieces, 3]`` (m)."""
         return np.stack([_positions(data) for data in self.data])
