@@ -47,8 +47,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         collision   [n, 1] bool               likewise, where an episode can end by one
         context     [n, objects, 3] dtype     where the objects start, x, y (m), yaw (rad); not where there are none
         reward      [n, 1] dtype              1 where ``success`` else 0
-        terminated  [n, 1] bool               ``success`` or ``collision``
-        truncated   [n, 1] bool               ``max_steps`` control steps are over
+        terminated  [n, 1] bool               ``success`` or ``collision``; truncated: ``max_steps`` steps are over
 
     Args:
         num_envs (int): number of environments, the batch size.
@@ -98,7 +97,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         task: Task | None = None,
     ):
         max_steps = self.MAX_STEPS if max_steps is None else max_steps
-        for name, value in {"num_envs": num_envs, "num_threads": num_threads, "max_steps": max_steps}.items():
+        for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
@@ -157,8 +156,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         self.observation_spec = Composite(leaves, shape=shape)
         size = (*shape, self.task.action_dim)
         bounds = (torch.as_tensor(bound, dtype=self._dtype, device=device) for bound in self.ACTION_BOUND)
-        low, high = (bound.expand(size) for bound in bounds)
-        self.action_spec = Bounded(low, high, size, device=device, dtype=self._dtype)
+        self.action_spec = Bounded(*(bound.expand(size) for bound in bounds), size, device=device, dtype=self._dtype)
         self.reward_spec = Bounded(0.0, 1.0, (*shape, 1), device=device, dtype=self._dtype)
         done = Categorical(2, (*shape, 1), device=device, dtype=torch.bool)
         self.done_spec = Composite({name: done.clone() for name in ("done", "terminated", "truncated")}, shape=shape)

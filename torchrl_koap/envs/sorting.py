@@ -10,7 +10,7 @@ import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.mujoco.scene import scene
+from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.sorting import (
     BIN_HALF,
@@ -168,9 +168,7 @@ class SortingEnv(ManipulationEnv):
     def _scene(self) -> Any:
         def add_boxes(root) -> None:
             for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
-                box = root.worldbody.add("body", name=name)
-                box.add("freejoint", name=name)
-                box.add("geom", name=name, type="box", size=(BOX_HALF,) * 3, mass=0.05, rgba=_COLOURS[colour])
+                add_free_box(root, name, (BOX_HALF,) * 3, _COLOURS[colour])
 
         root = scene(link_collisions=True, add_objects=add_boxes)
         # bodies of their own, after the boxes: contacts are listed in the order of bodies, as in the original

@@ -11,7 +11,7 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco import controller
-from torchrl_koap.envs.mujoco.scene import scene
+from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
@@ -165,9 +165,7 @@ class StackingEnv(ManipulationEnv):
 
 
 def _add_boxes_and_target(root) -> None:
-    for name, size in BOXES:
-        box = root.worldbody.add("body", name=name)
-        box.add("freejoint", name=name)
-        box.add("geom", name=name, type="box", size=size, mass=0.05, rgba=COLOURS[name])
+    for name, half in BOXES:
+        add_free_box(root, name, half, COLOURS[name])
     size = (TARGET_HALF, TARGET_HALF, 0.04)
     root.worldbody.add("site", name="target", type="box", pos=(*TARGET, 0), size=size, rgba=(1, 0.5, 0, 0.3))

@@ -67,7 +67,7 @@ class Columns:
         observation_units (tuple of str): unit of every observation column; empty: m for positions, rad for angles.
         command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
             never shown to planner or controller. None: the observation holds no command.
-        state (dict): part of the observation to name of its feature (:data:`FEATURES`) or its import
+        state (dict): part of the observation to name of its feature (``FEATURES``) or its import
             string, in the order of the state. Empty: every part but the command and the hidden ones, unchanged.
         hidden (tuple of str): further parts that planner and controller must not see.
 

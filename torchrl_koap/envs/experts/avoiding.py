@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -224,7 +225,7 @@ class AvoidingExpert(Expert):
         return decision
 
 
-def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
+def _draw(mode: int, generator: np.random.Generator) -> dict[str, Any]:
     """Habits and slips of one episode: everything that is random about it (m and control steps).
 
     ``gap_x`` is aimed at in each row (entry 3: behind the last one), reached ``gate`` before the row; the next gap
@@ -250,19 +251,19 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
         "release": np.append(uniform(0.010, 0.042, 3), 0.0),
         "tolerance": np.append(uniform(0.008, 0.014, 3), 0.02),
         "haste": np.append(uniform(0.9, 1.15, 3), 1.0),
-        "attention": np.array(uniform(0.1, 0.4)),
-        "caution": np.array(uniform(0.005, 0.011)),
-        "ease": np.array(uniform(0.3, 0.8)),
-        "patience": np.array(uniform(1.0, 5.0)),
-        "creep": np.array(uniform(0.6, 1.1)),
-        "margin": np.array(uniform(0.010, 0.014)),
+        "attention": uniform(0.1, 0.4),
+        "caution": uniform(0.005, 0.011),
+        "ease": uniform(0.3, 0.8),
+        "patience": uniform(1.0, 5.0),
+        "creep": uniform(0.6, 1.1),
+        "margin": uniform(0.010, 0.014),
         "open": np.array([2 * row1 - 1, row2 - 1, 0, 0]),  # sign of the side without further cylinders
-        "pause": np.array(max(pause, 0)),
-        "head_start": np.array(max(-pause, 0)),
-        "side_pause": np.array(max(pause, 0) + (generator.integers(2, 8) if generator.random() < 0.5 else 0)),
-        "linger": np.array(4 + generator.geometric(0.3)),
-        "last_side": np.array(uniform(-0.008, 0.008) if turns else 0.0),
-        "last_forward": np.array(uniform(-0.1, 0.2) if lets_go else 1.0),
+        "pause": max(pause, 0),
+        "head_start": max(-pause, 0),
+        "side_pause": max(pause, 0) + (generator.integers(2, 8) if generator.random() < 0.5 else 0),
+        "linger": 4 + generator.geometric(0.3),
+        "last_side": uniform(-0.008, 0.008) if turns else 0.0,
+        "last_forward": uniform(-0.1, 0.2) if lets_go else 1.0,
         "cruise": np.clip(cruise, 0.4, uniform(1.0, 1.05)) * FULL_PUSH,
         "grip": 1 + ar1_noise(generator, 8, 0.06, _HORIZON),
         "misjudgement": np.stack([ar1_noise(generator, 12, 0.003, _HORIZON) for _ in range(2)], axis=1),

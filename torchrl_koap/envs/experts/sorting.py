@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -131,11 +132,11 @@ class SortingExpert(Expert):
         return int(candidates[np.argmin(np.array(costs) + self._habits.taste[row, candidates])])
 
 
-def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, np.ndarray]:
+def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, Any]:
     """What is random about an episode: ``taste`` for boxes (m of way), ``aim`` within the bin (m), pause, tempo."""
     return {
         "taste": generator.normal(0, 0.03, num_boxes),
         "aim": generator.uniform(-0.015, 0.015, num_boxes),
-        "pause": np.array(generator.integers(0, 6)),
+        "pause": generator.integers(0, 6),
         "tempo": generator.uniform(0.95, 1.05) * (1 + ar1_noise(generator, 15, 0.04, _HORIZON)),
     }

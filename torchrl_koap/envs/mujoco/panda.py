@@ -12,6 +12,7 @@ import math
 from pathlib import Path
 
 from torchrl_koap.envs.mujoco.mjcf import mjcf
+from torchrl_koap.tasks.panda_kinematics import LINKS
 
 TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
 FLANGE_OFFSET = 0.107  # link8 along the z axis of link7
@@ -19,20 +20,17 @@ HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z
 REST_POSTURE = (0.0, 0.17453, 0.0, -0.87266, 0.0, 1.22173, 0.78540)
 
 _TURN = 0.5**0.5
-_TO_X = (_TURN, _TURN, 0.0, 0.0)  # +90 deg about x
-_FROM_X = (_TURN, -_TURN, 0.0, 0.0)  # -90 deg about x
-_NONE = (1.0, 0.0, 0.0, 0.0)
-
-# offset, rotation, mass, centre of mass of the links, by which they hang on each other
-_LINKS: tuple[tuple, ...] = (
-    ((0.0, 0.0, 0.0), _NONE, 3.01399, (-0.0291898, -0.000879465, 0.0566032)),
-    ((0.0, 0.0, 0.333), _NONE, 2.77281, (1.1399e-05, -0.0312655, -0.0693733)),
-    ((0.0, 0.0, 0.0), _FROM_X, 2.7996, (-1.31766e-05, -0.0703216, 0.0311782)),
-    ((0.0, -0.316, 0.0), _TO_X, 2.14603, (0.0443483, 0.0249283, -0.03813)),
-    ((0.0825, 0.0, 0.0), _TO_X, 2.18807, (-0.0385503, 0.0395256, 0.0247162)),
-    ((-0.0825, 0.384, 0.0), _FROM_X, 3.19545, (-6.36776e-05, 0.0384124, -0.10997)),
-    ((0.0, 0.0, 0.0), _TO_X, 1.35761, (0.0510023, 0.00693267, 0.00616899)),
-    ((0.088, 0.0, 0.0), _TO_X, 0.417345, (0.0103614, 0.0103596, 0.0791078)),
+_TURNS = ((1.0, 0.0, 0.0, 0.0), (_TURN, _TURN, 0.0, 0.0), (_TURN, -_TURN, 0.0, 0.0))  # about x: none, +90, -90 deg
+# mass and centre of mass of the links, by which they hang on each other
+_MASSES = (
+    (3.01399, (-0.0291898, -0.000879465, 0.0566032)),
+    (2.77281, (1.1399e-05, -0.0312655, -0.0693733)),
+    (2.7996, (-1.31766e-05, -0.0703216, 0.0311782)),
+    (2.14603, (0.0443483, 0.0249283, -0.03813)),
+    (2.18807, (-0.0385503, 0.0395256, 0.0247162)),
+    (3.19545, (-6.36776e-05, 0.0384124, -0.10997)),
+    (1.35761, (0.0510023, 0.00693267, 0.00616899)),
+    (0.417345, (0.0103614, 0.0103596, 0.0791078)),
 )
 # their principal inertia and its frame
 _INERTIA = (
@@ -49,6 +47,7 @@ _LOW = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)  # of the
 _HIGH = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
 _MOTOR_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 _FINGER_LIMIT = 70.0
+_MESHES = (*(f"link{i}" for i in range(8)), "hand", "finger")
 
 
 def mesh_folder() -> Path:
@@ -65,7 +64,7 @@ def mesh_folder() -> Path:
             " pip install 'gymnasium-robotics>=1.4'"
         )
     folder = Path(spec.origin).parent / "envs" / "assets" / "kitchen_franka" / "franka_assets" / "meshes" / "visual"
-    missing = [name for name in (*(f"link{i}" for i in range(8)), "hand", "finger") if not _mesh(folder, name).exists()]
+    missing = [name for name in _MESHES if not _mesh(folder, name).exists()]
     if missing:
         raise FileNotFoundError(
             f"the installed 'gymnasium-robotics' has no Panda mesh {missing[0]}.stl in {folder} (version 1.4.2 does)"
@@ -92,14 +91,16 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
     folder = mesh_folder()
     root = mjcf.RootElement(model="panda")
     root.compiler.angle = "radian"
-    for name in (*(f"link{i}" for i in range(8)), "hand", "finger"):
+    for name in _MESHES:
         root.asset.add("mesh", name=name, file=str(_mesh(folder, name)))
     colour, dark = (0.95, 0.95, 0.95, alpha), (0.25, 0.25, 0.28, alpha)
     hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
 
     body = root.worldbody
-    for index, ((offset, quat, mass, com), (inertia, frame)) in enumerate(zip(_LINKS, _INERTIA, strict=True)):
-        body = body.add("body", name=f"link{index}", pos=offset, quat=quat)
+    placed = (((0.0, 0.0, 0.0), 0), *LINKS)
+    links = zip(placed, _MASSES, _INERTIA, strict=True)
+    for index, ((offset, turn), (mass, com), (inertia, frame)) in enumerate(links):
+        body = body.add("body", name=f"link{index}", pos=offset, quat=_TURNS[turn])
         body.add("inertial", mass=mass, pos=com, diaginertia=inertia, quat=frame)
         if index:
             joint = {"type": "hinge", "axis": (0, 0, 1), "limited": True, "range": (_LOW[index - 1], _HIGH[index - 1])}

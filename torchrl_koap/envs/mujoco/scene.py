@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 
@@ -89,3 +89,10 @@ def scene(
 def compile_scene(root: mjcf.RootElement) -> mujoco.MjModel:
     """Compiles a scene into a MuJoCo model, which any number of simulations may share."""
     return mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
+
+
+def add_free_box(root: mjcf.RootElement, name: str, half: Sequence[float], colour: Sequence[float]) -> None:
+    """Adds a box of 50 g that moves freely; ``half`` its sizes (m)."""
+    box = root.worldbody.add("body", name=name)
+    box.add("freejoint", name=name)
+    box.add("geom", name=name, type="box", size=half, mass=0.05, rgba=colour)

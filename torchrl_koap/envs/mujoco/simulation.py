@@ -15,17 +15,81 @@ from torchrl_koap.envs.mujoco.scene import PANDA
 
 _NUM_JOINTS = 9  # seven of the arm, two fingers
 _CHUNKS_PER_THREAD = 4  # smaller pieces even out simulations that take longer
+_PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
-class SimulationBatch:
+class Simulations:
     """Simulations that share a model and are advanced together, in one or several threads.
 
     The result for one simulation depends neither on the others nor on the number of threads.
 
     Args:
-        model (mujoco.MjModel): a compiled scene that holds the arm, see :func:`~torchrl_koap.envs.mujoco.scene.scene`.
+        model (mujoco.MjModel): the compiled scene.
         num_sims (int): number of simulations.
         num_threads (int): number of threads that advance them; 1 stays in the caller's thread.
+    """
+
+    _episode: dict[str, np.ndarray]  # what decides the future beside the physics, a row per simulation
+
+    def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
+        self.model, self.num_threads = model, num_threads
+        self.data = [mujoco.MjData(model) for _ in range(num_sims)]
+        self._executor: ThreadPoolExecutor | None = None
+        self._executor_pid: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def _run(self, advance: Callable[[np.ndarray], None], rows: np.ndarray, substeps: int) -> None:
+        """Advances the simulations ``rows`` by ``substeps``, in threads where there are several of both.
+
+        Raises:
+            RuntimeError: if a simulation becomes unstable.
+        """
+        timestep = self.model.opt.timestep
+        due = [self.data[row].time + substeps * timestep for row in rows]
+        if self.num_threads == 1 or len(rows) <= 1:
+            advance(rows)
+        else:
+            if self._executor is None or self._executor_pid != os.getpid():  # threads do not survive a fork
+                self._executor = ThreadPoolExecutor(self.num_threads, thread_name_prefix="koap-simulation")
+                self._executor_pid = os.getpid()
+            pieces = np.array_split(rows, min(len(rows), self.num_threads * _CHUNKS_PER_THREAD))
+            for future in [self._executor.submit(advance, piece) for piece in pieces]:
+                future.result()
+        for row, time in zip(rows, due, strict=True):
+            if abs(self.data[row].time - time) > 0.5 * timestep:  # MuJoCo resets a state that blows up
+                raise RuntimeError(f"the simulation of environment {row} became unstable")
+
+    def get_state(self, row: int) -> dict[str, np.ndarray]:
+        """Returns everything that decides the future of one simulation."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
+        mujoco.mj_getState(self.model, self.data[row], physics, _PHYSICS)
+        return {"physics": physics} | {name: array[row].copy() for name, array in self._episode.items()}
+
+    def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
+        """Restores what :meth:`get_state` returned; the simulation then continues bit for bit."""
+        data = self.data[row]
+        mujoco.mj_resetData(self.model, data)
+        mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
+        mujoco.mj_forward(self.model, data)  # poses for pictures, contacts; what it changes is put back below
+        mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
+        for name, array in self._episode.items():
+            array[row] = state[name]
+
+    def close(self) -> None:
+        """Ends the threads; they start again when needed."""
+        if self._executor is not None:
+            self._executor.shutdown()
+            self._executor = None
+
+
+class SimulationBatch(Simulations):
+    """Simulations of D3IL's arm under its controller.
+
+    Args:
+        model (mujoco.MjModel): a scene that holds the arm, see :func:`~torchrl_koap.envs.mujoco.scene.scene`.
+        num_sims (int): and ``num_threads``, see :class:`Simulations`.
 
     Examples:
         >>> import numpy as np
@@ -39,14 +103,14 @@ class SimulationBatch:
     """
 
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
-        self.model = model
-        self.data = [mujoco.MjData(model) for _ in range(num_sims)]
-        self.num_threads = num_threads
+        super().__init__(model, num_sims, num_threads)
         self.joint_targets = np.zeros((num_sims, 7))
         self.joint_speeds = np.zeros((num_sims, 7))
         self.started = np.zeros(num_sims, dtype=bool)
         self.widths = np.full(num_sims, controller.FINGER_RESET)
         self.grasping = np.zeros(num_sims, dtype=bool)
+        self._episode = {"joint_targets": self.joint_targets, "joint_speeds": self.joint_speeds}
+        self._episode |= {"started": self.started, "width": self.widths, "grasping": self.grasping}
         self.log = np.zeros((num_sims, controller.LOG_WIDTH + model.nq - _NUM_JOINTS))
         self.log_time = np.zeros(num_sims)
 
@@ -62,8 +126,6 @@ class SimulationBatch:
         self._tcp_views = [data.xpos[self._tcp] for data in self.data]
         self._arm_views = [data.qpos[self._qpos_start :] for data in self.data]
         self._object_views = [data.qpos[: self._qpos_start] for data in self.data]
-        self._executor: ThreadPoolExecutor | None = None
-        self._executor_pid: int | None = None
 
     def _arrays(self, data: mujoco.MjData) -> list[int]:
         """Addresses of what the controller reads and writes, in the order of its pointer table."""
@@ -71,9 +133,6 @@ class SimulationBatch:
         bias, tcp = data.qfrc_bias[self._qvel_start :], (data.xpos[self._tcp], data.xquat[self._tcp])
         axes = (data.xanchor[self._joint :], data.xaxis[self._joint :])
         return [array.ctypes.data for array in (joints, speeds, data.ctrl, bias, *tcp, *axes, data.qpos)]
-
-    def __len__(self) -> int:
-        return len(self.data)
 
     @property
     def tcp_position(self) -> np.ndarray:
@@ -128,77 +187,35 @@ class SimulationBatch:
 
     def track_pose(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
         """Advances simulations by ``substeps`` while the TCP follows ``commands`` [n, 7] (position, quaternion)."""
-        commands = np.ascontiguousarray(commands, dtype=np.float64)
         state = (self.joint_targets, self.joint_speeds, self.started, self.log)
-        self._run(controller.track_pose, rows, (commands, self.widths, self.grasping, substeps, *state))
+        self._track(controller.track_pose, rows, commands, substeps, *state)
 
     def track_joints(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
         """Advances simulations by ``substeps`` while the joints are held at ``commands`` [n, 7] (rad)."""
-        commands = np.ascontiguousarray(commands, dtype=np.float64)
-        self._run(controller.track_joints, rows, (commands, self.widths, self.grasping, substeps, self.log))
+        self._track(controller.track_joints, rows, commands, substeps, self.log)
 
-    def _run(self, kernel, rows: np.ndarray, arguments: tuple) -> None:
-        rows = np.ascontiguousarray(rows, dtype=np.int64)
-        if not len(rows):
-            return
+    def _track(self, kernel: Callable[..., None], rows, commands, substeps: int, *state: np.ndarray) -> None:
         for row in rows:
             self.log_time[row] = self.data[row].time + controller.TIMESTEP
-        due = [self.data[row].time + arguments[3] * controller.TIMESTEP for row in rows]
-        self._dispatch(kernel, rows, arguments)
-        for row, time in zip(rows, due, strict=True):
-            if abs(self.data[row].time - time) > 0.5 * controller.TIMESTEP:  # MuJoCo resets a state that blows up
-                raise RuntimeError(f"the simulation of environment {row} became unstable")
-
-    def _dispatch(self, kernel: Callable[..., None], rows: np.ndarray, arguments: tuple) -> None:
+        commands = np.ascontiguousarray(commands, dtype=np.float64)
         fixed = (self._step, self.model._address, self._data_addresses, self._pointers)
-        if self.num_threads == 1 or len(rows) == 1:
-            kernel(*fixed, rows, *arguments)
-            return
-        if self._executor is None or self._executor_pid != os.getpid():  # threads do not survive a fork
-            self._executor = ThreadPoolExecutor(self.num_threads, thread_name_prefix="koap-simulation")
-            self._executor_pid = os.getpid()
-        pieces = np.array_split(rows, min(len(rows), self.num_threads * _CHUNKS_PER_THREAD))
-        for future in [self._executor.submit(kernel, *fixed, piece, *arguments) for piece in pieces]:
-            future.result()
-
-    def close(self) -> None:
-        """Ends the threads; they start again when needed."""
-        if self._executor is not None:
-            self._executor.shutdown()
-            self._executor = None
+        arguments = (commands, self.widths, self.grasping, substeps, *state)
+        rows = np.ascontiguousarray(rows, dtype=np.int64)
+        self._run(lambda piece: kernel(*fixed, piece, *arguments), rows, substeps)
 
     def get_state(self, row: int) -> dict[str, np.ndarray]:
         """Returns everything that decides the future of one simulation, controller included."""
-        data, spec = self.data[row], mujoco.mjtState.mjSTATE_INTEGRATION.value
-        physics = np.empty(mujoco.mj_stateSize(self.model, spec))
-        mujoco.mj_getState(self.model, data, physics, spec)
-        return {
-            "physics": physics,
-            "bias": data.qfrc_bias.copy(),
-            "tcp_position": data.xpos[self._tcp].copy(),
-            "tcp_quaternion": data.xquat[self._tcp].copy(),
-            "joint_targets": self.joint_targets[row].copy(),
-            "joint_speeds": self.joint_speeds[row].copy(),
-            "started": self.started[row].copy(),
-            "width": self.widths[row].copy(),
-            "grasping": self.grasping[row].copy(),
-        }
+        data = self.data[row]
+        tool = {"tcp_position": data.xpos[self._tcp].copy(), "tcp_quaternion": data.xquat[self._tcp].copy()}
+        return super().get_state(row) | {"bias": data.qfrc_bias.copy()} | tool
 
     def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
         """Restores what :meth:`get_state` returned; the simulation then continues bit for bit."""
+        super().set_state(row, state)
         data = self.data[row]
-        mujoco.mj_resetData(self.model, data)
-        spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        mujoco.mj_setState(self.model, data, state["physics"], spec)
-        mujoco.mj_forward(self.model, data)  # poses for pictures, contacts; what it changes is put back below
-        mujoco.mj_setState(self.model, data, state["physics"], spec)
         data.qfrc_bias[:] = state["bias"]
         data.xpos[self._tcp] = state["tcp_position"]
         data.xquat[self._tcp] = state["tcp_quaternion"]
-        self.joint_targets[row] = state["joint_targets"]
-        self.joint_speeds[row] = state["joint_speeds"]
-        self.started[row] = state["started"]
-        self.widths[row], self.grasping[row] = state["width"], state["grasping"]
 
     def set_physics(self, row: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
         """Puts one simulation into a physics state and forgets the controller's past.

@@ -5,21 +5,13 @@ from __future__ import annotations
 
 import functools
 import math
-from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
 
+from torchrl_koap.envs.mujoco.simulation import Simulations
 from torchrl_koap.envs.scooping.scene import SPOON_HALF, TIMESTEP, scooping_model
-from torchrl_koap.tasks.scooping import (
-    BOWL,
-    CONTROL_HZ,
-    FRAME_HZ,
-    NUM_PIECES,
-    PIECE_RADIUS,
-    RIM_HEIGHT,
-    RIM_RADIUS,
-)
+from torchrl_koap.tasks.scooping import BOWL, CONTROL_HZ, FRAME_HZ, NUM_PIECES, PIECE_RADIUS, RIM_HEIGHT, RIM_RADIUS
 
 TICKS = round(CONTROL_HZ / FRAME_HZ)  # commands per frame
 SUBSTEPS = round(1 / (CONTROL_HZ * TIMESTEP))  # per command
@@ -27,16 +19,14 @@ OVER_RIM = RIM_HEIGHT + 0.05  # m; lower than that over the bowl, the spoon has 
 LEFT_BOWL = RIM_HEIGHT + 0.04  # m; higher than that, the spoon has left the bowl
 HELD_TICKS = 6  # commands for which a piece has to stay on a spoon that has left the bowl
 _LAYOUTS, _SIDES = 6, 16  # settled layouts of the pieces; turns by which they can be laid
-_PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
-class ScoopingSimulations:
-    """Simulations of one embodiment that are advanced together, in one or several threads.
+class ScoopingSimulations(Simulations):
+    """Simulations of one embodiment.
 
     Args:
         embodiment (str): ``"robot"`` or ``"hand"``.
-        num_sims (int): number of simulations.
-        num_threads (int): threads that advance them; results do not depend on it.
+        num_sims (int): and ``num_threads``, see :class:`~torchrl_koap.envs.mujoco.simulation.Simulations`.
 
     Examples:
         >>> import numpy as np
@@ -50,19 +40,14 @@ class ScoopingSimulations:
     """
 
     def __init__(self, embodiment: str, num_sims: int, num_threads: int = 1):
-        self.embodiment, self.num_threads = embodiment, num_threads
-        self.model = scooping_model(embodiment)
-        self.data = [mujoco.MjData(self.model) for _ in range(num_sims)]
+        super().__init__(scooping_model(embodiment), num_sims, num_threads)
+        self.embodiment = embodiment
         self.commands = np.zeros((num_sims, self.model.nu))
         self.rim = np.zeros(num_sims, dtype=bool)
         self.held = np.zeros(num_sims, dtype=np.int64)
         self._episode = {"commands": self.commands, "rim": self.rim, "held": self.held}
         self._site = self.model.site("spoon").id
         self._pieces = 7 * NUM_PIECES  # numbers that make up the pieces' poses
-        self._executor: ThreadPoolExecutor | None = None
-
-    def __len__(self) -> int:
-        return len(self.data)
 
     @property
     def spoon_position(self) -> np.ndarray:
@@ -127,26 +112,18 @@ class ScoopingSimulations:
         Raises:
             RuntimeError: if a simulation becomes unstable.
         """
-        if self.num_threads == 1 or len(rows) == 1:
-            for row in rows:
-                self._advance_one(int(row), targets[row])
-            return
-        if self._executor is None:
-            self._executor = ThreadPoolExecutor(self.num_threads, thread_name_prefix="koap-scooping")
-        for _ in self._executor.map(lambda row: self._advance_one(int(row), targets[row]), rows):
-            pass
 
-    def _advance_one(self, row: int, target: np.ndarray) -> None:
-        data, begin = self.data[row], self.commands[row].copy()
-        due = data.time + TICKS * SUBSTEPS * TIMESTEP
-        for tick in range(1, TICKS + 1):
-            data.ctrl[:] = begin + (target - begin) * tick / TICKS
-            mujoco.mj_step(self.model, data, SUBSTEPS)
-            self._assess(row, data)
-        mujoco.mj_kinematics(self.model, data)  # the spoon where the joints are now
-        self.commands[row] = target
-        if abs(data.time - due) > TIMESTEP:  # MuJoCo resets a state that blows up
-            raise RuntimeError(f"the simulation of environment {row} became unstable")
+        def advance(piece: np.ndarray) -> None:
+            for row in piece:
+                data, begin = self.data[row], self.commands[row].copy()
+                for tick in range(1, TICKS + 1):
+                    data.ctrl[:] = begin + (targets[row] - begin) * tick / TICKS
+                    mujoco.mj_step(self.model, data, SUBSTEPS)
+                    self._assess(row, data)
+                mujoco.mj_kinematics(self.model, data)  # the spoon where the joints are now
+                self.commands[row] = targets[row]
+
+        self._run(advance, rows, TICKS * SUBSTEPS)
 
     def _assess(self, row: int, data: mujoco.MjData) -> None:
         x, y, height = data.site_xpos[self._site]
@@ -156,28 +133,6 @@ class ScoopingSimulations:
         left = self.rim[row] and height > LEFT_BOWL
         if self.held[row] < HELD_TICKS:
             self.held[row] = self.held[row] + 1 if left and self._on_spoon(data) else 0
-
-    def get_state(self, row: int) -> dict[str, np.ndarray]:
-        """Returns everything that decides the future of one simulation."""
-        physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
-        mujoco.mj_getState(self.model, self.data[row], physics, _PHYSICS)
-        return {"physics": physics} | {name: array[row].copy() for name, array in self._episode.items()}
-
-    def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
-        """Restores what :meth:`get_state` returned."""
-        data = self.data[row]
-        mujoco.mj_resetData(self.model, data)
-        mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
-        mujoco.mj_forward(self.model, data)
-        mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
-        for name, array in self._episode.items():
-            array[row] = state[name]
-
-    def close(self) -> None:
-        """Ends the threads; they start again when needed."""
-        if self._executor is not None:
-            self._executor.shutdown()
-            self._executor = None
 
 
 def _positions(data: mujoco.MjData) -> np.ndarray:
