@@ -74,13 +74,6 @@ def progress_bar(total: int | None, description: str, *, unit: str = "it", **opt
     Keyword Args:
         unit (str): the name of one of them.
         **options: of ``tqdm``.
-
-    Examples:
-        >>> from torchrl_koap.runs.progress import progress_bar, without_progress_bars
-        >>> with without_progress_bars(), progress_bar(2, "updates") as bar:
-        ...     bar.update(2)
-        ...     bar.disable
-        True
     """
     disable = not _SHOWN.get() or sys.stderr is None
     stream: _Forgiving | None = None

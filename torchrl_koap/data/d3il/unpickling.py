@@ -58,14 +58,7 @@ def load_pickle(path: str | Path) -> Any:
 
 
 def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
-    """Reads a pickle from bytes under the rules of :func:`load_pickle`.
-
-    Examples:
-        >>> import pickle
-        >>> from torchrl_koap.data.d3il.unpickling import loads_pickle
-        >>> loads_pickle(pickle.dumps([1, "two", None]))
-        [1, 'two', None]
-    """
+    """Reads a pickle from bytes under the rules of :func:`load_pickle`."""
     if not content:
         raise DataError(name, "the file is empty")
     try:

@@ -41,14 +41,6 @@ class Piece:
         states (dict): columns ``[T]`` of everything that is no action, by name.
         actions (dict, optional): columns ``[T]`` or ``[T - 1]`` of actions, by name; None where there are none.
         unclear (tuple of str): columns among the states of which the user has to say what they are.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data.formats.columns import Piece, assemble
-        >>> columns = {"t_ms": 50 * np.arange(4), "done": np.array([0, 1, 0, 1]), "x": np.arange(4.0)}
-        >>> found = assemble([Piece("run.csv", columns, {"v": np.ones(4)})], "recordings")
-        >>> found.sources, found.control_hz, found.state_names, found.skipped
-        (('run.csv[0]', 'run.csv[1]'), 20.0, ('x',), ('t_ms', 'done'))
     """
 
     name: str
@@ -65,13 +57,7 @@ def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def kind_of(name: str) -> tuple[str | None, float]:
-    """What a column is by its name, None for a state; and its unit in seconds.
-
-    Examples:
-        >>> from torchrl_koap.data.formats.columns import kind_of
-        >>> kind_of("Timestamp [ms]"), kind_of("is_success"), kind_of("joint_1")
-        (('clock', 0.001), ('other', 1.0), (None, 1.0))
-    """
+    """What a column is by its name, None for a state; and of a clock its unit in seconds, 0.001 of "Time [ms]"."""
     plain = name.strip().lower().removeprefix("next.")
     unit = _UNIT.fullmatch(plain)
     base, scale = (unit[1], _UNITS[unit[2]]) if unit else (plain, 1.0)
