@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
@@ -12,8 +13,8 @@ from torchrl_koap import keys
 
 
 def flatten_trajectories(
-    observations: Sequence[torch.Tensor],
-    actions: Sequence[torch.Tensor | None] | None,
+    observations: Sequence[torch.Tensor | np.ndarray],
+    actions: Sequence[torch.Tensor | np.ndarray | None] | None,
     *,
     action_dim: int | None = None,
     dtype: torch.dtype = torch.float32,
@@ -26,9 +27,9 @@ def flatten_trajectories(
     NaN throughout a row, means that it is not.
 
     Args:
-        observations (sequence of Tensor): for each trajectory its frames ``[T_i, obs]``.
-        actions (sequence of Tensor or None): for each trajectory its actions ``[T_i - 1, act]``, or None. None instead
-            of the sequence: no trajectory has any.
+        observations (sequence of Tensor or array): for each trajectory its frames ``[T_i, obs]``.
+        actions (sequence of Tensor, array or None): for each trajectory its actions ``[T_i - 1, act]``, or None. None
+            instead of the sequence: no trajectory has any.
 
     Keyword Args:
         action_dim (int, optional): size of an action; needed where no trajectory has one.
@@ -49,10 +50,10 @@ def flatten_trajectories(
         (tensor([2., 3.]), tensor([4., 5.]), tensor([False, False,  True]))
     """
     observations = [torch.as_tensor(frames) for frames in observations]
-    actions = [None] * len(observations) if actions is None else list(actions)
+    actions = [None] * len(observations) if actions is None else actions
+    actions = [None if steps is None else torch.as_tensor(steps) for steps in actions]
     if not observations or len(observations) != len(actions):
         raise ValueError(f"{len(observations)} trajectories of observations, {len(actions)} of actions")
-    actions = [None if steps is None else torch.as_tensor(steps) for steps in actions]
     given = next((steps for steps in actions if steps is not None and steps.ndim == 2), None)
     if given is None and action_dim is None:
         raise ValueError("no trajectory has actions: action_dim is needed")

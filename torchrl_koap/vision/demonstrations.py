@@ -78,25 +78,24 @@ def embed_demonstrations(
         ValueError: if the embedding has another size than the task's, or frames another size than the encoder's.
     """
     task = get_task(task) if isinstance(task, str) else task
-    states, actions, embodiments = [], [], []
-    read = [source.read() for source in sources]
-    names = sorted({episode.embodiment for episodes in read for episode in episodes})
+    episodes = [episode for source in sources for episode in source.read()]
+    embodiments = [episode.embodiment for episode in episodes]
+    names = sorted(set(embodiments))
     if len(names) > 1 and not mixed:
         raise DataError(
             out,
             f"the sources mix the embodiments {' and '.join(names)}: pass mixed=True (koap embed --mixed) if that is"
             " meant",
         )
-    for episode in (episode for episodes in read for episode in episodes):
+    states = []
+    for episode in episodes:
         embedding = encoder.embed(torch.from_numpy(episode.frames)).float()
         if embedding.shape[1] + episode.state.shape[1] != task.observation_dim:
             raise ValueError(
                 f"task {task.name!r} observes {task.observation_dim} columns, embedding and recording have"
                 f" {embedding.shape[1]} and {episode.state.shape[1]}"
             )
-        states.append(torch.from_numpy(np.concatenate([embedding.numpy(), episode.state], axis=1)))
-        missing = np.full((len(episode), task.action_dim), np.nan, dtype=np.float32)
-        actions.append(torch.from_numpy(missing if episode.action is None else episode.action))
-        embodiments.append(episode.embodiment)
+        states.append(np.concatenate([embedding.numpy(), episode.state], axis=1))
+    data = flatten_trajectories(states, [episode.action for episode in episodes], action_dim=task.action_dim)
     notes = {"embodiments": embodiments, "encoder": encoder.identity}
-    return save_ted(flatten_trajectories(states, actions), Path(out) / "ted", task, notes).parent
+    return save_ted(data, Path(out) / "ted", task, notes).parent

@@ -160,7 +160,7 @@ def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
 
 def read_raw(
     converter: Converter, root: str | Path, *, progress: Callable[[int, int], None] | None = None
-) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Reads raw demonstrations, one trajectory per file: frames ``[T, obs]`` and actions ``[T - 1, act]``, float64.
 
     Raises:
@@ -168,8 +168,8 @@ def read_raw(
         FileNotFoundError: if there are none.
     """
     problems: list[str] = []
-    frames: list[torch.Tensor] = []
-    actions: list[torch.Tensor] = []
+    frames: list[np.ndarray] = []
+    actions: list[np.ndarray] = []
     files = find_raw_files(converter, root)
     for index, file in enumerate(files):
         if progress is not None and index:
@@ -187,8 +187,9 @@ def read_raw(
             wanted = ", ".join(converter.objects) or "no objects"
             problems.append(f"{file}: of another task: it logs {', '.join(map(str, episode.objects))}, wanted {wanted}")
         elif not problems:
-            for found, values in zip((frames, actions), converter.convert(episode), strict=True):
-                found.append(torch.from_numpy(values))
+            seen, done = converter.convert(episode)
+            frames.append(seen)
+            actions.append(done)
     if problems:
         raise DataError(root, problems)
     return frames, actions
