@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 
+import counted_windows
 import numpy as np
 import pytest
 import torch
@@ -320,9 +321,7 @@ LONGER = [20 + 3 * index for index in range(10)]
 
 
 def numbered(labelled=2, seed=0):
-    states = [torch.full((length + 1, 2), float(index)) for index, length in enumerate(LONGER)]
-    actions = [torch.full((length, 1), float(index)) for index, length in enumerate(LONGER)]
-    data = flatten_trajectories(states, actions)
+    data = counted_windows.demonstrations(LONGER)
     return data if labelled is None else LabelBudget(count=labelled, seed=seed).apply(data)[0]
 
 

@@ -137,26 +137,21 @@ def put(row, value):
     return lambda rows: [*rows[:row], value(rows[row]) if callable(value) else value, *rows[row + 1 :]]
 
 
+def begins(row, value):
+    return put(row, lambda cells: [value, *cells[1:]])
+
+
 FILES = [
     (lambda t: t.drop_columns("observation.state"), "FILE: missing column 'observation.state'; the file has observ"),
-    (
-        edited("observation.state", put(3, lambda row: [np.nan, *row[1:]])),
-        "trajectory episode 1: states are not finite",
-    ),
+    (edited("observation.state", begins(3, np.nan)), "trajectory episode 1: states are not finite"),
     (edited("observation.state", put(3, None)), "trajectory episode 1: states are not finite at frame 3"),
-    (
-        edited("action", put(2, lambda row: [np.inf, *row[1:]])),
-        "trajectory episode 1: the action of step 2 is infinite",
-    ),
+    (edited("action", begins(2, np.inf)), "trajectory episode 1: the action of step 2 is infinite"),
     (edited("action", put(5, lambda row: row[:1])), "FILE: column 'action' has rows of 1 and 7 numbers"),
     (edited("action", lambda rows: ["up"] * len(rows)), "FILE: column 'action' must hold numbers or lists of numbers"),
     (edited("action", lambda rows: [1.0] * len(rows)), "FILE: column 'action' holds double, that of another file list"),
     (lambda t: t.slice(0, 0), "1 episodes are missing: 1"),
     (lambda t: t.slice(0, 4), "FILE: episode 1 has 4 rows, its description says 6"),
-    (
-        edited("frame_index", lambda rows: [row + 1 for row in rows]),
-        "FILE: column 'frame_index' of episode 1 must count 0, 1, 2, ...",
-    ),
+    (edited("frame_index", put(5, 9)), "FILE: column 'frame_index' of episode 1 must count 0, 1, 2, ..."),
     (edited("observation.state", lambda rows: [row[:3] for row in rows]), "'observation.state' has rows of 3 and 7"),
 ]
 
