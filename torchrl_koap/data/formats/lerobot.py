@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,22 +31,6 @@ EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
 IMAGES = ("image", "video")
 _INFO = "meta/info.json"
 _LARGEST = 1 << 40  # bytes of a file of rows
-
-
-@dataclass(frozen=True)
-class Rows:
-    """The rows of all episodes, one after the other.
-
-    Args:
-        columns (dict): of each column what it holds: float64 ``[N, d]`` of numbers, NaN where a row is empty; lists of
-            ``N`` cells of pictures. ``action`` is missing where no file has it.
-        numbers (list of int): of every episode its ``episode_index``.
-        spans (list of slice): of every episode its rows.
-    """
-
-    columns: dict[str, Any]
-    numbers: list[int]
-    spans: list[slice]
 
 
 def is_lerobot(folder: str | Path) -> bool:
@@ -85,25 +68,22 @@ def read_lerobot(
     if problems:
         raise DataError(root, problems)
     rows = read_rows(root, chosen, episodes=episodes)
-    names = [label for name in chosen for label in _names(known[name], name, rows.columns[name].shape[1])]
-    if len(set(names)) < len(names):  # two features with the same names of columns
-        names = [label for name in chosen for label in _names({}, name, rows.columns[name].shape[1])]
-    columns = dict(zip(names, np.concatenate([rows.columns[name] for name in chosen], 1).T, strict=True))
-    if TIME in rows.columns and np.isfinite(rows.columns[TIME]).all():
-        columns[TIME] = rows.columns[TIME][:, 0]
-    actions, width = rows.columns.get(ACTION), _announced(info)
-    if actions is None and not width:
+    if not rows:
+        raise DataError(root, "there are no trajectories")
+    first, width = next(iter(rows.values())), _announced(info)
+    if ACTION not in first and not width:
         raise DataError(root, "no file has actions, and info.json does not say how many columns an action has")
-    acting = _names(known.get(ACTION) or {}, ACTION, width if actions is None else actions.shape[1])
-    pieces = [
-        Piece(
-            f"episode {number}",
-            {name: values[span] for name, values in columns.items()},
-            None if actions is None else dict(zip(acting, actions[span].T, strict=True)),
-        )
-        for number, span in zip(rows.numbers, rows.spans, strict=True)
-    ]
-    if actions is None:
+    names = [label for name in chosen for label in _names(known[name], name, first[name].shape[1])]
+    if len(set(names)) < len(names):  # two features with the same names of columns
+        names = [label for name in chosen for label in _names({}, name, first[name].shape[1])]
+    acting = _names(known.get(ACTION) or {}, ACTION, first[ACTION].shape[1] if ACTION in first else width)
+    stamped = TIME in first and all(np.isfinite(columns[TIME]).all() for columns in rows.values())
+    pieces = []
+    for number, columns in rows.items():
+        states = dict(zip(names, np.concatenate([columns[name] for name in chosen], 1).T, strict=True))
+        steps = dict(zip(acting, columns[ACTION].T, strict=True)) if ACTION in columns else None
+        pieces.append(Piece(f"episode {number}", states | ({TIME: columns[TIME][:, 0]} if stamped else {}), steps))
+    if ACTION not in first:
         options = {"action_dim": width} | options
     unread = [
         name for name in known if name not in (*chosen, *images, ACTION, TIME, EPISODE, FRAME, "index", "task_index")
@@ -138,8 +118,10 @@ def read_info(root: str | Path) -> dict[str, Any]:
 
 def read_rows(
     root: str | Path, features: Sequence[str], *, pictures: Sequence[str] = (), episodes: Sequence[int] = ()
-) -> Rows:
-    """Reads columns of numbers and of pictures, and actions if there are any.
+) -> dict[int, dict[str, Any]]:
+    """Reads of every episode, by its number, columns of numbers and of pictures, and actions if there are any.
+
+    Numbers are float64 ``[T, d]``, NaN where a row is empty; pictures are lists of ``T`` cells.
 
     Raises:
         DataError: with the problems of all files and episodes.
@@ -164,17 +146,19 @@ def read_rows(
     if missing:
         absent, there = (some([str(number) for number in numbers]) for numbers in (missing, found))
         problems = [f"{len(missing)} episodes are missing: {absent}; name in episodes which to read (here: {there})"]
-    chosen = [index for index, number in enumerate(found) if not episodes or number in episodes]
-    spans = [slice(int(starts[index]), int(ends[index])) for index in chosen]
-    for number, span in zip(found[chosen].tolist(), spans, strict=True):
-        length, wanted = span.stop - span.start, expected.get(number)
-        if wanted not in (None, length):
-            problems.append(f"{files[span.start]}: episode {number} has {length} rows, its description says {wanted}")
-        elif not np.array_equal(frame[span], np.arange(length)):
-            problems.append(f"{files[span.start]}: column {FRAME!r} of episode {number} must count 0, 1, 2, ...")
+    rows: dict[int, dict[str, Any]] = {}
+    for number, start, end in zip(found.tolist(), starts, ends, strict=True):
+        if episodes and number not in episodes:
+            continue
+        wanted = expected.get(number)
+        if wanted not in (None, end - start):
+            problems.append(f"{files[start]}: episode {number} has {end - start} rows, its description says {wanted}")
+        elif not np.array_equal(frame[start:end], np.arange(end - start)):
+            problems.append(f"{files[start]}: column {FRAME!r} of episode {number} must count 0, 1, 2, ...")
+        rows[number] = {name: values[start:end] for name, values in columns.items()}
     if problems:
         raise DataError(root, problems)
-    return Rows(columns, found[chosen].tolist(), spans)
+    return rows
 
 
 def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):

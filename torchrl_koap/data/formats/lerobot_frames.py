@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.lerobot import ACTION, IMAGES, STATE, Rows, is_lerobot, read_info, read_rows
+from torchrl_koap.data.formats.lerobot import ACTION, IMAGES, STATE, is_lerobot, read_info, read_rows
 from torchrl_koap.files import DataError
 
 EMBODIMENT = "embodiment"  # an entry of info.json that LeRobot itself has nothing like
@@ -63,17 +63,17 @@ def read_image_episodes(
     video = info["features"][camera].get("dtype") == "video"
     rows = read_rows(folder, [STATE], pictures=() if video else (camera,))
     found = []
-    for number, span in list(zip(rows.numbers, rows.spans, strict=True))[:episodes]:
-        state, action = (rows.columns[name][span] if name in rows.columns else None for name in (STATE, ACTION))
+    for number, columns in list(rows.items())[:episodes]:
+        state, action = columns[STATE], columns.get(ACTION)
         try:
-            if span.stop - span.start < 2:
+            if len(state) < 2:
                 raise ValueError("1 row: an episode has two frames at least")
             if not np.isfinite(state).all():
                 raise ValueError(f"column {STATE!r} is empty, NaN or infinite in some rows")
             if video:
-                frames = _from_video(Path(folder), info, camera, number, span, rows)
+                frames = _from_video(Path(folder), info, camera, number, len(state))
             else:
-                frames = _from_cells(rows.columns[camera][span], camera)
+                frames = _from_cells(columns[camera], camera)
         except (ValueError, OSError) as error:
             raise DataError(folder, f"episode {number}: {error}") from error
         label = None if action is None else action[:-1].astype(np.float32)
@@ -109,7 +109,7 @@ def _from_cells(cells: list, camera: str) -> np.ndarray:
     return np.stack(frames)
 
 
-def _from_video(folder: Path, info: dict, camera: str, number: int, span: slice, rows: Rows) -> np.ndarray:
+def _from_video(folder: Path, info: dict, camera: str, number: int, length: int) -> np.ndarray:
     """Frames uint8 ``[T, H, W, 3]`` of a video, of which an episode may be a part (format 3.0)."""
     if importlib.util.find_spec("imageio") is None:
         raise RuntimeError("videos are read with an extra: pip install 'torchrl_koap[video]'")
@@ -121,7 +121,7 @@ def _from_video(folder: Path, info: dict, camera: str, number: int, span: slice,
     if about is not None:  # format 3.0
         names |= {"chunk_index": about[0], "file_index": about[1]}
         first = round(about[2] * float(info["fps"]))
-    path, length = folder / str(info.get("video_path")).format(**names), span.stop - span.start
+    path = folder / str(info.get("video_path")).format(**names)
     frames = list(islice(imageio.v3.imiter(path), first, first + length))
     if len(frames) < length:
         raise ValueError(f"{path} has {first + len(frames)} frames, {first + length} are needed")
