@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -38,9 +38,13 @@ def read_minari(source: str, **options: Any) -> Recordings:
     dataset = minari.load_dataset(name, download=False)
     pieces, skipped, problems = [], [], []
     for episode in dataset.iterate_episodes():
-        tables, images = _tables(episode.observations)
-        skipped += images
-        if not tables:
+        states: dict[str, np.ndarray] = {}
+        for name, array in _leaves(episode.observations):
+            if array.ndim > 2 or array.dtype.kind not in "fiub":
+                skipped.append(name or "observation")
+            else:
+                states |= spread(name or "state", array)
+        if not states:
             problems.append(f"episode {episode.id}: observations hold no numbers but images")
         if isinstance(episode.actions, (Mapping, tuple)):
             kind = "Dict" if isinstance(episode.actions, Mapping) else "Tuple"
@@ -50,7 +54,6 @@ def read_minari(source: str, **options: Any) -> Recordings:
         if steps.ndim > 2 or steps.dtype.kind != "f" and (steps.ndim < 2 or steps.dtype.kind not in "iub"):
             problems.append(f"episode {episode.id}: actions must be [T, a], got {steps.dtype} {list(steps.shape)}")
             continue
-        states = {column: values for name, table in tables.items() for column, values in spread(name, table).items()}
         acting = {f"action_{index}": values for index, values in enumerate(steps.reshape(len(steps), -1).T)}
         pieces.append(Piece(str(episode.id), states, acting))
     if problems:
@@ -65,20 +68,13 @@ def read_minari(source: str, **options: Any) -> Recordings:
     )
 
 
-def _tables(observations: Any, name: str = "") -> tuple[dict[str, np.ndarray], list[str]]:
-    """Entries ``[T, d]`` by name, and the names of those that are images."""
-    if isinstance(observations, Mapping):
-        tables: dict[str, np.ndarray] = {}
-        images: list[str] = []
-        for key in sorted(observations):
-            inner, left = _tables(observations[key], f"{name}_{key}" if name else str(key))
-            tables |= inner
-            images += left
-        return tables, images
-    array = np.asarray(observations)
-    if array.ndim > 2 or array.dtype.kind not in "fiub":
-        return {}, [name or "observation"]
-    return {name or "state": array.reshape(len(array), -1)}, []
+def _leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays by name, those of dictionaries in the order of their names."""
+    if not isinstance(observations, Mapping):
+        yield name, np.asarray(observations)
+        return
+    for key in sorted(observations):
+        yield from _leaves(observations[key], f"{name}_{key}" if name else str(key))
 
 
 def _rate(dataset: Any) -> float | None:
