@@ -46,6 +46,10 @@ def test_the_stateless_policy_is_the_open_loop_one():
     with torch.no_grad():
         actions = what.module(*what.inputs.values())
         observed = what.inputs["observations"]
+        assert {name: list(value.shape) for name, value in what.inputs.items()} == {
+            "observations": [1, 5, 4],
+            "noise": [1, 14, 2],
+        }
         plan = whole.plan(observed, what.inputs["noise"])
     assert actions.shape == (1, 4, 3)
     torch.testing.assert_close(actions[:, 0], whole.act(observed, plan, 0))

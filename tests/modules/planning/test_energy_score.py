@@ -18,6 +18,8 @@ def test_the_energy_score_is_least_for_the_true_distribution():
     scores = [energy_score(scale * torch.randn(16, 4000, 3, generator=generator), true).mean() for scale in (1, 0, 2)]
     assert scores[0] < scores[1] and scores[0] < scores[2]
     torch.testing.assert_close(energy_score(torch.zeros(16, 4000, 3), true), true.norm(dim=-1))
+    left_or_right = torch.tensor([[-1.0], [1.0], [-1.0], [1.0]])
+    torch.testing.assert_close(energy_score(left_or_right, torch.ones(1)), torch.tensor(1 / 3))
     with pytest.raises(ValueError, match=r"wanted samples \[S, \*B, d\] and true \[\*B, d\], got \[3, 2\], \[3, 2\]"):
         energy_score(torch.zeros(3, 2), torch.zeros(3, 2))
 

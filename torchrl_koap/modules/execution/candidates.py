@@ -35,14 +35,7 @@ def paths_apart(candidates: Tensor, previous: Tensor) -> Tensor:
 
 
 def first_of_nearest(distance: Tensor) -> Tensor:
-    """Index ``[*B]`` of the first of the nearest quarter, by distances to the current plan ``[*B, N]``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.execution.candidates import first_of_nearest
-        >>> first_of_nearest(torch.tensor([9.0, 2.0, 1.0, 8.0, 7.0, 6.0, 5.0, 4.0])).item()  # two of eight are near
-        1
-    """
+    """Index ``[*B]`` of the first of the nearest quarter, by distances to the current plan ``[*B, N]``."""
     farthest = distance.kthvalue(max(1, round(SHARE * distance.shape[-1])), -1, keepdim=True).values
     return (distance <= farthest).int().argmax(-1)
 

@@ -75,14 +75,6 @@ def exportable(policy: PlanningPolicy, part: str = "policy", *, observation_dim:
 
     Raises:
         ValueError: for another part, or the controller of a policy that decodes by no inverse dynamics.
-
-    Examples:
-        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet, make_koopman_inverse_dynamics, make_policy
-        >>> from torchrl_koap.modules.execution.export import exportable
-        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
-        >>> policy = make_policy(planner, make_koopman_inverse_dynamics(2, 3), state_of=(2, 3))
-        >>> {name: list(value.shape) for name, value in exportable(policy, observation_dim=4).inputs.items()}
-        {'observations': [1, 5, 4], 'noise': [1, 14, 2]}
     """
     lookup(PARTS, part, "part of a policy")
     planner = policy.planner

@@ -124,14 +124,7 @@ def command_rest(action_rule: ActionRule | None, states: Tensor, plan: Tensor, w
 
 
 def remaining_plan(plan: Tensor, age: Tensor | int) -> Tensor:
-    """What is left of plans ``[*B, H, w]`` that were made ``age [*B]`` steps ago, their last state repeated.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.execution.followers import remaining_plan
-        >>> remaining_plan(torch.arange(4.0)[:, None], 2).flatten().tolist()
-        [2.0, 3.0, 3.0, 3.0]
-    """
+    """What is left of plans ``[*B, H, w]`` that were made ``age [*B]`` steps ago, their last state repeated."""
     steps, last = torch.arange(plan.shape[-2], device=plan.device), plan.shape[-2] - 1
     if isinstance(age, int):
         return plan[..., (steps + age).clamp_max(last), :]

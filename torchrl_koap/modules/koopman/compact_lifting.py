@@ -121,14 +121,6 @@ class CompactLifting(TensorDictModuleBase):
         hidden_dims (sequence of int): widths of all networks. Defaults to ``(128, 128)``.
         in_key (NestedKey): states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): lifted states ``[*B, T, 3 m]``. Defaults to ``"lifted_state"``.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
-        >>> lifting = CompactLifting(32, 2)
-        >>> lifting(TensorDict({"state": torch.randn(5, 16, 32)}, [5]))["lifted_state"].shape
-        torch.Size([5, 16, 6])
     """
 
     kept: Tensor

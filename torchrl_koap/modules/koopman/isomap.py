@@ -34,14 +34,6 @@ def isomap(points: Tensor, dims: int, *, neighbours: int = 12, landmarks: int = 
 
     Raises:
         ValueError: for less than two points.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.koopman.isomap import isomap
-        >>> turn = 4.5 * torch.rand(300, generator=torch.Generator().manual_seed(0))
-        >>> along = isomap(torch.stack([turn.cos(), turn.sin()], -1), 1)[:, 0]  # three quarters of a ring
-        >>> abs(torch.corrcoef(torch.stack([along, turn]))[0, 1]) > 0.999
-        tensor(True)
     """
     if len(points) < 2:
         raise ValueError(f"coordinates along a surface need at least two points, got {len(points)}")

@@ -43,16 +43,6 @@ class LatentActionSmoothed(LatentActionModule):
 
     Raises:
         ValueError: if the raw block would read frames that the lifted one does not.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import KoopmanLifting
-        >>> from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
-        >>> infer = LatentActionSmoothed(KoopmanLifting(64, 2), 32, num_past=8, look_ahead=range(2, 9))
-        >>> windows = torch.randn(20, 17, 64)
-        >>> infer.finish(windows)
-        >>> infer.infer(infer.gather(windows)).shape, infer.blocks
-        (torch.Size([20, 17, 606]), ('lifted', 'raw'))
     """
 
     gates: Tensor

@@ -71,14 +71,6 @@ def noise_covariance(windows: Tensor) -> Tensor:
 
     Returns:
         Tensor: symmetric and positive semidefinite ``[d, d]``, float64.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.koopman.smoothing import noise_covariance
-        >>> _ = torch.manual_seed(0)
-        >>> still = 0.5 * torch.randn(5000, 8, 1)
-        >>> abs(noise_covariance(still).item() - 0.25) < 0.02
-        True
     """
     if windows.ndim != 3 or windows.shape[-2] < 5:
         raise ValueError(f"noise_covariance needs windows [N, T >= 5, d], got {list(windows.shape)}")

@@ -30,13 +30,6 @@ def energy_score(samples: Tensor, true: Tensor) -> Tensor:
 
     Raises:
         ValueError: if shapes disagree.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.planning.energy_score import energy_score
-        >>> left_or_right = torch.tensor([[-1.0], [1.0], [-1.0], [1.0]])
-        >>> energy_score(left_or_right, torch.tensor([1.0])), energy_score(torch.zeros(4, 1), torch.tensor([1.0]))
-        (tensor(0.3333), tensor(1.))
     """
     if samples.ndim < 2 or samples.shape[1:] != true.shape:
         raise ValueError(f"wanted samples [S, *B, d] and true [*B, d], got {list(samples.shape)}, {list(true.shape)}")

@@ -47,14 +47,6 @@ class RelativePositionFeatures(nn.Module):
 
     Shape:
         history of states ``[*B, h, d]`` to ``[*B, num_features]``; the last frame counts.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.planning.relative_positions import RelativePosition, RelativePositionFeatures
-        >>> features = RelativePositionFeatures([RelativePosition(slice(0, 2), slice(2, 4), yaw=slice(4, 6))])
-        >>> state = torch.tensor([[0.1, 0.3, 0.1, 0.2, 0.0, 1.0]])  # 0.1 m ahead of an object turned by 90 deg
-        >>> features(state)[:2]
-        tensor([0.1000, 0.0000])
     """
 
     def __init__(self, pairs: Sequence[RelativePosition]):
