@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 # offset along the parent's axes (m) and the fixed quarter turns about x that follow it, for joints 1 to 7
+# compiled callers in other files are cached by Numba without regard to this file: clear __pycache__ after a change
 LINKS = (
     ((0.0, 0.0, 0.333), 0),
     ((0.0, 0.0, 0.0), -1),
