@@ -86,7 +86,7 @@ def test_bad_input():
 
 @pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
 def test_scripted_medians_lie_in_the_human_range():
-    human = [statistics(frames.numpy()) for frames in read_raw(CONVERTERS["avoiding"], HUMAN)[0]]
+    human = [statistics(frames) for frames in read_raw(CONVERTERS["avoiding"], HUMAN)[0]]
     played = [take.frames for take in iterate_takes("avoiding", 48, seed=1)]
     scripted = [statistics(frames) for frames in played]
     outside = {}
