@@ -10,7 +10,6 @@ where its table ends, in a process that has a number of its own there, as its me
 
 from __future__ import annotations
 
-import csv
 import resource
 import sys
 import tempfile
@@ -74,13 +73,11 @@ def main(*, table: Path, run: str = "pretrained:avoiding", episodes: int = 1000,
         batch_size: how many at a time.
     """
     torch.set_num_threads(1)
-    _, write = open_table(table, COLUMNS, COLUMNS[:2])
-    with table.open(newline="", encoding="utf-8") as file:
-        done = list(csv.DictReader(file))
-    first, process = (int(done[-1]["episodes"]), int(done[-1]["process"]) + 1) if done else (0, 1)
+    done, write = open_table(table, COLUMNS, COLUMNS[:2])
+    first, process = max(((int(played), int(number)) for number, played in done), default=(0, 0))
     with tempfile.TemporaryDirectory() as folder:
         for row in play(range(first, episodes), batch_size, quick_run(folder) if run == "quick" else run):
-            shown = [process, *(round(value, 2) for value in row)]
+            shown = [process + 1, *(round(value, 2) for value in row)]
             print(*shown, flush=True)
             write(shown)
 
