@@ -19,6 +19,8 @@ from late_files import wait_until
 from torchrl_koap.studies.launchers import Job, Machines, launch, run_logged
 
 pytestmark = pytest.mark.usefixtures("job_server")
+# where a process that no test has started finds this file and what it imports
+IMPORTED_FROM = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "helpers")]
 
 
 def say(folder):
@@ -187,7 +189,7 @@ def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
     """Neither the job nor the server that it is a copy of."""
     script = tmp_path / "parent.py"
     script.write_text(
-        f"import sys; sys.path[:0] = {[str(Path(__file__).parent)]}\n"
+        f"import sys; sys.path[:0] = {IMPORTED_FROM}\n"
         "from pathlib import Path\n"
         "from torchrl_koap.studies import launchers\n"
         "from test_launchers import sleep\n"
@@ -225,7 +227,7 @@ def test_a_ray_cluster_does_the_same(tmp_path, monkeypatch):
     import ray
 
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where its workers find the jobs
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(IMPORTED_FROM))  # where its workers find the jobs
     (tmp_path / "token").write_text(secrets.token_hex(32))  # else Ray leaves one in the home folder
     monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(tmp_path / "token"))
     names = ("raises", "killed", "leaves", "memory", "speaks")
