@@ -47,6 +47,7 @@ autodoc_typehints = "none"  # the docstrings tell types, with shapes and units
 napoleon_google_docstring, napoleon_numpy_docstring = True, False
 napoleon_use_rtype = False
 napoleon_custom_sections = ["Shape"]
+suppress_warnings = ["ref.python"]  # "a, b: as for f": Sphinx takes a for the type of b, and several classes have an a
 add_module_names = False
 html_show_sourcelink = False
 html_copy_source = False
