@@ -121,15 +121,17 @@ def scooping_matrix() -> str:
 
 
 def suggestions_table() -> str:
-    """Formats the action error by number of labelled demonstrations, a column per criterion."""
+    """Formats action errors by number of labelled demonstrations, and what criteria differ from random choice."""
     rows = read_rows("label_suggestions")
     criteria = list(dict.fromkeys(row["criterion"] for row in rows))
     body = []
     for chosen in dict.fromkeys(row["chosen"] for row in rows):
         mine = {row["criterion"]: row for row in rows if row["chosen"] == chosen}
         body.append([chosen, mine[criteria[0]]["random_error"]])
-        body[-1] += ["{error} ({low}-{high})".format(**mine[name]) for name in criteria]
-    return table(["labelled", "random", *(f"`{name}`" for name in criteria)], body)
+        body[-1] += [
+            "{error}; {difference} ({difference_low} to {difference_high})".format(**mine[name]) for name in criteria
+        ]
+    return table(["labelled", "random", *(f"`{name}`; difference" for name in criteria)], body)
 
 
 def speed_table() -> str:

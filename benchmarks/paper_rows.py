@@ -174,7 +174,7 @@ def bench_size(name: str) -> str:
     rollouts = " or ".join(map(str, sorted(episodes)))
     trained = "1 training seed" if len(seeds) == 1 else f"up to {len(seeds)} training seeds"
     return (
-        f"{len(cells)} cells, {trained}, {rollouts} rollouts each, {'/'.join(_PLURAL[unit] for unit in units)} labelled"
+        f"{len(cells)} runs, {trained}, {rollouts} rollouts each, {'/'.join(_PLURAL[unit] for unit in units)} labelled"
     )
 
 

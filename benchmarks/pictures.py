@@ -65,7 +65,9 @@ def draw_all(folder: Path) -> list[Path]:
         draw_few_labels(folder / "few_labels.png"),
         draw_bars(_controllers(), "success (%)", folder / "controllers.png"),
         draw_lines(_planner_data(), "demonstrations (%)", "success (%)", folder / "unlabelled_planner.png"),
-        draw_lines(_suggestions(), "labelled demonstrations", "action error (mm)", folder / "labelling.png"),
+        draw_lines(
+            _suggestions(), "labelled demonstrations", "action error (mm), mean and range", folder / "labelling.png"
+        ),
         draw_bars(
             [(name, value, value, value) for name, key in latent.items() for value in [float(fact(key, "bare"))]],
             "error after 10 control steps (mm), logarithmic",
