@@ -6,7 +6,7 @@ import warnings
 import pytest
 import torch
 
-from torchrl_koap.runs.device import has_bfloat16_units, set_up_torch, training_dtype
+from torchrl_koap.runs.device import find_precision, has_bfloat16_units, set_up_torch
 
 
 @pytest.fixture(params=["amx_bf16", "avx512_bf16", None])
@@ -19,24 +19,24 @@ def units(request, monkeypatch):
 
 def test_auto_is_what_the_processor_has_units_for(units):
     assert has_bfloat16_units() == (units is not None)
-    assert training_dtype("auto") is (None if units is None else torch.bfloat16)
+    assert find_precision("auto") == ("float32" if units is None else "bfloat16")
 
 
-def test_float32_is_the_default_on_every_processor(units):
-    assert training_dtype("float32") is None
+def test_float32_by_name_is_obeyed(units):
+    assert find_precision("float32") == "float32"
 
 
 def test_bfloat16_by_name_is_obeyed_and_warns_where_it_is_emulated(units):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        assert training_dtype("bfloat16") is torch.bfloat16
+        assert find_precision("bfloat16") == "bfloat16"
     assert len(caught) == (units is None)
     assert units is not None or "'auto'" in str(caught[0].message)
 
 
 def test_another_precision_is_refused_by_name():
     with pytest.raises(ValueError, match="precision 'bfloat61'"):
-        training_dtype("bfloat61")
+        find_precision("bfloat61")
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_the_levels_in_the_middle_of_a_table_have_one_seed_unless_told_otherwise
 
 def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
     study = complete(Study(out=tmp_path, preset="table1", tasks=("aligning", "sorting"), methods=("koap",), seeds=1))
-    assert (study.label_unit, study.labels, study.planner.width, study.run.precision) == ("window", (), 512, "auto")
+    assert (study.label_unit, study.labels, study.planner.width) == ("window", (), 512)
     shares = {task: [cell.labels for cell in study.cells() if cell.task == task] for task in study.tasks}
     assert shares == {"aligning": [0.02, 0.05, 0.1, 0.25, 0.5], "sorting": [0.01, 0.02, 0.05, 0.1, 0.25]}
     assert [config.split("=")[0] for config in study.datasets] == []
@@ -126,7 +126,7 @@ def test_what_is_asked_for_wins_over_the_preset(tmp_path):
     study = complete(Study(out=tmp_path, preset="quick", tasks=("avoiding",), run=RunConfig(threads=2), **own))
     assert (study.planner.width, study.planner.steps, study.evaluation.episodes) == (99, 2000, 7)
     assert (study.labels, study.levels, study.seeds, study.record) == ((0.3,), (), 1, 48)
-    assert (study.run.threads, study.run.precision, study.preset) == (2, "auto", None)
+    assert (study.run.threads, study.preset) == (2, None)
 
 
 def test_data_and_planners_are_named_by_task(tmp_path):

@@ -10,6 +10,7 @@ import pytest
 from torchrl_koap import ControllerConfig, Execution, ExecutionConfig, LabelConfig, PlannerConfig, TrainConfig
 from torchrl_koap.data import make_demonstrations
 from torchrl_koap.runs.config_files import to_json
+from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.training import METHODS, resolve
@@ -27,7 +28,7 @@ def test_nothing_is_left_open_and_a_second_pass_changes_nothing(task):
         for section in (config.planner, config.controller, config.execution):
             missing = {field.name for field in fields(section) if getattr(section, field.name) is None}
             assert missing <= {"source"}, method
-        assert config.labels.fraction == 1.0 and config.task == task
+        assert config.labels.fraction == 1.0 and config.task == task and config.run.precision in DTYPES
         assert resolve(config, get_task(task)) == config
 
 

@@ -143,8 +143,8 @@ class RunConfig:
         seed: seed of label choice, initialisation and batches.
         threads: torch threads.
         device: "cpu" or "cuda".
-        precision: "float32", "bfloat16" for the matrix products of the planner's training, several times quicker where
-            the processor has units for them and many times slower where not, or "auto", which looks.
+        precision: of the matrix products in the planner's training: "float32", "bfloat16" (several times quicker where
+            the processor has units for it, many times slower where not), or "auto", which looks.
         logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise) or
             "tensorboard".
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
@@ -163,7 +163,7 @@ class RunConfig:
     seed: int = 0
     threads: int = 1
     device: str = "cpu"
-    precision: str = "float32"
+    precision: str = "auto"
     logger: str = "csv"
     resume: bool = False
     plugins: Plugins = ()

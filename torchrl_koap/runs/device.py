@@ -9,37 +9,46 @@ import torch
 
 from torchrl_koap.lookup import lookup
 
-PRECISIONS = ("float32", "bfloat16", "auto")
+# matrix products of a denoiser in training; None leaves them as its weights are
+DTYPES = {"float32": None, "bfloat16": torch.bfloat16}
+PRECISIONS = (*DTYPES, "auto")
 _MOST_THREADS = 1024
 _BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat16 matrices say of themselves
 
 
-def training_dtype(precision: str, device: str | torch.device = "cpu") -> torch.dtype | None:
-    """Type of the denoiser's matrix products in training; None leaves them as they are.
+def find_precision(precision: str, device: str | torch.device = "cpu") -> str:
+    """Says what "auto" means on a device: "bfloat16" where it has units for it, else "float32".
 
     With units for bfloat16 a processor is several times quicker than with float32; without them it emulates it and is
     many times slower (``benchmarks/training_speed.py`` measures both).
 
     Args:
-        precision (str): "float32", "bfloat16", or "auto": bfloat16 where the device has units for it.
-        device (str or torch.device): where the training runs.
+        precision (str): "float32", "bfloat16" or "auto".
+        device (str or torch.device, optional): where the training runs. Default: "cpu".
 
     Raises:
         ValueError: for another precision.
 
     Warns:
         UserWarning: if bfloat16 was asked for by name where it is emulated.
+
+    Examples:
+        >>> from torchrl_koap.runs.device import find_precision
+        >>> find_precision("float32"), find_precision("auto") in ("float32", "bfloat16")
+        ('float32', True)
     """
-    if lookup(PRECISIONS, precision, "precision") == "float32":
-        return None
+    lookup(PRECISIONS, precision, "precision")
+    if precision == "float32":
+        return precision
     quick = has_bfloat16_units(device)
-    if precision == "bfloat16" and not quick:
-        warnings.warn(
+    if precision == "auto":
+        return "bfloat16" if quick else "float32"
+    if not quick:
+        told = (
             f"precision 'bfloat16': {torch.device(device).type} has no units for it and emulates it, many times slower"
-            " than 'float32'; 'auto' takes what is quick on the machine",
-            stacklevel=2,
         )
-    return torch.bfloat16 if quick or precision == "bfloat16" else None
+        warnings.warn(f"{told} than 'float32'; 'auto' takes what is quick on the machine", stacklevel=2)
+    return precision
 
 
 def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:

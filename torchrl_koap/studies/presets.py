@@ -27,7 +27,6 @@ _TABLE_1: dict[str, Any] = {
     "label_unit": "window",
     "planner": {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3},
     "controller": {"steps": 1000},
-    "run": {"precision": "auto"},
 }
 PRESETS: dict[str, dict[str, Any]] = {
     "table1": _TABLE_1,

@@ -14,7 +14,7 @@ from torch import nn
 from torchrl_koap.data import controller_view, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.runs.config import TrainConfig
-from torchrl_koap.runs.device import training_dtype
+from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
@@ -168,9 +168,7 @@ def _train_sampler(
         pad_after=HORIZON - 1,
         labelled_share=LABELLED_SHARES[phase.windows],
     )
-    loss = phase.loss(
-        sampler, condition_noise=section.noise, dtype=training_dtype(config.run.precision, config.run.device)
-    )
+    loss = phase.loss(sampler, condition_noise=section.noise, dtype=DTYPES[config.run.precision])
     augment = augmentation(task, actions=True)
     num_steps = max(round(section.steps * phase.share), 1)
     losses = loop(

@@ -41,7 +41,7 @@ def fit(
     controller: Mapping[str, Any] | None = None,
     seed: int = 0,
     device: str = "cpu",
-    precision: str = "float32",
+    precision: str = "auto",
     progress: bool = True,
 ) -> Trained:
     """Trains planner and controller, or a network that samples actions, on data in memory.

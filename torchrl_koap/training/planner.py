@@ -27,7 +27,7 @@ from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.config import PlannerConfig, TrainConfig
-from torchrl_koap.runs.device import training_dtype
+from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, Task
@@ -93,9 +93,7 @@ def learn_planner(
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
 
-    loss = PlannerLoss(
-        planner, condition_noise=section.noise, dtype=training_dtype(config.run.precision, config.run.device)
-    )
+    loss = PlannerLoss(planner, condition_noise=section.noise, dtype=DTYPES[config.run.precision])
     best = None
     if held_out is not None:
         best = BestWeights(loss, plan_score(planner, held_out, task), check_interval(section, planner.num_steps))
