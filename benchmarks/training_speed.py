@@ -86,7 +86,7 @@ def controllers(repeats: int) -> Iterable[tuple[object, ...]]:
 def planners(repeats: int) -> Iterable[tuple[object, ...]]:
     """A row for the default planner of Avoiding."""
     torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, num_steps=10, clip=1.2)
+    planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, num_steps=10)
     windows = TensorDict({"state": torch.randn(256, planner.history + planner.horizon, 2).cumsum(1)}, [256])
     planner.fit_normalizers(windows["state"])
     updates = 1 / median_seconds(update_of(PlannerLoss(planner), lambda: windows), repeats)

@@ -83,7 +83,7 @@ print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 # ---------------------
 # It never sees an action. Recovery augmentation shows it states off the demonstrated path, and the way back.
 
-planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, relative=False, clip=1.2, num_steps=5)
+planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, relative=False, num_steps=5)
 extended = extrapolate_ends(data, 13)
 planner.fit_normalizers(cut_windows(extended, 16, select=["state"], pad_before=1)["state"])
 planner_loss = PlannerLoss(planner)

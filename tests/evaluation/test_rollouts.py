@@ -57,7 +57,7 @@ def test_results_do_not_depend_on_the_batch_size(together, batch_size):
 @pytest.mark.parametrize("strategy", ["feedback", "open_loop"])
 def test_real_networks_do_not_depend_on_it_either(strategy):
     torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3, clip=1.0)
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3)
     planner.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1))
     controller = make_koopman_inverse_dynamics(2, 2)
     torch.nn.init.normal_(controller.action_decoder.linear.weight, std=1e-3)

@@ -48,7 +48,7 @@ class SamplerTestBase:
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     @pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 3)])
     def test_any_batch_dtype_and_device(self, batch, dtype, device):
-        sampler = self.fit(self.make_unet(num_steps=3, clip=1.0, horizon=6), dtype=torch.float64)
+        sampler = self.fit(self.make_unet(num_steps=3, horizon=6), dtype=torch.float64)
         sampler.to(device=device, dtype=dtype)
         history = torch.randn(*batch, 2, 2, dtype=dtype, device=device)
         noise = sampler.draw_noise(history)
@@ -58,7 +58,7 @@ class SamplerTestBase:
         torch.testing.assert_close(sequence.reshape(-1, 6, self.width), flat)
 
     def test_given_noise_makes_samples_independent_of_the_batch(self):
-        sampler = self.make(num_steps=5, clip=1.0)
+        sampler = self.make(num_steps=5)
         history, noise = torch.randn(6, 2, 2), torch.randn(6, *sampler.noise_shape)
         together = sampler(TensorDict({"history": history, "noise": noise}, [6]))[self.out_key]
         for row in range(6):
@@ -66,7 +66,7 @@ class SamplerTestBase:
 
     @pytest.mark.parametrize("exploration", ExplorationType)
     def test_without_noise_every_sample_is_another_unless_a_generator_repeats_it(self, exploration):
-        sampler, history = self.make(clip=1.0), torch.randn(3, 2, 2)
+        sampler, history = self.make(), torch.randn(3, 2, 2)
         with set_exploration_type(exploration):
             assert not torch.equal(sampler.sample(history), sampler.sample(history))
         first, second, other = (sampler.sample(history, generator=torch.Generator().manual_seed(s)) for s in (0, 0, 1))

@@ -83,7 +83,7 @@ def test_training_recovers_the_mean_and_spread_of_the_data():
     )
     data = torch.randn(2048, 3, 1)
     data[:, 1:] = data[:, :1] + 2.0 + 0.5 * torch.randn(2048, 2, 1)
-    planner.fit_normalizers(data, mode="standard")
+    planner.fit_normalizers(data)
     loss = PlannerLoss(planner)
     average = SoftUpdate(loss, eps=0.99)
     optimizer = torch.optim.Adam(loss.parameters(), lr=2e-3)
@@ -105,7 +105,7 @@ def test_forward_and_plan_compile_without_a_graph_break(network):
     torch._dynamo.reset()  # TorchRL wraps every loss in one function: their graphs share its recompilation limit
     loss = make_loss()
     if network == "unet":  # the loss of the other one is compiled in LossTestBase
-        planner = StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2, horizon=6, num_steps=2, clip=1.0)
+        planner = StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2, horizon=6, num_steps=2)
         loss, data = PlannerLoss(planner), batch_of(4)
         compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
         torch.testing.assert_close(compiled(data)["loss_planner"], loss(data)["loss_planner"])

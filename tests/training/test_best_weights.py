@@ -95,14 +95,6 @@ def test_a_resumed_training_keeps_the_same_weights_bit_for_bit(tmp_path, stop):
     assert last[0]["kept_update"] == whole.step.item() == last[1]["kept_update"]
 
 
-def test_noise_on_the_condition_changes_the_loss_alone():
-    torch.manual_seed(0)
-    planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=8, depth=1), state_dim=2, horizon=6)
-    batch = sample().update({"planner_noise": torch.randn(4, 6, 2), "planner_time": torch.rand(4)})
-    plain, none, noisy = (PlannerLoss(planner, condition_noise=size)(batch)["loss_planner"] for size in (0, 0, 0.5))
-    assert torch.equal(plain, none) and not torch.equal(plain, noisy)
-
-
 @pytest.mark.parametrize(("steps", "batch_size", "every"), [(20_000, 512, 500), (4000, 256, 134), (100, 64, 100)])
 def test_scores_take_a_twentieth_of_the_training(steps, batch_size, every):
     section = PlannerConfig(steps=steps, batch_size=batch_size)

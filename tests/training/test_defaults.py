@@ -95,7 +95,7 @@ class TestThePlanner:
         assert config.planner.held_out == 0.1 and resolved().planner.held_out == 0.0
         assert (config.planner.network, config.planner.width, config.planner.octaves) == ("mlp", 512, 0)
         unet = resolve(TrainConfig(out="run", planner=PlannerConfig(network="unet")), task).planner
-        assert (unet.network, unet.width, unet.octaves, unet.noise, unet.steps) == ("unet", 64, 4, 0.0, 3000)
+        assert (unet.network, unet.width, unet.octaves, unet.steps) == ("unet", 64, 4, 3000)
         wide = replace(task, defaults=replace(task.defaults, planner={"network": "unet", "width": 32}))
         wide = resolve(TrainConfig(out="run"), wide).planner
         assert (wide.network, wide.width, wide.batch_size, wide.held_out) == ("unet", 32, 128, 0.1)

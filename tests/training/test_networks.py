@@ -31,7 +31,7 @@ def test_every_network_plans(network, frames, task):
     task = get_task(task)
     planner = build_planner(task, PlannerConfig(network=network, width=16, octaves=2, frames=frames))
     assert planner.sample(torch.zeros(3, frames, task.state_dim)).shape == (3, 14, task.state_dim)
-    assert (planner.clip, planner.relative, planner.history) == (1.2, task.defaults.relative, frames)
+    assert (planner.relative, planner.history) == (task.defaults.relative, frames)
     assert sizes_of(planner) == {"network": network, "width": 16, "octaves": 2, "frames": frames}
 
 

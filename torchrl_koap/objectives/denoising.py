@@ -33,8 +33,6 @@ class DenoisingLoss(NetworkLoss):
         network (ConditionalSampler): network to train, its normalisers already fitted.
 
     Keyword Args:
-        condition_noise (float): largest standard deviation of normal noise on the normalised condition; that of every
-            row is uniform between 0 and it. Defaults to 0.
         create_target_params (bool): keep an averaged copy of the weights in ``target_network_params``, to be moved by
             :class:`torchrl.objectives.SoftUpdate` and used for sampling. Defaults to True.
         reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, width]`` that count
@@ -63,13 +61,12 @@ class DenoisingLoss(NetworkLoss):
         self,
         network: ConditionalSampler,
         *,
-        condition_noise: float = 0.0,
         create_target_params: bool = True,
         reduction: Literal["none", "mean", "sum"] = "mean",
         dtype: torch.dtype | None = None,
     ):
         super().__init__(network, create_target_params=create_target_params, reduction=reduction)
-        self.dtype, self.condition_noise = dtype, condition_noise
+        self.dtype = dtype
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads raw histories and sequences of a batch, and which of their steps count.
@@ -90,9 +87,6 @@ class DenoisingLoss(NetworkLoss):
                 condition, clean = network.encode_history(history), network.encode(history, sequence)
                 if counts is not None:
                     clean = torch.where(counts, clean, 0.0)
-                if self.condition_noise:
-                    size = self.condition_noise * torch.rand_like(condition[..., :1])
-                    condition = condition + size * torch.randn_like(condition)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
             error = network.denoising_error(condition, clean, noise, time, dtype=self.dtype)  # [*B, H, width]
 

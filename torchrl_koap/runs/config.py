@@ -70,8 +70,6 @@ class PlannerConfig:
         octaves: octaves of the Fourier features of what it sees; with 0 it sees the plain numbers.
         batch_size: windows per update.
         learning_rate: peak learning rate.
-        weight_decay: decoupled weight decay (AdamW).
-        noise: largest standard deviation of the noise on what it sees, as a share of half the range of each entry.
         frames: frames that it sees, 1 or 2.
         held_out: share of the trajectories that it never learns from, those without labels first. Training keeps the
             weights that plan them best, and `koap eval` evaluates plans on them (default: 0.1 for a task without an
@@ -93,8 +91,6 @@ class PlannerConfig:
     octaves: int | None = None
     batch_size: int | None = None
     learning_rate: float | None = None
-    weight_decay: float | None = None
-    noise: float | None = None
     frames: int | None = None
     held_out: float | None = None
     source: Path | None = None
@@ -102,7 +98,7 @@ class PlannerConfig:
     def __post_init__(self):
         _check("planner", self, steps=(1, None), width=(1, None), batch_size=(1, None), frames=(1, HISTORY))
         _check("planner", self, learning_rate=(0, None, False), held_out=(0, 1, True, False))
-        _check("planner", self, octaves=(0, None), weight_decay=(0, None), noise=(0, None))
+        _check("planner", self, octaves=(0, None))
         if self.source is not None:
             object.__setattr__(self, "source", find_run(self.source))
 

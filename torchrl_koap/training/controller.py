@@ -22,7 +22,7 @@ from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import LABELLED_SHARES, Method
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.networks import build_controller
+from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import augmentation
 from torchrl_koap.training.policy_facts import command_ranges
 
@@ -168,7 +168,7 @@ def _train_sampler(
         pad_after=HORIZON - 1,
         labelled_share=LABELLED_SHARES[phase.windows],
     )
-    loss = phase.loss(sampler, condition_noise=section.noise, dtype=DTYPES[config.run.precision])
+    loss = phase.loss(sampler, dtype=DTYPES[config.run.precision])
     augment = augmentation(task, actions=True)
     num_steps = max(round(section.steps * phase.share), 1)
     losses = loop(
@@ -177,7 +177,7 @@ def _train_sampler(
         lambda: augment(buffer.sample()),
         num_steps=num_steps,
         learning_rate=section.learning_rate,
-        weight_decay=section.weight_decay,
+        weight_decay=WEIGHT_DECAY,
         target_update=moving_average(loss, num_steps),
     )
     loss.target_network_params.to_module(sampler)

@@ -22,14 +22,7 @@ from torchrl_koap.training.networks import NETWORKS
 CONTROLLER_UPDATES = 500
 PLACES = "absolute"  # what the default preset is where actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
-OWN_DATA: dict[str, Any] = {
-    "steps": 3000,
-    "network": "mlp",
-    "octaves": 0,
-    "weight_decay": 0.1,
-    "noise": 0.1,
-    "held_out": 0.1,
-}
+OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 
 

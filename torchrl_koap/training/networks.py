@@ -15,11 +15,11 @@ from torchrl_koap.runs.config import ControllerConfig, PlannerConfig
 from torchrl_koap.tasks import HORIZON, Task
 from torchrl_koap.training.method import Method
 
-CLIP = 1.2  # of normalised sequences, which lie in [-1, 1] in the data
+WEIGHT_DECAY = 1e-4  # decoupled, of all networks that denoise
 # the networks of planners, and what they are built and trained with where nothing else is asked for
 NETWORKS: dict[str, dict[str, Any]] = {
-    "unet": {"width": 64, "octaves": 4, "batch_size": 128, "learning_rate": 3e-3, "weight_decay": 1e-4, "noise": 0.0},
-    "mlp": {"width": 512, "octaves": 1, "batch_size": 512, "learning_rate": 1e-3, "weight_decay": 1e-4, "noise": 0.0},
+    "unet": {"width": 64, "octaves": 4, "batch_size": 128, "learning_rate": 3e-3},
+    "mlp": {"width": 512, "octaves": 1, "batch_size": 512, "learning_rate": 1e-3},
 }
 
 
@@ -67,7 +67,6 @@ def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
         "horizon": HORIZON,
         "relative": task.defaults.relative,
         "features": features,
-        "clip": CLIP,
     }
 
 

@@ -34,7 +34,7 @@ from torchrl_koap.tasks import HISTORY, Task
 from torchrl_koap.tasks.units import unit_groups
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import moving_average, train_phase
-from torchrl_koap.training.networks import build_planner
+from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner
 
 SITUATIONS, SAMPLES = 128, 4  # held out, and plans in each, that weights are chosen by
 CHECKS = 40  # scores in a training at most
@@ -93,7 +93,7 @@ def learn_planner(
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
 
-    loss = PlannerLoss(planner, condition_noise=section.noise, dtype=DTYPES[config.run.precision])
+    loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision])
     best = None
     if held_out is not None:
         best = BestWeights(loss, plan_score(planner, held_out, task), check_interval(section, planner.num_steps))
@@ -104,7 +104,7 @@ def learn_planner(
             draw,
             num_steps=section.steps,
             learning_rate=section.learning_rate,
-            weight_decay=section.weight_decay,
+            weight_decay=WEIGHT_DECAY,
             target_update=moving_average(loss, section.steps),
             best=best,
             run=run,

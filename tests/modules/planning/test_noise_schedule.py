@@ -50,15 +50,6 @@ def test_target_and_split_are_inverse(prediction, dtype, device):
         assert noisy.dtype == dtype
 
 
-@pytest.mark.parametrize("prediction", PREDICTIONS)
-def test_clip_bounds_the_plan_and_keeps_the_split_consistent(prediction):
-    schedule = NoiseSchedule(prediction)
-    level, x = schedule.noise_levels(4)[1], 5 * torch.randn(6, 3, 2)
-    sample, epsilon = schedule.split(torch.randn_like(x), x, level, clip=0.5)
-    assert sample.abs().max() <= 0.5
-    torch.testing.assert_close(level.signal * sample + level.noise * epsilon, x)
-
-
 def test_sampled_times_cover_the_schedule():
     generator = torch.Generator().manual_seed(0)
     times = NoiseSchedule(num_train_steps=20).sample_time(torch.empty(4000, 3, 2), generator)
@@ -127,18 +118,13 @@ def test_levels_agree_with_diffusers(diffusers, prediction):
 
 
 @pytest.mark.parametrize("prediction", PREDICTIONS)
-@pytest.mark.parametrize(("num_steps", "clip"), [(50, 1.0), (10, 1.0), (10, None), (5, 0.6)])
-def test_ddim_agrees_with_diffusers(diffusers, prediction, num_steps, clip):
-    oracle = diffusers.DDIMScheduler(
-        **oracle_options(prediction, 50),
-        clip_sample=clip is not None,
-        clip_sample_range=clip or 1.0,
-        timestep_spacing="trailing",
-    )
+@pytest.mark.parametrize("num_steps", [50, 10, 5])
+def test_ddim_agrees_with_diffusers(diffusers, prediction, num_steps):
+    oracle = diffusers.DDIMScheduler(**oracle_options(prediction, 50), clip_sample=False, timestep_spacing="trailing")
     oracle.set_timesteps(num_steps)
     noise = torch.randn(6, 14, 2, dtype=torch.float64)
-    expected = follow(oracle, noise, use_clipped_model_output=clip is not None)
-    got = NoiseSchedule(prediction).solve(smooth_network, noise, num_steps, "ddim", clip=clip)
+    expected = follow(oracle, noise)
+    got = NoiseSchedule(prediction).solve(smooth_network, noise, num_steps, "ddim")
     torch.testing.assert_close(got, expected, atol=1e-4, rtol=1e-4)
 
 

@@ -69,15 +69,12 @@ class DiffusionPolicy(ConditionalSampler):
         self.action_dim = action_dim
         self.action_normalizer = Normalizer(action_dim)
 
-    def fit_normalizers(self, windows: Tensor, actions: Tensor, *, mode: str = "minmax") -> None:
+    def fit_normalizers(self, windows: Tensor, actions: Tensor) -> None:
         """Takes the statistics of condition and actions from data; call it before a loss is built on the policy.
 
         Args:
             windows (Tensor): raw states ``[*N, history + horizon, d]``; no label is needed for them.
             actions (Tensor): labelled raw actions ``[*M, act]``. All steps of a chunk share their statistics.
-
-        Keyword Args:
-            mode (str): of the statistics, see :class:`~torchrl_koap.modules.Normalizer`.
 
         Raises:
             ValueError: for windows or actions of another shape, no actions, or actions that are not finite: they
@@ -86,8 +83,8 @@ class DiffusionPolicy(ConditionalSampler):
         if actions.ndim < 2 or actions.shape[-1] != self.action_dim:
             raise ValueError(f"actions must be [*M, {self.action_dim}] (action_dim), got {list(actions.shape)}")
         history, _ = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
-        example, condition = self.action_normalizer.scale, Normalizer.fit(self.condition(history), mode=mode)
-        self.action_normalizer = Normalizer.fit(actions, mode=mode).to(example)
+        example, condition = self.action_normalizer.scale, Normalizer.fit(self.condition(history))
+        self.action_normalizer = Normalizer.fit(actions).to(example)
         self.condition_normalizer = condition.to(example)
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:

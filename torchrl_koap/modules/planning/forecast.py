@@ -10,7 +10,7 @@ from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.ridge import ridge
 
 _MOST_ROWS = 20_000  # windows that the ridge is fitted to at most, spread evenly
-_NOTHING = 1e-3  # of the range of an entry: scale of what is forecast without error
+_NOTHING = 1e-3  # of the spread of an entry: scale of what is forecast without error
 _PENALTIES = tuple(10.0**power for power in range(-6, 8))  # the last one leaves next to nothing
 
 
@@ -44,7 +44,7 @@ class LinearForecast(nn.Module):
         self.register_buffer("bias", torch.zeros(width))
         self.residual = Normalizer(width)
 
-    def fit(self, condition: Tensor, sequence: Tensor, groups: Tensor | None = None, *, mode: str = "minmax") -> float:
+    def fit(self, condition: Tensor, sequence: Tensor, groups: Tensor | None = None) -> float:
         """Fits the ridge and the statistics of what it leaves over, and returns the penalty chosen.
 
         Args:
@@ -52,9 +52,6 @@ class LinearForecast(nn.Module):
             sequence (Tensor): normalised sequences ``[N, w]``.
             groups (Tensor, optional): trajectory of every row ``[N]``; they are left out one at a time to choose the
                 penalty. Default: one row at a time.
-
-        Keyword Args:
-            mode (str): of the statistics (:class:`~torchrl_koap.modules.normalizer.Normalizer`).
         """
         groups = torch.arange(len(condition), device=condition.device) if groups is None else groups
         rows = slice(None, None, -(-len(condition) // _MOST_ROWS))
@@ -68,7 +65,7 @@ class LinearForecast(nn.Module):
         self.weight.copy_(fit.weight)
         self.bias.copy_(fit.bias)
         rest = sequence - self._forecast(condition)
-        fitted = Normalizer.fit(rest, mode=mode)
+        fitted = Normalizer.fit(rest, mode="standard")
         nothing = (rest - fitted.offset).abs().amax(0) < _NOTHING  # such as a goal that never moves
         scale = torch.where(nothing, _NOTHING, fitted.scale)
         self.residual = Normalizer(len(scale), offset=fitted.offset, scale=scale).to(self.bias)

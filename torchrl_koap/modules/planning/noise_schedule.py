@@ -141,18 +141,16 @@ class NoiseSchedule(nn.Module):
         return [*(NoiseLevel(float(time), *self._levels[time]) for time in times), NoiseLevel(0.0, 1.0, 0.0)]
 
     def split(
-        self, output: Tensor, x: Tensor, level: NoiseLevel, clip: float | None = None, prefix: Tensor | None = None
+        self, output: Tensor, x: Tensor, level: NoiseLevel, prefix: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Splits noisy sequences ``x`` of a level into the clean ones and the noise that a network output stands for.
 
-        All are ``[*B, H, d]``; ``clip`` and ``prefix`` as for :meth:`solve`.
+        All are ``[*B, H, d]``; ``prefix`` as for :meth:`solve`.
         """
         sample = output if self.prediction == "sample" else (x - output * level.noise) / level.signal
-        if clip is not None:
-            sample = sample.clamp(-clip, clip)
         if prefix is not None:
             sample = torch.cat([prefix, sample[..., prefix.shape[-2] :, :]], -2)
-        elif clip is None and self.prediction == "epsilon":
+        elif self.prediction == "epsilon":
             return sample, output
         return sample, (x - sample * level.signal) / level.noise
 
@@ -163,7 +161,6 @@ class NoiseSchedule(nn.Module):
         num_steps: int,
         solver: str = "dpm++2m",
         *,
-        clip: float | None = None,
         prefix: Tensor | None = None,
     ) -> Tensor:
         """Turns noise into sequences ``[*B, H, d]``.
@@ -175,7 +172,6 @@ class NoiseSchedule(nn.Module):
             solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
 
         Keyword Args:
-            clip (float, optional): bound of the clean sequence at every step. Defaults to no bound.
             prefix (Tensor, optional): first frames ``[*B, k, d]`` that the clean sequence has to have: they replace
                 what the network says at every step, so that the rest is made to fit them.
 
@@ -185,6 +181,6 @@ class NoiseSchedule(nn.Module):
         run, levels, batch = lookup(SOLVERS, solver, "solver"), self.noise_levels(num_steps), noise.shape[:-2]
 
         def denoise(x: Tensor, level: NoiseLevel) -> tuple[Tensor, Tensor]:
-            return self.split(network(x, x.new_full(batch, level.time)), x, level, clip, prefix)
+            return self.split(network(x, x.new_full(batch, level.time)), x, level, prefix)
 
         return run(denoise, noise, levels)

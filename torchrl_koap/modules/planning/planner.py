@@ -31,7 +31,8 @@ class StatePlanner(ConditionalSampler):
     (:class:`~torchrl_koap.modules.planning.forecast.LinearForecast`), which carries over to goals never seen.
 
     Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
-    dict.
+    dict. Conditions are scaled by their range, plans by their standard deviation: by range first frames would be a
+    tenth as wide as last ones, and the noise of the schedule would cover them.
 
     Args as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`, like keywords that are not listed; a
     sequence is a plan, of ``d`` columns.
@@ -70,16 +71,13 @@ class StatePlanner(ConditionalSampler):
         self.plan_normalizer = Normalizer(entries)
         self.forecast = LinearForecast(len(self.condition_normalizer.scale), entries) if forecast else None
 
-    def fit_normalizers(
-        self, windows: Tensor, *, mode: str = "minmax", seen: Tensor | None = None, groups: Tensor | None = None
-    ) -> None:
+    def fit_normalizers(self, windows: Tensor, *, seen: Tensor | None = None, groups: Tensor | None = None) -> None:
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
 
         Args:
             windows (Tensor): raw states ``[*N, history + horizon, d]``.
 
         Keyword Args:
-            mode (str): of the statistics, see :class:`~torchrl_koap.modules.Normalizer`.
             seen (Tensor, optional): the windows as training augments them, which the forecast is fitted to. Default:
                 as they are.
             groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
@@ -87,13 +85,13 @@ class StatePlanner(ConditionalSampler):
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
         example = self.plan_normalizer.scale
-        self.condition_normalizer = Normalizer.fit(self.condition(history), mode=mode).to(example)
-        self.plan_normalizer = Normalizer.fit(self._displaced(history, plan), mode=mode).to(example)
+        self.condition_normalizer = Normalizer.fit(self.condition(history)).to(example)
+        self.plan_normalizer = Normalizer.fit(self._displaced(history, plan), mode="standard").to(example)
         if self.forecast is not None:
             history, plan = self.split_window((windows if seen is None else seen).reshape(-1, *windows.shape[-2:]))
             plan = self.plan_normalizer(self._displaced(history, plan))
             groups = None if groups is None else groups.flatten()
-            self.forecast.fit(self.encode_history(history), plan, groups, mode=mode)
+            self.forecast.fit(self.encode_history(history), plan, groups)
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Maps raw plans ``[*B, H, d]`` to normalised sequences (:meth:`ConditionalSampler.encode`)."""

@@ -41,7 +41,6 @@ class ConditionalSampler(TensorDictModuleBase):
             further numbers that the condition holds, such as the relative positions of objects.
         solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
         num_steps (int): solver steps. Defaults to 10.
-        clip (float, optional): bound of the normalised sequence at every solver step. Defaults to no bound.
         noise_key (NestedKey, optional): entry of start noise ``[*B, H, width]``, read if present. Defaults to
             ``"noise"``.
 
@@ -65,7 +64,6 @@ class ConditionalSampler(TensorDictModuleBase):
         features: nn.Module | None = None,
         solver: str = "dpm++2m",
         num_steps: int = 10,
-        clip: float | None = None,
         noise_key: NestedKey | None = "noise",
     ):
         super().__init__()
@@ -80,7 +78,7 @@ class ConditionalSampler(TensorDictModuleBase):
         self.schedule = NoiseSchedule() if schedule is None else schedule
         lookup(SOLVERS, solver, "solver")
         self.schedule.noise_levels(num_steps)  # refuses a number out of range
-        self.solver, self.num_steps, self.clip = solver, num_steps, clip
+        self.solver, self.num_steps = solver, num_steps
         self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
         self.features = features
         condition_dim = history * state_dim + (0 if features is None else features.num_features)
@@ -203,7 +201,6 @@ class ConditionalSampler(TensorDictModuleBase):
             noise,
             self.num_steps,
             self.solver,
-            clip=self.clip,
             prefix=None if prefix is None else self._encode_prefix(history, prefix),
         )
         return self.decode(history, sequence)
