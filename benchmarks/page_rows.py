@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from paper_rows import count_by_observations, count_successes, finished_cells, label_shares, paper_cells_beside
 from scooping_rows import scooping_cells
-from tables import SOURCE, fact, percent, planner_rows, read_rows, table
+from tables import SOURCE, fact, percent, planner_rows, pooled_rewards, read_rows, table
 from unlabelled_rows import REGIMES, followed
 
 from torchrl_koap.studies.paper import default_entries
@@ -174,10 +174,10 @@ def followed_rollouts(labels: int, regimes: Sequence[str]) -> str:
     return " or ".join(map(str, sorted({size for (_, name), size in sizes.items() if name in FOLLOWED.values()})))
 
 
-def mean_reward(ground: str) -> str:
-    """Formats the mean largest reward of the training seeds of a proving ground with the default execution."""
-    rewards = [float(row["largest_reward"]) for row in read_rows("proving_grounds", ground=ground, execution="default")]
-    return f"{sum(rewards) / len(rewards):.2f}"
+def mean_reward(ground: str, method: str, execution: str = "default") -> str:
+    """Formats the mean largest reward of a method on a proving ground, all training seeds together."""
+    ((_, mean, _),) = pooled_rewards(ground=ground, method=method, execution=execution)
+    return f"{mean:.2f}"
 
 
 def requirement(name: str) -> str:

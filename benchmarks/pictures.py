@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.ticker import FixedLocator, NullLocator
 from paper_rows import count_by_observations, count_successes, draw_bench_average, label_shares
-from tables import fact, planner_rows, read_rows
+from tables import fact, planner_rows, pooled_rewards, read_rows
 from unlabelled_rows import draw_unlabelled
 
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -45,12 +45,8 @@ def draw_all(folder: Path) -> list[Path]:
     latent = {"Koopman model": "latent_koopman", "linear model on states": "latent_linear", "no motion": "latent_still"}
     ways = [(row["way"], float(row["p50_ms"]), float(row["p99_ms"])) for row in read_rows("exported_policy")]
     scores = [
-        (
-            f"seed {row['seed']}, {row['execution'].replace('_', ' ')}",
-            float(row["largest_reward"]),
-            float(row["standard_error"]),
-        )
-        for row in read_rows("proving_grounds", ground="pusht")
+        (f"{rows[0]['method']}, {rows[0]['execution'].replace('_', ' ')}", mean, error)
+        for rows, mean, error in pooled_rewards(ground="pusht")
     ]
     return [
         draw_label_curves(label_curves(), folder / "success_and_entropy.png"),

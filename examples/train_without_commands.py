@@ -36,7 +36,7 @@ controller = koap.KoopmanInverseDynamics(
     state_normalizer=koap.Normalizer.fit(data["state"], mode="standard"),
     action_normalizer=koap.Normalizer.fit(data["action"], mode="rms", mask=data["has_action"]),
 )
-planner = koap.StatePlanner(koap.TemporalUnet(2, 4), state_dim=2, clip=1.2)
+planner = koap.StatePlanner(koap.TemporalUnet(2, 4), state_dim=2)
 entries = ["state", "action", "has_action"]
 labelled = make_window_buffer(data, 16, 128, select=entries, pad_before=1, labelled_share=0.25)
 states = make_window_buffer(data, 16, 128, select=["state"], pad_before=1, pad_after=13)
