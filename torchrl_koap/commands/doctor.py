@@ -55,7 +55,8 @@ def machine_facts() -> dict[str, str]:
             facts[name] = "MISSING"
     facts["processors"] = str(os.cpu_count())
     facts["torch threads"] = str(torch.get_num_threads())
-    facts["bfloat16 (--run.precision)"] = "quick" if has_bfloat16_units() else "emulated, many times slower than float32"
+    quick = has_bfloat16_units()
+    facts["bfloat16 (--run.precision)"] = "quick" if quick else "emulated, many times slower than float32"
     facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     facts["rendering (3-D pictures)"] = _rendering()
     for extra, module in {"wandb": "wandb", "video": "imageio", "lerobot": "pyarrow"}.items():
