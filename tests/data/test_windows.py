@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_koap.data import D3ILExperienceReplay, LabelBudget, WindowTable, cut_windows, make_window_buffer, save_ted
+from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.tasks import get_task
 
 GPU = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))
@@ -164,3 +165,9 @@ def test_from_a_data_set(tmp_path):
     batch = buffer.sample()
     assert set(batch.keys()) == {"state", "action"}
     assert batch["action"][:4, 1:15].isfinite().all() and batch["action"][4:].isnan().all()
+
+
+def test_rows_are_taken_evenly_from_the_first_to_the_last():
+    rows = torch.arange(10)
+    assert spread_evenly(rows, 4).tolist() == [0, 3, 6, 9]
+    assert spread_evenly(rows, 10) is rows and len(spread_evenly(rows[:0], 4)) == 0

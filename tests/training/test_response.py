@@ -17,6 +17,7 @@ from torchrl_koap.training.response import (
     fit_response,
     labelled_steps,
     prediction_errors,
+    take,
     tracked_columns,
 )
 
@@ -186,7 +187,7 @@ def test_axes_that_are_not_coupled_stay_so():
 def test_without_a_stretch_nothing_changes():
     response = columns().double()
     response.weight.copy_(a_system().weight)
-    fit_predictions(response, stretches().take(torch.zeros(0, dtype=torch.long)), coupled=True)
+    fit_predictions(response, take(stretches(), torch.zeros(0, dtype=torch.long)), coupled=True)
     assert torch.equal(response.weight, a_system().weight)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -22,6 +23,8 @@ from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorDictReplayB
 from torchrl_koap import keys
 from torchrl_koap.data.window_sampler import WindowSampler, WindowUnit
 from torchrl_koap.files import some
+
+Rows = TypeVar("Rows", Tensor, TensorDictBase)
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,11 @@ class WindowTable:
         wanted = starts.unsqueeze(-1) + torch.arange(self.window, device=starts.device)
         inside = wanted.clamp(first.unsqueeze(-1), last.unsqueeze(-1))
         return inside, inside != wanted
+
+
+def spread_evenly(rows: Rows, most: int) -> Rows:
+    """At most so many of some rows, spread evenly from the first to the last."""
+    return rows if len(rows) <= most else rows[torch.linspace(0, len(rows) - 1, most).round().long()]
 
 
 def cut_windows(

@@ -16,7 +16,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
-from torchrl_koap.evaluation.plan_errors import SAMPLES, score_sequences, spread_evenly
+from torchrl_koap.data.windows import spread_evenly
+from torchrl_koap.evaluation.plan_errors import SAMPLES, SITUATIONS, score_sequences
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics
 from torchrl_koap.modules.planning.energy_score import sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
@@ -123,9 +124,8 @@ def errors_left_out(
     episodes = labelled["episode"][has_action].unique()
     if len(episodes) < 2:
         return {"note": "only one trajectory has labels: none can be left out"}
-    left_out = episodes[torch.linspace(0, len(episodes) - 1, min(len(episodes), _MOST_FOLDS)).round().long()]
     folds = []
-    for number in left_out:
+    for number in spread_evenly(episodes, _MOST_FOLDS):
         fold = labelled.copy()
         hidden = labelled["episode"] == number
         fold["has_action"] = labelled["has_action"] & ~hidden.unsqueeze(-1)
@@ -174,7 +174,7 @@ def errors_of_chunks(
     windows = windows[torch.isin(windows["episode"][:, -1], episodes.cpu())]
     if not len(windows):
         return {"note": "no trajectory outside the budget has labels"}
-    windows = spread_evenly(windows)
+    windows = spread_evenly(windows, SITUATIONS)
 
     def moved(part: TensorDictBase) -> Tensor:
         """Absolute actions as distances from where their columns are in the present frame."""

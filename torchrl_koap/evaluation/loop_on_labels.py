@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
@@ -196,7 +197,7 @@ def _roll(
     """Commands ``[steps, n, act]``, fewer where they are no numbers any more, and the distance to recorded states."""
     observed, first = data[OBSERVATION].double(), _first(data)
     starts = (first.roll(1) & ~first & (observed + observed.roll(1, 0)).isfinite().all(-1)).nonzero().squeeze(-1)
-    starts = starts[torch.linspace(0, len(starts) - 1, min(ROBOTS, len(starts))).round().long()]
+    starts = spread_evenly(starts, ROBOTS)
     now, change = observed[starts], observed[starts] - observed[starts - 1]
     agent, commands, visited = Agent(policy, seed=seed), [], []
     agent.reset()

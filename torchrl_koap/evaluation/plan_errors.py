@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import cut_windows
+from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.planning.energy_score import energy_score, sample_sequences
 from torchrl_koap.tasks import Task
@@ -51,7 +52,7 @@ def plan_errors(
     """
     horizon, history = planner.horizon, max(planner.history, 2)  # constant velocity needs two frames
     windows = cut_windows(data, history + horizon, select=["state", "episode"], pad_before=history - 1)
-    windows = spread_evenly(windows)
+    windows = spread_evenly(windows, SITUATIONS)
     states = windows["state"].float().cpu()
     past, future = planner.split_window(states[:, history - planner.history :])
     episode = windows["episode"][:, -1].cpu()
@@ -71,13 +72,6 @@ def plan_errors(
             for number in episode.unique().tolist()
         ],
     }
-
-
-def spread_evenly(windows: TensorDictBase) -> TensorDictBase:
-    """At most :data:`SITUATIONS` of some windows, spread evenly."""
-    if len(windows) <= SITUATIONS:
-        return windows
-    return windows[torch.linspace(0, len(windows) - 1, SITUATIONS).round().long()]
 
 
 def score_sequences(

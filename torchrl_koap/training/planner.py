@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
@@ -23,6 +22,7 @@ from torchrl_koap.data import (
     extrapolate_ends,
     make_window_buffer,
 )
+from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
 from torchrl_koap.objectives import PlannerLoss
@@ -140,8 +140,7 @@ def plan_score(planner: StatePlanner, data: TensorDictBase, task: Task) -> Calla
     """
     length = planner.history + planner.horizon
     states = cut_windows(data, length, select=["state"], pad_before=planner.history - 1)["state"]
-    chosen = torch.linspace(0, len(states) - 1, min(SITUATIONS, len(states)), device=states.device).round().long()
-    history, future = planner.split_window(states[chosen])
+    history, future = planner.split_window(spread_evenly(states, SITUATIONS))
     still, groups = history[:, -1:].expand_as(future), list(unit_groups(task.state_units).values())
 
     def score(planner: StatePlanner) -> float:

@@ -6,7 +6,7 @@ A ridge regression of single steps comes first, then nonlinear least squares of 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -75,10 +75,6 @@ class LabelledSteps(NamedTuple):
     known: Tensor
     row: Tensor
 
-    def take(self, chosen: Tensor) -> LabelledSteps:
-        """Some of them."""
-        return LabelledSteps(*(field[chosen] for field in self))
-
 
 class Stretches(NamedTuple):
     """Stretches of labelled steps of equal length ``N``, to predict the measured positions of.
@@ -99,9 +95,13 @@ class Stretches(NamedTuple):
     measured: Tensor
     known: Tensor
 
-    def take(self, chosen: Tensor) -> Stretches:
-        """Some of them."""
-        return Stretches(*(field[chosen] for field in self))
+
+Rows = TypeVar("Rows", LabelledSteps, Stretches)
+
+
+def take(rows: Rows, chosen: Tensor) -> Rows:
+    """Some steps, or some stretches."""
+    return type(rows)(*(field[chosen] for field in rows))
 
 
 def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any]:
@@ -137,8 +137,8 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
             out = folds == fold
             if not out.any() or out.all():
                 continue
-            _fit(response, data, steps.take(~out), changes, coupled=coupled)
-            errors.append(prediction_errors(response, _stretches(response, data, steps.take(out), changes)).flatten())
+            _fit(response, data, take(steps, ~out), changes, coupled=coupled)
+            errors.append(prediction_errors(response, _stretches(response, data, take(steps, out), changes)).flatten())
         errors = torch.cat(errors)
         error = errors.pow(2).mean().sqrt().item() if len(errors) else float("inf")
         if best is None or error < best[0]:
@@ -233,8 +233,8 @@ def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSte
     length = min(AHEAD, int(steps.segment.bincount().max()))
     enough = torch.zeros_like(row, dtype=torch.bool)
     enough[: len(row) - length + 1] = row[length - 1 :] - row[: len(row) - length + 1] == length - 1
-    start = steps.take(enough)
-    start = start.take(torch.arange(0, len(start.row), 2, device=row.device))
+    start = take(steps, enough)
+    start = take(start, torch.arange(0, len(start.row), 2, device=row.device))
     row = start.row
     positions = data["state"][:, response.states].double()
     return Stretches(
@@ -283,7 +283,7 @@ def fit_predictions(response: ResponseModel, stretches: Stretches, *, coupled: b
     if not len(stretches.known):
         return
     if len(stretches.known) > MOST:
-        stretches = stretches.take(torch.arange(MOST, device=stretches.known.device) * len(stretches.known) // MOST)
+        stretches = take(stretches, torch.arange(MOST, device=stretches.known.device) * len(stretches.known) // MOST)
     now, axes = stretches.positions[:, -1], response.num_axes
     read = response.coordinates(stretches.positions, stretches.command - now, stretches.changes)
     size = read.square().mean(0).sqrt().clamp_min(1e-12)
