@@ -30,8 +30,12 @@ from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of
 
-_READING = ("control_hz", "observations", "episodes", "action_columns", "action_dim", "state_columns", "drop_columns")
+_READING = (
+    *("control_hz", "resample", "observations", "episodes"),
+    *("action_columns", "action_dim", "state_columns", "drop_columns"),
+)
 _DESCRIBING = ("name", "robot", "command", "action_kind", "targets", "action_units", "state_units", "max_steps")
+_ONE_FOR_ALL = ("action_kind", "action_units", "state_units")
 
 
 @dataclass(kw_only=True)
@@ -117,7 +121,9 @@ class Convert(Command):
         out: folder to write.
         to: another format than this library's: "npz" or "lerobot" (3.0).
         name: name of the task (default: that of the folder).
-        control_hz: frames per second (default: as the source says).
+        control_hz: frames per second (default: as the source says; time stamps are not looked at if it is given).
+        resample: frames per second that are wanted: for irregular time stamps, or a rate at which a plan covers enough
+            of the motion.
         observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
             that are no images).
         episodes: which episodes of a LeRobot data set to read, such as those that were downloaded (default: all).
@@ -130,7 +136,9 @@ class Convert(Command):
         drop_short: leave out trajectories that are shorter than a window.
         robot: state columns of the robot itself, which the controller reads (default: all that are no command).
         command: neighbouring columns that repeat the last command; nothing that learns sees them.
-        action_kind: "delta" (velocities, efforts, changes) or "absolute" (targets of state columns) (default: delta).
+        action_kind: of each action column, or one for all: "delta" (velocities, efforts, changes) or "absolute"
+            (targets of state columns); with --resample "change" (over one frame, summed) or "velocity" (or effort,
+            held) instead of "delta" (default: delta).
         targets: for absolute actions the state column that each is the target of (default: the robot's).
         action_units: unit of each action column, or one for all.
         state_units: unit of each state column, or one for all.
@@ -142,6 +150,7 @@ class Convert(Command):
     to: str | None = None
     name: str | None = None
     control_hz: float | None = None
+    resample: float | None = None
     observations: tuple[str, ...] = ()
     episodes: tuple[int, ...] = ()
     action_columns: tuple[str, ...] = ()
@@ -152,7 +161,7 @@ class Convert(Command):
     drop_short: bool = False
     robot: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
-    action_kind: str | None = None
+    action_kind: tuple[str, ...] = ()
     targets: tuple[str, ...] = ()
     action_units: tuple[str, ...] = ()
     state_units: tuple[str, ...] = ()
@@ -170,11 +179,8 @@ class Convert(Command):
             raise ValueError(f"{self.source} is a data set of this library already: name another format with --to")
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
-        recordings, described = self._read(), self._given(_DESCRIBING)
-        for name in ("action_units", "state_units"):
-            if len(described.get(name, ())) == 1:  # one for all
-                described[name] = described[name][0]
-        folder = save_demonstrations(self.out, recordings, **described)
+        recordings = self._read()
+        folder = save_demonstrations(self.out, recordings, **self._given(_DESCRIBING))
         data, task = open_dataset(folder)
         return {
             "data set": str(folder),
@@ -190,20 +196,26 @@ class Convert(Command):
     def _take_out(self, kind: str) -> dict[str, Any]:
         """Recordings become a folder in another format."""
         lookup([name for name, form in FORMATS.items() if form.write is not None], kind, "format")
-        for name in self._given(_DESCRIBING):
+        reading = self._reading()
+        for name in self._given([name for name in _DESCRIBING if name not in reading]):
             raise ValueError(f"--{name.replace('_', '-')} was given, but format {kind!r} does not hold it")
         recordings = self._read()
         return {"written": str(write_recordings(recordings, self.out, kind)), "format": kind, **_contents(recordings)}
 
     def _read(self) -> Recordings:
-        recordings = read_recordings(self.source, **self._given(_READING))
+        recordings = read_recordings(self.source, **self._given(self._reading()))
         for asked, change in ((self.trim_still, trim_still), (self.drop_short, drop_short)):
             recordings = change(recordings) if asked else recordings
         return recordings
 
+    def _reading(self) -> tuple[str, ...]:
+        """Options of the reader, which has to know what actions are if they are resampled."""
+        return _READING if self.resample is None else (*_READING, "action_kind")
+
     def _given(self, options: Sequence[str]) -> dict[str, Any]:
-        """Those of the options that were given."""
-        return {name: value for name, value in vars(self).items() if name in options and value not in (None, ())}
+        """Those of the options that were given; one value that is for all columns is no sequence."""
+        given = {name: value for name, value in vars(self).items() if name in options and value not in (None, ())}
+        return {name: value[0] if name in _ONE_FOR_ALL and len(value) == 1 else value for name, value in given.items()}
 
 
 @dataclass(kw_only=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from tensordict import TensorDict
 
 from torchrl_koap.data.formats.columns import kind_of, unknown
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
 from torchrl_koap.data.quality import constant_columns
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories
@@ -23,7 +25,8 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
-ACTION_KINDS: tuple[ActionKind, ...] = ("delta", "absolute")
+# what a user calls the kind of an action, and the kind that it is when its rate is settled
+ACTION_KINDS: dict[str, ActionKind] = {name: "absolute" if name == "absolute" else "delta" for name in ADDS_UP}
 _COARSE = 1e-3  # share of a column's range to which float32 must hold it
 _SLACK = 1.5  # episodes may be that much longer than the longest demonstration
 
@@ -80,8 +83,9 @@ def make_demonstrations(
     action_dim: int | None = None,
     robot: Sequence[str | int] | None = None,
     command: Sequence[str | int] = (),
-    action_kind: ActionKind | Sequence[ActionKind] = "delta",
+    action_kind: str | Sequence[str] = "delta",
     targets: Sequence[str | int] | None = None,
+    resample: float | None = None,
     max_steps: int | None = None,
 ) -> tuple[TensorDict, Task]:
     """Demonstrations in memory: flat data and the task they are of.
@@ -102,9 +106,12 @@ def make_demonstrations(
             actions, so nothing that learns ever sees them.
         action_kind (str, or sequence of str): ``"delta"``, velocities, efforts or changes: small where the robot stands
             still; or ``"absolute"``, targets of the columns ``targets``. One for all actions or one for each, such as
-            of a gripper that is commanded by its width beside joints that are commanded by changes.
+            of a gripper that is commanded by its width beside joints that are commanded by changes. ``"change"`` (over
+            one frame) and ``"velocity"`` (or effort) say which ``"delta"`` is meant, as ``resample`` needs to know.
         targets (sequence of str or int, optional): where all actions are absolute, the state column that each is the
             target of. Default: the robot's columns, if there are as many.
+        resample (float, optional): frames per second that are wanted, where ``control_hz`` is that of the arrays; see
+            :func:`~torchrl_koap.data.read_recordings`.
         max_steps (int, optional): steps after which an episode counts as failed. Default: 1.5 times the longest
             demonstration.
 
@@ -147,6 +154,9 @@ def make_demonstrations(
     ]
     names, acting = recordings.state_names, recordings.action_names
     rate = control_hz or recordings.control_hz
+    if resample is not None:
+        recordings = resampled(replace(recordings, control_hz=rate), resample, action_kind)
+        rate = resample
     if rate is None:
         problems.append("control_hz is missing: frames per second")
     commanded = _columns(command, names, "command", problems)
@@ -157,7 +167,7 @@ def make_demonstrations(
         problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
     if not others:
         problems.append("every column is a command: nothing is left to plan and act on")
-    kinds: tuple[ActionKind, ...] = _each(action_kind, len(acting), "action_kind", problems)
+    kinds = [ACTION_KINDS[kind] for kind in _each(action_kind, len(acting), "action_kind", problems)]
     reached = _targets(kinds, targets, own, names, problems)
     if targets is not None:
         problems += [f"column {names[column]!r} is a target and a command" for column in reached if column in commanded]

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from torchrl_koap import keys
 from torchrl_koap.data.formats.recordings import Recordings
+from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import DataError, some
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
-LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
 STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
@@ -122,12 +122,9 @@ def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
 
 def _leaps(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
     """Columns whose largest step is above a third of their range and twenty times the usual one, and why."""
-    steps = np.concatenate([np.diff(frames, axis=0) for frames in trajectories])
-    if not len(steps):
+    if all(len(frames) < 2 for frames in trajectories):
         return []
-    spans = np.ptp(np.concatenate(trajectories), axis=0)
-    usual = np.array([np.median(moved) if len(moved := step[step > 0]) else np.inf for step in np.abs(steps).T])
-    bound = np.maximum(LEAP * spans, UNUSUAL * usual)
+    bound, usual = leap_bounds(trajectories)
     found: dict[str, list[str]] = {}
     for column, name in enumerate(names):
         where = [np.flatnonzero(np.abs(np.diff(frames[:, column])) > bound[column]) for frames in trajectories]
@@ -247,7 +244,7 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
     every = math.ceil(ENOUGH * frames / HORIZON)
     return f"{covers}; {lasts}", (
         f"a plan covers {covers}, {HORIZON / frames:.1%} of a demonstration: short against the motion. A rate of"
-        f" {control_hz / every:.3g} Hz (one frame in {every}) would let it look farther"
+        f" {control_hz / every:.3g} Hz (one frame in {every}) would let it look farther: `koap convert --resample`"
     )
 
 

@@ -62,7 +62,8 @@ def _read_stored(source: str) -> Recordings:
     )
 
 
-COMMON = ("control_hz", "action_dim", "state_columns", "drop_columns")  # options of all but this library's own
+# options of all but this library's own
+COMMON = ("control_hz", "resample", "action_kind", "action_dim", "state_columns", "drop_columns")
 
 FORMATS = {
     "minari": Format(
@@ -99,6 +100,8 @@ def read_recordings(
     source: str | Path,
     *,
     control_hz: float | None = None,
+    resample: float | None = None,
+    action_kind: str | Sequence[str] | None = None,
     observations: Sequence[str] = (),
     episodes: Sequence[int] = (),
     action_columns: Sequence[str] = (),
@@ -113,7 +116,12 @@ def read_recordings(
             this library.
 
     Keyword Args:
-        control_hz (float, optional): frames per second. Default: as the source says.
+        control_hz (float, optional): frames per second; time stamps are not looked at then. Default: as the source
+            says.
+        resample (float, optional): frames per second that are wanted, also of irregular time stamps. States between
+            frames are interpolated, switches and leaps take the nearest frame, actions hold on or are summed.
+        action_kind (str, or sequence of str): what actions are, needed to resample them: ``"change"`` over one frame,
+            which is summed, or ``"velocity"`` (or effort) or ``"absolute"``, which hold on.
         observations (sequence of str): features of a LeRobot data set, or entries of an HDF5 file, that make up the
             state. Default: all that are no images.
         episodes (sequence of int): which episodes of a LeRobot data set to read. Default: all.
@@ -136,7 +144,8 @@ def read_recordings(
         >>> from torchrl_koap.data import read_recordings
         >>> read_recordings("/data/so100_pick")  # doctest: +SKIP
     """
-    asked: dict[str, Any] = {"control_hz": control_hz, "observations": list(observations), "episodes": list(episodes)}
+    asked: dict[str, Any] = {"control_hz": control_hz, "resample": resample, "action_kind": action_kind}
+    asked |= {"observations": list(observations), "episodes": list(episodes)}
     asked |= {"action_columns": list(action_columns), "action_dim": action_dim}
     asked |= {"state_columns": list(state_columns), "drop_columns": list(drop_columns)}
     given = {name: value for name, value in asked.items() if value not in (None, [])}

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.resampling import UNEVEN, resampled
 from torchrl_koap.files import DataError, some
 from torchrl_koap.lookup import lookup
 
@@ -27,7 +28,6 @@ KINDS = {
 _KIND = {name: kind for kind, names in KINDS.items() for name in names.split()}
 _UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(_UNITS)})[)\]]?")
-UNEVEN = 0.2  # share of the usual step by which a step in time may differ
 SLOWEST, FASTEST = 1.0, 2000.0  # Hz; beyond, stamps are in another unit
 _LONG = 20  # frames after which a column that rises evenly is taken for a clock
 
@@ -71,6 +71,8 @@ def assemble(
     *,
     declared_hz: float | None = None,
     control_hz: float | None = None,
+    resample: float | None = None,
+    action_kind: str | Sequence[str] = "delta",
     state_columns: Sequence[str] = (),
     drop_columns: Sequence[str] = (),
     action_dim: int | None = None,
@@ -86,7 +88,8 @@ def assemble(
 
     Keyword Args:
         declared_hz (float, optional): frames per second that the source declares; time stamps must agree.
-        control_hz, state_columns, drop_columns, action_dim: as for :func:`~torchrl_koap.data.read_recordings`.
+        control_hz, resample, action_kind, state_columns, drop_columns, action_dim: as for
+            :func:`~torchrl_koap.data.read_recordings`.
         action_names (sequence of str, optional): names of the action columns, where nothing has actions.
         skipped (sequence of str): entries that the reader left out.
         no_rate (str): what is said where nothing tells the rate.
@@ -119,10 +122,12 @@ def assemble(
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
     left_out += [name for name in acting if name in drop_columns]
     acting = [name for name in acting if name not in drop_columns]
-    rate = control_hz if control_hz is not None else _find_rate(pieces, declared_hz, no_rate, problems)
+    rate, times = control_hz, None
+    if control_hz is None:
+        rate, times = _find_rate(pieces, declared_hz, no_rate, resample is None, problems)
     if problems:
         raise DataError(source, problems)
-    return make_recordings(
+    recordings = make_recordings(
         [_stack(piece.states, observed) for piece in pieces],
         [_stack(piece.actions, acting) if piece.actions and acting else None for piece in pieces],
         action_dim=action_dim,
@@ -133,6 +138,7 @@ def assemble(
         skipped=left_out,
         source=source,
     )
+    return recordings if resample is None else resampled(recordings, resample, action_kind, times=times)
 
 
 def unknown(asked: Sequence[str], known: Sequence[str], what: str) -> list[str]:
@@ -150,42 +156,51 @@ def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarra
     return np.stack([columns[name] for name in names], 1).astype(np.float64)
 
 
-def _find_rate(pieces: Sequence[Piece], declared: float | None, otherwise: str, problems: list[str]) -> float | None:
-    """Frames per second by the time stamps of all pieces; what is declared where there are none."""
+def _find_rate(
+    pieces: Sequence[Piece], declared: float | None, otherwise: str, fixed: bool, problems: list[str]
+) -> tuple[float | None, list[np.ndarray] | None]:
+    """Frames per second by the time stamps of all pieces, and these in seconds; what is declared where there are none.
+
+    Stamps that are to be ``fixed`` have even steps, and agree with what is declared.
+    """
     clock = next((name for name in pieces[0].states if kind_of(name)[0] == "clock"), None)
     if clock is None:
         if declared is None:
             problems.append(otherwise)
-        return declared
-    steps = {piece.name: np.diff(piece.states[clock].astype(np.float64)) * kind_of(clock)[1] for piece in pieces}
-    back = [name for name, step in steps.items() if not (step > 0).all()]
-    if back or not sum(map(len, steps.values())):
+        return declared, None
+    stamps = [piece.states[clock].astype(np.float64) for piece in pieces]
+    times = [(values - values[:1]) * kind_of(clock)[1] for values in stamps]
+    steps = [np.diff(values) for values in times]
+    back = [piece.name for piece, step in zip(pieces, steps, strict=True) if not (step > 0).all()]
+    if back or not sum(map(len, steps)):
         where = f" in {len(back)} of {len(steps)} trajectories ({some(back)})" if back else ""
         problems.append(f"time stamps do not increase: column {clock!r}{where}; pass control_hz if they mean nothing")
-        return None
-    usual = float(np.median(np.concatenate(list(steps.values()))))
+        return None, None
+    usual = float(np.median(np.concatenate(steps)))
     if not SLOWEST <= 1 / usual <= FASTEST:
         problems.append(
             f"column {clock!r} says {1 / usual:.3g} frames per second if it is in seconds: name it {clock}_ms,"
             f" {clock}_us or {clock}_ns if it is in another unit, or pass control_hz"
         )
-        return None
-    uneven = {name: step for name, step in steps.items() if np.abs(step - usual).max(initial=0) > UNEVEN * usual}
+        return None, None
+    if not fixed:
+        return 1 / usual, times
+    uneven = [
+        f"{piece.name}: frames are {step.min():.4g} to {step.max():.4g} s apart (frame {np.abs(step - usual).argmax()})"
+        for piece, step in zip(pieces, steps, strict=True)
+        if np.abs(step - usual).max(initial=0) > UNEVEN * usual
+    ]
     if uneven:
-        listed = [
-            f"{name}: frames are {step.min():.4g} to {step.max():.4g} s apart (frame {np.abs(step - usual).argmax()})"
-            for name, step in uneven.items()
-        ]
         problems.append(
-            f"{some(listed)}; the usual step is {usual:.4g} s: resample them to a fixed rate first, or pass control_hz"
-            " if the stamps are wrong"
+            f"{some(uneven)}; the usual step is {usual:.4g} s: pass resample {1 / usual:.3g} (Hz) to bring them to a"
+            " fixed rate, or control_hz if the stamps are wrong"
         )
     if declared is not None and abs(declared * usual - 1) > UNEVEN:
         problems.append(
             f"column {clock!r} says {1 / usual:.4g} frames per second, the source declares {declared:g}:"
             " pass control_hz"
         )
-    return float(1 / usual) if declared is None else declared
+    return float(1 / usual) if declared is None else declared, times
 
 
 def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:

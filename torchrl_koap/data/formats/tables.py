@@ -73,7 +73,10 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
         raise DataError(folder, [f"{some(names)}: {said}" for said, names in problems.items()])
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
-        raise DataError(folder, f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second: resample them")
+        if "resample" not in options or len(rates) < len(tables):
+            said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
+            raise DataError(folder, f"{said}: pass resample (Hz) to bring them to one rate, or control_hz")
+        tables = [(_stamped(piece, rate), None, names) for (piece, _, names), rate in zip(tables, rates, strict=True)]
     unread = [f"{path.name} (no table)" for path in sorted(folder.iterdir()) if path not in files]
     return assemble(
         _named_alike([piece for piece, _, _ in tables]),
@@ -86,6 +89,12 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
 
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*") if path.suffix in _READERS and path.is_file())
+
+
+def _stamped(piece: Piece, rate: float) -> Piece:
+    """A piece with time stamps by its rate, unless it has some."""
+    frames = len(next(iter(piece.states.values())))
+    return replace(piece, states={"timestamp": np.arange(frames) / rate} | piece.states)
 
 
 def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:

@@ -1,0 +1,102 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recordings at another rate: states between frames, and what becomes of actions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data import make_demonstrations, make_recordings
+from torchrl_koap.data.formats.resampling import resampled
+from torchrl_koap.files import DataError
+
+TIME = np.arange(41) / 20
+
+
+def recorded(*columns, actions=None, times=None, **more):
+    frames = np.stack(columns, 1)
+    steps = np.full((len(frames) - 1, 1), np.nan) if actions is None else actions
+    return make_recordings([frames], [steps], control_hz=None if times is not None else 20.0, **more)
+
+
+@pytest.mark.parametrize("rate", [5.0, 8.0, 20.0, 33.0, 40.0])
+def test_states_are_interpolated(rate):
+    found = resampled(recorded(3 * TIME, TIME > 1), rate)
+    new = np.arange(int(2 * rate) + 1) / rate
+    np.testing.assert_allclose(found.states[0][:, 0], 3 * new)
+    assert set(found.states[0][:, 1]) == {0.0, 1.0} and found.control_hz == rate
+    assert len(found.actions[0]) == len(found.states[0]) - 1
+
+
+def test_irregular_frames():
+    times = np.sort(np.random.default_rng(0).uniform(0, 2, 80))
+    times = times - times[0]
+    actions = np.stack([np.diff(times**2), times[:-1]], 1)
+    found = resampled(recorded(times**2, times=times, actions=actions), 10, ["change", "velocity"], times=[times])
+    new = np.arange(len(found.states[0])) / 10
+    np.testing.assert_allclose(found.states[0][:, 0], new**2, atol=5e-3)
+    np.testing.assert_allclose(found.actions[0][:, 0], np.diff(found.states[0][:, 0]))
+    assert (np.abs(found.actions[0][:, 1] - new[:-1]) < np.diff(times).max()).all()
+
+
+def test_changes_add_up_and_other_actions_hold_on():
+    steps = np.stack([np.ones(40), np.arange(40.0), np.arange(40.0)], 1)
+    recordings = recorded(TIME, actions=steps)
+    half = resampled(recordings, 10, ["change", "velocity", "absolute"]).actions[0]
+    np.testing.assert_allclose(half, np.stack([np.full(20, 2), *2 * [np.arange(0, 40, 2)]], 1))
+    double = resampled(recordings, 40, ["change", "velocity", "absolute"]).actions[0]
+    np.testing.assert_allclose(double, np.stack([np.full(80, 0.5), *2 * [np.arange(80) // 2]], 1))
+
+
+@pytest.mark.parametrize(("kind", "known"), [("change", [True, False, True, True]), ("absolute", [True] * 4)])
+def test_steps_with_an_unlabelled_part(kind, known):
+    steps = np.ones((40, 1))
+    steps[11] = np.nan  # in the second half of the second new step
+    found = resampled(recorded(TIME, actions=steps), 2.5 if kind == "change" else 10, kind)
+    np.testing.assert_array_equal(np.isfinite(found.actions[0][:4, 0]), known)
+
+
+def test_leaps_are_not_filled():
+    angle = (3 * TIME + 1 + np.pi) % (2 * np.pi) - np.pi
+    quaternion = np.cos(TIME) * np.where(TIME < 1, 1, -1)
+    found = resampled(recorded(angle, quaternion), 13).states[0]
+    new = np.arange(len(found)) / 13
+    apart = np.abs(np.exp(1j * found[:, 0]) - np.exp(1j * (3 * new + 1)))
+    assert apart.max() < 3 / 40 + 1e-9 and np.abs(found[:, 0]).max() <= np.pi  # half a recorded step
+    np.testing.assert_allclose(np.abs(found[:, 1]), np.abs(np.cos(new)), atol=0.03)
+
+
+def test_gaps_end_trajectories_and_are_told():
+    times = TIME + 3 * (TIME > 0.98) + 7 * (TIME > 1.93)
+    found = resampled(recorded(TIME, times=times, actions=TIME[:-1, None]), 10, "velocity", times=[times])
+    assert found.sources == ("0[0]", "0[1]") and [len(frames) for frames in found.states] == [10, 10]
+    np.testing.assert_allclose(found.states[1][:, 0], 1 + np.arange(10) / 10)
+    np.testing.assert_allclose(found.actions[1][:, 0], 1 + np.arange(9) / 10)
+    assert found.skipped == (
+        "2 gaps in time, where trajectories were split: 0 (3.05 s), 0 (7.05 s)",
+        "1 trajectories without two frames at 10 Hz: 0[2]",
+    )
+
+
+@pytest.mark.parametrize(
+    ("rate", "kind", "message"),
+    [
+        (41, "change", r"41 Hz is more than twice the rate of 0 \(20 Hz\): resample to at most 40"),
+        (0.4, "change", "no trajectory has two frames at 0.4 Hz"),
+        (-1, "change", "must be a positive number of frames per second, got -1"),
+        (10, "delta", "may be changes over one frame, .* pass action_kind 'change' or 'velocity'"),
+        (10, ["change"] * 2, "action_kind names 2 columns, there are 1"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(rate, kind, message):
+    with pytest.raises(DataError, match=message):
+        resampled(recorded(TIME, actions=TIME[:-1, None]), rate, kind)
+
+
+def test_demonstrations_at_another_rate():
+    states, steps = [np.stack([TIME, TIME], 1)] * 2, [np.ones((40, 1)), None]
+    data, task = make_demonstrations(states, steps, control_hz=20, resample=10, action_kind="change")
+    assert task.control_hz == 10 and task.max_steps == 32 and task.actions["action_0"].kind == "delta"
+    assert data["action"][:20].unique().tolist() == [2.0] and int(data["has_action"].sum()) == 20
+    with pytest.raises(DataError, match="the rate of the recordings is not known"):
+        make_demonstrations(states, steps, resample=10, action_kind="change")

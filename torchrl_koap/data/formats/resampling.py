@@ -1,0 +1,152 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recordings at another rate: what a state and an action are between two recorded frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from torchrl_koap.data.formats.recordings import Recordings
+from torchrl_koap.files import DataError, some
+from torchrl_koap.lookup import lookup
+
+# kinds of actions by name: whether they add up over the frames of a longer step; None where the name does not tell
+ADDS_UP = {"delta": None, "change": True, "velocity": False, "absolute": False}
+LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
+MOST = 2.0  # new frames in one recorded step
+_LEVELS = 10  # a column of no more integers is a switch
+UNEVEN = 0.2  # share of the usual step by which a step in time may differ
+_SAME = 1e-3  # share of a step that is rounding
+
+
+def resampled(
+    recordings: Recordings,
+    control_hz: float,
+    action_kind: str | Sequence[str] = "delta",
+    *,
+    times: Sequence[np.ndarray] | None = None,
+) -> Recordings:
+    """Brings recordings to a fixed rate.
+
+    States are interpolated linearly. Where a column leaps (a wrapped angle, a quaternion that changes its sign), and in
+    columns of at most ten integers (a switch), the nearest frame counts. Changes over one frame are summed over the new
+    step; any other action is the one in force at its beginning. A step with an unlabelled part has no label. A gap of
+    more than two steps, recorded or new, ends a trajectory; ``skipped`` counts these.
+
+    Args:
+        recordings (Recordings): what was read.
+        control_hz (float): frames per second that are wanted.
+        action_kind (str, or sequence of str): as for :func:`~torchrl_koap.data.make_demonstrations`.
+
+    Keyword Args:
+        times (sequence of array, optional): seconds of every frame ``[T_i]``, rising. Default: as
+            ``recordings.control_hz`` says.
+
+    Raises:
+        DataError: with all faults: no rate, more than two new frames in a recorded step, labels of the kind
+            ``"delta"``, which does not tell what becomes of them, no trajectory of two new frames.
+        ValueError: for an unknown kind of action.
+    """
+    known, wide = recordings.control_hz, len(recordings.action_names)
+    kinds = [action_kind] * wide if isinstance(action_kind, str) else list(action_kind)
+    summing = [lookup(ADDS_UP, kind, "kind of action") for kind in kinds]
+    if not (np.isfinite(control_hz) and control_hz > 0):
+        raise DataError("resample", f"it must be a positive number of frames per second, got {control_hz!r}")
+    if times is None and known is None:
+        raise DataError("resample", "the rate of the recordings is not known: pass control_hz")
+    if times is None:
+        times = [np.arange(len(frames)) / known for frames in recordings.states]
+    usual = [float(np.median(np.diff(at))) for at in times]
+    dense = [
+        f"{name} ({1 / step:.4g} Hz)"
+        for name, step in zip(recordings.sources, usual, strict=True)
+        if step * control_hz > MOST * (1 + _SAME)
+    ]
+    problems = []
+    if dense:
+        problems.append(
+            f"{control_hz:g} Hz is more than twice the rate of {some(dense)}: resample to at most"
+            f" {MOST / max(usual):.4g}, most frames would be made up"
+        )
+    if len(kinds) != wide:
+        problems.append(f"action_kind names {len(kinds)} columns, there are {wide}")
+    elif recordings.num_labels and None in summing:
+        problems.append(
+            "actions of kind 'delta' may be changes over one frame, which add up over a longer step, or velocities or"
+            " efforts, which hold on: pass action_kind 'change' or 'velocity'"
+        )
+    if problems:
+        raise DataError("resample", problems)
+    adding = np.array(summing, dtype=bool)
+    bounds = np.where(_switches(np.concatenate(recordings.states)), 0, leap_bounds(recordings.states)[0])
+    parts: list[tuple[str, np.ndarray, np.ndarray]] = []
+    gaps: list[str] = []
+    short: list[str] = []
+    for name, frames, steps, at, step in zip(
+        recordings.sources, recordings.states, recordings.actions, times, usual, strict=True
+    ):
+        breaks = np.flatnonzero(np.diff(at) > MOST * max(step, 1 / control_hz) * (1 + _SAME))
+        gaps += [f"{name} ({at[before + 1] - at[before]:.3g} s)" for before in breaks]
+        edges = [0, *(breaks + 1), len(at)]
+        for part, (start, end) in enumerate(zip(edges, edges[1:], strict=False)):
+            called, span = f"{name}[{part}]" if len(breaks) else name, slice(start, end)
+            new = at[start] + np.arange(int((at[end - 1] - at[start]) * control_hz + _SAME) + 1) / control_hz
+            if len(new) < 2:
+                short.append(called)
+                continue
+            labels = _actions(steps[start : end - 1], at[span], new, adding, UNEVEN * step)
+            parts.append((called, _states(frames[span], at[span], new, bounds), labels))
+    if not parts:
+        raise DataError("resample", f"no trajectory has two frames at {control_hz:g} Hz")
+    notes = [f"{len(gaps)} gaps in time, where trajectories were split: {some(gaps)}"] if gaps else []
+    notes += [f"{len(short)} trajectories without two frames at {control_hz:g} Hz: {some(short)}"] if short else []
+    names, states, actions = zip(*parts, strict=True)
+    return replace(
+        recordings,
+        states=list(states),
+        actions=list(actions),
+        sources=names,
+        control_hz=float(control_hz),
+        skipped=(*recordings.skipped, *notes),
+    )
+
+
+def leap_bounds(trajectories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the step above which a column leaps, and its usual step, infinite where it never moves: both ``[d]``."""
+    steps = np.abs(np.concatenate([np.diff(frames, axis=0) for frames in trajectories]))
+    spans = np.ptp(np.concatenate(trajectories), axis=0)
+    usual = np.array([np.median(moved) if len(moved := step[step > 0]) else np.inf for step in steps.T])
+    return np.maximum(LEAP * spans, UNUSUAL * usual), usual
+
+
+def _switches(frames: np.ndarray) -> list[bool]:
+    """Which columns of ``[N, d]`` are few integers."""
+    return [bool((column == column.round()).all()) and len(np.unique(column)) <= _LEVELS for column in frames.T]
+
+
+def _states(frames: np.ndarray, times: np.ndarray, new: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """States ``[T, d]`` at new times within the recorded ones."""
+    before = np.clip(np.searchsorted(times, new, side="right") - 1, 0, len(times) - 2)
+    share = np.clip((new - times[before]) / (times[before + 1] - times[before]), 0, 1)[:, None]
+    step = frames[before + 1] - frames[before]
+    return np.where(
+        np.abs(step) > bounds,
+        np.where(share < 0.5, frames[before], frames[before + 1]),
+        frames[before] + share * step,
+    )
+
+
+def _actions(steps: np.ndarray, times: np.ndarray, new: np.ndarray, adding: np.ndarray, room: float) -> np.ndarray:
+    """Actions ``[T - 1, a]`` of the steps between new times: summed, or those in force."""
+    held = steps[np.searchsorted(times[:-1], new[:-1] + room, side="right") - 1]
+    if not adding.any():
+        return held
+    unlabelled = np.isnan(steps).any(-1)
+    ends = np.concatenate(
+        [np.zeros((1, steps.shape[1] + 1)), np.column_stack([np.nan_to_num(steps), unlabelled]).cumsum(0)]
+    )
+    sums = np.stack([np.diff(np.interp(new, times, column)) for column in ends.T], 1)
+    known = (sums[:, -1:] < _SAME) & ~np.isnan(held).any(-1, keepdims=True)
+    return np.where(known, np.where(adding, sums[:, :-1], held), np.nan)
