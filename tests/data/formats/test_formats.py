@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from recording_writers import WRITERS, columns
 
 from torchrl_koap.data import make_recordings, read_recordings, save_demonstrations, write_recordings
 from torchrl_koap.data.formats import FORMATS
@@ -80,3 +81,20 @@ def test_refusals_of_writing(recordings, tmp_path):
     unknown = make_recordings([np.zeros((5, 1))], [np.zeros((4, 1))])
     with pytest.raises(DataError, match="the rate is not known"):
         write_recordings(unknown, tmp_path / "b", "lerobot")
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64", "int16", "int64", "uint8", "bool"])
+def test_numbers_of_every_type_mean_what_they_are(kind, dtype, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    episodes = []
+    for seed in range(2):
+        states, actions = columns(seed)
+        drawn = {name: np.abs(9 * values).astype(dtype) for name, values in states.items() if name != "timestamp"}
+        episodes.append(({"timestamp": states["timestamp"]} | drawn, actions))
+    found = read_recordings(WRITERS[kind](tmp_path, episodes))
+    assert found.state_names == ("q0", "q1", "q2") and found.control_hz == pytest.approx(20)
+    for frames, (states, _) in zip(found.states, episodes, strict=True):
+        wanted = np.stack([states[name] for name in found.state_names], 1).astype(np.float64)
+        np.testing.assert_array_equal(frames, wanted)
+        assert frames.dtype == np.float64

@@ -54,7 +54,7 @@ def with_nan(array):
         ([FRAMES], [None, None], {}, "1 trajectories of states, 2 of actions"),
         ([FRAMES, FRAMES[:, :2]], None, {"action_dim": 1}, "trajectory 1: states have 2 columns, those before have 3"),
         ([FRAMES[:1]], [None], {"action_dim": 1}, "trajectory 0: 1 frame; a transition needs two"),
-        ([FRAMES.astype(int)], [np.ones((4, 1))], {}, "trajectory 0: states are int64; wanted floating-point numbers"),
+        ([FRAMES.astype(complex)], [np.ones((4, 1))], {}, "trajectory 0: states are complex128, wanted numbers"),
         ([FRAMES[0]], [np.ones((4, 1))], {}, r"trajectory 0: states must be \[T, d\], got \[3\]"),
         ([with_nan(FRAMES)], [np.ones((4, 1))], {}, r"not finite at frame 2, columns \[1\]"),
         ([FRAMES], [np.full((4, 1), np.inf)], {}, "the action of step 0 is infinite; NaN means that it is unknown"),
@@ -81,5 +81,5 @@ def test_lists_of_different_lengths_and_truth_values():
 
 def test_all_faults_are_told_at_once():
     with pytest.raises(DataError) as caught:
-        make_recordings([FRAMES[:1], FRAMES.astype(int)], [None, np.ones((9, 1))], sources=["left", "right"])
+        make_recordings([FRAMES[:1], FRAMES.astype(complex)], [None, np.ones((9, 1))], sources=["left", "right"])
     assert len(caught.value.problems) == 2 and "trajectory left" in str(caught.value)

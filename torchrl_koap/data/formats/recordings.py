@@ -68,7 +68,7 @@ def make_recordings(
     """Checks arrays and puts them into one form.
 
     Args:
-        states (sequence of array): frames of every trajectory ``[T_i, d]``, floating point.
+        states (sequence of array): frames of every trajectory ``[T_i, d]``.
         actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, or
             None for one without; None for no labels at all.
 
@@ -82,9 +82,9 @@ def make_recordings(
         Recordings: checked, with names.
 
     Raises:
-        DataError: with all faults: no trajectories, other widths than in the first, fewer than two frames,
-            integers where floating-point numbers are wanted, states that are not finite, infinite actions, a number of
-            actions that is neither ``T`` nor ``T - 1``, an action column with few numbers, names that do not fit.
+        DataError: with all faults: no trajectories, other widths than in the first, fewer than two frames, states
+            that are no numbers or not finite, infinite actions, a number of actions that is neither ``T`` nor
+            ``T - 1``, an action column with few numbers, names that do not fit.
 
     Examples:
         >>> import numpy as np
@@ -145,11 +145,8 @@ def _frames(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | No
     array = _table(value, f"{name}: states", "[T, d]", problems)
     if array is None:
         return None
-    array = array.astype(np.float64) if array.dtype == bool else array
-    if not np.issubdtype(array.dtype, np.floating):
-        problems.append(
-            f"{name}: states are {array.dtype}; wanted floating-point numbers in the unit that the robot reports"
-        )
+    if array.dtype.kind not in "fiub":
+        problems.append(f"{name}: states are {array.dtype}, wanted numbers in the unit that the robot reports")
     elif len(array) < 2:
         problems.append(f"{name}: {len(array)} frame; a transition needs two")
     else:

@@ -112,8 +112,8 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
         raise ValueError(f"has no states: wanted one of {', '.join(STATES)}, it holds {held}")
     acting = next((name for name in ACTIONS if name in entries), None)
     frames, read = entries[key], {key, acting, "state_names", "action_names", "control_hz"}
-    if frames.ndim != 2 or frames.dtype.kind not in "fb":
-        raise ValueError(f"{key} must be floating-point numbers [T, d], got {frames.dtype} {list(frames.shape)}")
+    if frames.ndim != 2 or frames.dtype.kind not in "fiub":
+        raise ValueError(f"{key} must be numbers [T, d], got {frames.dtype} {list(frames.shape)}")
     states, unclear, unread, steps = _named(frames, entries.get("state_names"), "state"), [], [], None
     for name, values in entries.items():
         kind = kind_of(name)[0]
