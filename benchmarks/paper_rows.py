@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tables import SOURCE, percent, share, table
+from tables import percent, read_rows, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper import (
@@ -17,24 +17,37 @@ from torchrl_koap.studies.paper import (
     above_the_paper,
     draw_average,
     layout_rows,
+    paper_cell,
+    paper_cells,
     paper_entries,
+    paper_levels,
 )
-from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
-from torchrl_koap.studies.presets import PAPER_TASKS
-from torchrl_koap.studies.table import as_markdown, read_cells
+from torchrl_koap.studies.study import PAPER_TASKS
+from torchrl_koap.studies.table import as_markdown
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}
-CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
+
+
+def read_cells(name: str) -> list[dict[str, Any]]:
+    """The cells of a whole comparison as `koap bench` writes them: numbers as numbers, None for nothing."""
+    return [{column: _value(text) for column, text in row.items()} for row in read_rows(f"cells/{name}")]
+
+
+def _value(text: str) -> Any:
+    try:
+        return int(text) if text.lstrip("-").isdigit() else float(text)
+    except ValueError:
+        return text or None
 
 
 def finished_cells(name: str) -> list[dict[str, Any]]:
     """The finished cells of a comparison."""
-    return [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+    return [row for row in read_cells(name) if row["status"] == "done"]
 
 
 def paper_cells_beside(name: str) -> list[Entry]:
     """The cells of a comparison beside the paper's, those that were not run included."""
-    return paper_entries(read_cells(CELLS / f"{name}.csv"))
+    return paper_entries(read_cells(name))
 
 
 def paper_levels_table() -> str:
@@ -51,7 +64,7 @@ def bench_table(name: str, beside: str = "", methods: Sequence[str] = ()) -> str
         beside (str): another comparison, whose cells with the same task, share and seed stand before them.
         methods (sequence of str): of those, the methods that do.
     """
-    rows = read_cells(CELLS / f"{name}.csv")
+    rows = read_cells(name)
     places = {_place(row) for row in rows}
     others = (
         [row for row in finished_cells(beside) if row["method"] in methods and _place(row) in places] if beside else []

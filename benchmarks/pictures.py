@@ -18,7 +18,7 @@ from unlabelled_rows import draw_unlabelled
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, set_title, tidy
 from torchrl_koap.studies.plots import method_styles
-from torchrl_koap.studies.presets import PAPER_TASKS
+from torchrl_koap.studies.study import PAPER_TASKS
 
 _NAMES = {
     "koap": "KOAP",

@@ -31,7 +31,7 @@ import tempfile, torchrl_koap
 from pathlib import Path
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.studies.paper_results import paper_points
+from torchrl_koap.studies.paper import paper_points
 from torchrl_koap.tasks import get_task
 assert "site-packages" in torchrl_koap.__file__, torchrl_koap.__file__
 assert len(evaluation_contexts(get_task("aligning"))) >= 60

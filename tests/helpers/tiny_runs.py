@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -48,3 +49,9 @@ def write_demonstrations(folder: Path, *, episodes: int = 8, rows: int = 30, cha
         paths = {"des_c_pos": np.hstack([commanded, height]), "c_pos": np.hstack([measured, height])}
         write_raw_episode(Path(folder) / f"env_{index:03d}_00.pkl", paths)
     return Path(folder)
+
+
+def read_csv(file: Path) -> list[dict[str, str]]:
+    """The rows of a table as text."""
+    with Path(file).open(newline="", encoding="utf-8") as lines:
+        return list(csv.DictReader(lines))

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 from command_calls import fails
-from tiny_runs import TINY, koap
+from tiny_runs import TINY, koap, read_csv
 
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.studies.table import read_cells
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.methods import METHODS, register_method
 
@@ -97,7 +96,7 @@ def test_a_study_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstrations,
     made = (out / f"cells/avoiding/{NAME}-0.25-1-seed0/result.json").stat().st_mtime_ns
     forget()
     assert koap("curve", "--out", out, *words, "linear") == 0
-    assert {row["method"]: row["status"] for row in read_cells(out / "cells.csv")} == {NAME: "done", "linear": "done"}
+    assert {row["method"]: row["status"] for row in read_csv(out / "cells.csv")} == {NAME: "done", "linear": "done"}
     assert (out / f"cells/avoiding/{NAME}-0.25-1-seed0/result.json").stat().st_mtime_ns == made
     assert "nearest labelled steps" in (out / "index.html").read_text()
 

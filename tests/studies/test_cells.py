@@ -17,8 +17,7 @@ from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
 from torchrl_koap.studies.paired_comparison import compare, compare_cells
 from torchrl_koap.studies.report import write_study_report
-from torchrl_koap.studies.summary import summarise
-from torchrl_koap.studies.table import CELL_COLUMNS, read_cells, write_cells
+from torchrl_koap.studies.table import CELL_COLUMNS, summarise
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import on_disk
 
@@ -182,7 +181,7 @@ def arm(tmp_path_factory):
     return root, [cell_row(root, cell, **ROW) for cell in OFFLINE]
 
 
-def test_cells_without_an_environment_hold_errors_and_no_success(arm, tmp_path):
+def test_cells_without_an_environment_hold_errors_and_no_success(arm):
     root, found = arm
     koap, linear, dp = rows = [row for row, _ in found]
     assert [row["status"] for row in rows] == ["done"] * 3 and {row["kind"] for row in rows} == {"offline"}
@@ -192,9 +191,6 @@ def test_cells_without_an_environment_hold_errors_and_no_success(arm, tmp_path):
     held_out = [RunDirectory(root / cell.folder).read_json("config.json").get("held_out_episodes") for cell in OFFLINE]
     shared = RunDirectory(root / "planner").read_json("config.json")["held_out_episodes"]
     assert held_out == [shared, shared, None]
-    again = read_cells(write_cells(tmp_path / "cells.csv", rows))
-    assert [row["relative_action_error"] for row in again] == [row["relative_action_error"] for row in rows]
-    assert again[0]["episodes"] is again[0]["success_rate"] is None
 
 
 def test_the_report_compares_by_action_errors(arm):

@@ -13,10 +13,13 @@ from torchrl_koap.studies.paper import (
     default_entries,
     draw_average,
     layout_rows,
+    paper_cell,
+    paper_cells,
     paper_entries,
+    paper_levels,
+    paper_points,
     write_paper_layout,
 )
-from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels, paper_points
 from torchrl_koap.tasks import TASKS, get_task
 
 
@@ -66,18 +69,13 @@ def test_levels_are_those_of_the_tasks():
 def test_what_the_paper_does_not_have_is_none():
     assert paper_cell("aligning", "koap_untrained", 2) is None and paper_cell("sorting_2", "koap", 1) is None
     assert paper_levels("stacking") == ()
-    assert paper_points("sorting_6") == []
+    assert paper_points("sorting_6") == {}
 
 
 def test_points_lie_at_the_papers_shares():
-    cells = [cell for cell in paper_points("avoiding") if cell.method == "koap"]
-    assert [(cell.label_share, cell.success) for cell in cells] == [
-        (0.02, pytest.approx(0.7803)),
-        (0.05, pytest.approx(0.9805)),
-        (0.1, pytest.approx(0.9722)),
-        (0.25, pytest.approx(0.9833)),
-        (0.5, pytest.approx(0.975)),
-    ]
+    shares, successes = zip(*paper_points("avoiding")["koap"], strict=True)
+    assert shares == (0.02, 0.05, 0.1, 0.25, 0.5)
+    assert successes == pytest.approx((0.7803, 0.9805, 0.9722, 0.9833, 0.975))
 
 
 def test_an_unknown_table_is_refused():
@@ -129,7 +127,10 @@ def test_what_is_written(tmp_path):
     made = write_paper_layout(tmp_path, ROWS)
     assert made["sentence"] in (tmp_path / "paper_table.md").read_text()
     assert (tmp_path / made["picture"]).stat().st_size > 1000
-    assert write_paper_layout(tmp_path, [cell("sorting", "koap", 0.01)])["picture"] is None
+    one = [cell("sorting", "koap", 0.01, 30)]  # its own picture of success shows the same
+    assert write_paper_layout(tmp_path, one)["picture"] is None
+    no_level = write_paper_layout(tmp_path / "none", [cell("sorting", "koap", 0.03, 30)])
+    assert no_level["rows"] == [] and not (tmp_path / "none").exists()
     with pytest.raises(ValueError, match="nothing to average"):
         draw_average(paper_entries([cell("sorting", "koap", 0.01)]), tmp_path / "a.png")
 

@@ -11,10 +11,9 @@ import pytest
 from html_pages import Page
 from PIL import Image
 
-from torchrl_koap.studies.paper_results import PaperCell
 from torchrl_koap.studies.plots import method_styles, plot_measure
 from torchrl_koap.studies.report import write_study_report
-from torchrl_koap.studies.summary import summarise
+from torchrl_koap.studies.table import summarise
 
 _METHODS = {"koap": 0.9, "ridge": 0.6, "vae": 0.4}
 
@@ -63,12 +62,8 @@ def folder(tmp_path_factory):
     rows = make_cells(outcomes := {})
     spoil(rows[0], "failed", "RuntimeError: <loss> is not\nfinite")
     spoil(rows[5], "missing")
-    paper = [
-        PaperCell(1, "avoiding", method, level, share, success, spread=0.03)
-        for method, level, share, success in (("koap", 3, 0.1, 0.92), ("ridge", 4, 0.25, 0.5))
-    ]
     options = {"planner.steps": 12345}
-    path = write_study_report(folder, rows, outcomes, title="Labels & success", options=options, paper=paper)
+    path = write_study_report(folder, rows, outcomes, title="Labels & success", options=options)
     assert path == folder / "index.html"
     return folder
 
@@ -85,15 +80,16 @@ def test_page_says_what_was_run_and_what_was_not(folder):
         "1 of 2",
         "One planner is shared by all cells that plan",
         "resamples contexts and training seeds",
-        "All cells together: 10 min 50 s",  # ten times 60 + 5 s
     ):
         assert wanted in text
 
 
-def test_paper_stands_beside_what_was_measured(folder):
-    text = Page(folder / "index.html").text
-    assert re.search(r"koap 10 % 92\.0 \+- 3\.0 \d+\.\d % \(", text)
-    assert "ridge 25 % 50.0 +- 3.0 not run" in text
+def test_the_paper_stands_beside_labelled_windows(tmp_path):
+    rows = make_cells(outcomes := {}, labels=(0.02, 0.1), label_unit="window")
+    text = Page(write_study_report(tmp_path, rows, outcomes, title="t")).text
+    assert re.search(r"avoiding 3 \(10 %\) \d+\.\d \(\d+-\d+\) \[97\.2 \+- \d\.\d\]", text)
+    assert "Hollow, dashed: the paper" in text and "in 1 of 2 cells" in text or "in 2 of 2 cells" in text
+    assert (tmp_path / "paper_table.md").exists()
 
 
 def test_pictures_exist_and_nothing_comes_from_elsewhere(folder):
@@ -180,8 +176,6 @@ def test_pictures_of_few_points(tmp_path):
     both = ("labels", "labelled_transitions")
     single = summarise(make_cells(labels=(0.05,), seeds=1))
     assert plot_measure(single, tmp_path / "single.png", by=both).exists()
-    nothing = make_cells(labels=(0.0, 0.1))  # no label at all has its place on a logarithmic axis
-    assert plot_measure(summarise(nothing), tmp_path / "zero.png", by=both).exists()
     many = summarise(make_cells(methods={f"method {number}": 0.5 for number in range(12)}))
     assert plot_measure(many, tmp_path / "many.png", "action_error", unit="mm").exists()
     assert plot_measure(many, tmp_path / "entropy.png", "mode_entropy").stat().st_size > 5000

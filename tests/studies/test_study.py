@@ -7,14 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from offline_runs import save_arm
 from tiny_runs import TINY, koap
 
 from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig, RunConfig
 from torchrl_koap.runs.pretrained import pretrained_folders
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.studies import Study, run_study
-from torchrl_koap.studies.presets import PRESETS
-from torchrl_koap.studies.study import check_study, complete
+from torchrl_koap.studies.study import PRESETS, check_study, complete
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.training import resolve
 from torchrl_koap.training.methods import METHODS
@@ -48,12 +48,11 @@ def test_cells_of_all_seeds_share_a_planner_that_knows_no_seed(asked):
         assert config.planner == expected and config.out == study.out / cell.folder
 
 
-def test_a_planner_per_seed_and_share_of_the_demonstrations(asked):
-    study, cells = asked(methods=("koap",), planner_seeds=2, demonstrations=(0.5, 1.0), seeds=3)
-    folders = {study.planner_folder(cell).name for cell in cells}
-    assert folders == {f"{share}-seed{seed}" for share in ("0.5", "1") for seed in (0, 1)}
-    last = study.planner_config(cells[-2])  # seed 2, half of the demonstrations
-    assert (last.labels.trajectories, last.run.seed) == (0.5, 0)
+def test_a_planner_per_share_of_the_demonstrations(asked):
+    study, cells = asked(methods=("koap",), demonstrations=(0.5, 1.0), seeds=3)
+    assert {study.planner_folder(cell).name for cell in cells} == {"0.5-seed0", "1-seed0"}
+    half = study.planner_config(cells[0])
+    assert (half.labels.trajectories, half.run.seed) == (0.5, 0)
 
 
 def test_every_training_seed_meets_noise_of_its_own(asked):
@@ -127,6 +126,13 @@ def test_what_is_asked_for_wins_over_the_preset(tmp_path):
     assert (study.planner.width, study.planner.steps, study.evaluation.episodes) == (99, 2000, 7)
     assert (study.labels, study.levels, study.seeds, study.record) == ((0.3,), (), 1, 48)
     assert (study.run.threads, study.preset) == (2, None)
+
+
+def test_a_data_set_alone_brings_its_task(tmp_path):
+    """One that nobody has registered."""
+    study = complete(Study(out=tmp_path / "s", datasets=(str(save_arm(tmp_path / "arm", joints=2)),)))
+    assert study.tasks == ("arm",) and study.task("arm").action_dim == 2
+    assert study.train_config(study.cells()[0]).dataset == str(tmp_path / "arm")
 
 
 def test_data_and_planners_are_named_by_task(tmp_path):

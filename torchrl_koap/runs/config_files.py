@@ -11,7 +11,7 @@ import os
 import platform
 import types
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -114,6 +114,25 @@ def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
         elif a != b:
             changed.append(prefix + field.name)
     return changed
+
+
+def fill_in(asked: Config, known: Any) -> Config:
+    """Puts known options in place of those that are at their defaults, likewise in every section.
+
+    Args:
+        asked (dataclass): what was asked for.
+        known (dataclass or mapping): options by name, those of sections in such mappings of their own; some may be
+            missing.
+    """
+    known = known if isinstance(known, Mapping) else vars(known)
+    found = {}
+    for option in fields(asked):  # type: ignore[arg-type]
+        value = getattr(asked, option.name)
+        if option.name in known and is_dataclass(value):
+            found[option.name] = fill_in(value, known[option.name])
+        elif option.name in known and value == option.default:
+            found[option.name] = known[option.name]
+    return replace(asked, **found)  # type: ignore[type-var]
 
 
 def _fits(value: Any, kind: Any) -> bool:

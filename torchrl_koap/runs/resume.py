@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from torchrl._utils import logger
 
-from torchrl_koap.runs.config import LabelConfig, TrainConfig
-from torchrl_koap.runs.config_files import changed_options, read_config
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config_files import changed_options, fill_in, read_config
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 # with which a run may be resumed differently; with other threads sums are rounded differently
@@ -23,20 +23,10 @@ def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
     """Returns the options of a run, which may be new: of a resumed one what is not asked for otherwise is as it was."""
     if not (asked.run.resume and (run.path / "config.json").exists()):
         return asked
-    return _merged(asked, read_config(run))
-
-
-def _merged(asked: Any, saved: Any) -> Any:
-    kept = {}
-    for field in fields(asked):
-        value, earlier = getattr(asked, field.name), getattr(saved, field.name)
-        if is_dataclass(value):
-            kept[field.name] = _merged(value, earlier)
-        elif value == field.default and field.name != "resume":
-            kept[field.name] = earlier
-    if isinstance(asked, LabelConfig) and any(getattr(asked, name) for name in _ONE_OF):
-        kept = {name: value for name, value in kept.items() if name not in _ONE_OF}
-    return replace(asked, **kept)
+    saved = read_config(run)
+    if any(vars(asked.labels)[name] for name in _ONE_OF):
+        saved = replace(saved, labels=replace(saved.labels, fraction=None, count=None, episodes=()))
+    return fill_in(asked, saved)
 
 
 def check_resume(run: RunDirectory, config: TrainConfig) -> None:

@@ -18,7 +18,6 @@ from torchrl_koap.evaluation.offline import KIND
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import changed_options, from_json, to_json
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.studies.summary import needed_when_done
 from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training import train
 
@@ -126,8 +125,8 @@ def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int
     try:
         row = {str(name): value for name, value in content["row"].items()}
         outcomes = {(int(context), int(seed)): float(value) for context, seed, value in content["outcomes"]}
-        if (Path(folder) / "summary.json").exists() and any(row[name] is None for name in needed_when_done(row)):
-            raise ValueError("it has no successes")
+        if outcomes and row.get("kind") != KIND and not 0 <= row["successes"] <= row["episodes"]:
+            raise ValueError("wanted 0 <= successes <= episodes")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RunDirectoryError(f"{path} is damaged ({type(error).__name__}: {error})") from error
     if len(outcomes) < len(content["outcomes"]):

@@ -122,8 +122,6 @@ def launch(
     # a job of a cluster may not use all cores of its machine
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if machines.launcher == "ray":
-        from torchrl_koap.studies.ray_launcher import RayPool
-
         return _schedule(list(jobs), RayPool(function, machines.workers or cores, machines.address))
     return _schedule(list(jobs), LocalPool(function, machines.workers or cores))
 
@@ -158,24 +156,24 @@ def _schedule(waiting: list[Job], pool: Any) -> Generator[tuple[Job, str | None]
 def run_logged(function: Callable[[str], None], folder: str, log: str) -> str | None:
     """Calls a function of a folder with everything it prints going to a file; returns why it failed, if it did."""
     try:
-        with open_log(log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+        with _open_log(log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
             try:
                 function(folder)
             except Exception:
                 traceback.print_exc(file=file)
                 raise
     except Exception as error:  # also where there is no place for a log
-        return in_words(error)
+        return _in_words(error)
     return None
 
 
-def open_log(path: str) -> TextIO:
+def _open_log(path: str) -> TextIO:
     """Opens a file to append to."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     return Path(path).open("a", buffering=1)  # by lines: a job that is killed has said what it did until then
 
 
-def in_words(error: Exception) -> str:
+def _in_words(error: Exception) -> str:
     """Type and first line; cut, as a pipe holds 64 KB and nobody reads it before the process has ended."""
     lines = str(error).strip().splitlines() or [""]
     return f"{type(error).__name__}: {lines[0][:_LONGEST]}".removesuffix(": ")
@@ -253,7 +251,7 @@ def _child(writer: Any, function: Callable[[str], None], folder: str, log: str) 
     # not to outlive a killed parent: the next `koap curve` in the folder would meet its own ghost
     threading.Thread(target=_die_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    with contextlib.suppress(OSError), open_log(log) as file:  # what is not Python prints past sys.stdout
+    with contextlib.suppress(OSError), _open_log(log) as file:  # what is not Python prints past sys.stdout
         for descriptor in (1, 2):
             os.dup2(file.fileno(), descriptor)
     writer.send(run_logged(function, folder, log))
@@ -263,3 +261,70 @@ def _child(writer: Any, function: Callable[[str], None], folder: str, log: str) 
 def _die_with_parent() -> None:
     multiprocessing.parent_process().join()
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+class RayPool:
+    """Tasks of a Ray cluster; a task that dies is not tried again.
+
+    Args:
+        function (callable): what jobs do.
+        workers (int): jobs at a time, on a cluster of its own.
+        address (str, optional): of a cluster that runs, which decides how many by itself.
+    """
+
+    def __init__(self, function: Callable[[str], None], workers: int, address: str | None):
+        import ray  # the extra
+
+        self.ray, self.function = ray, function
+        self.owned = not ray.is_initialized()
+        if self.owned:
+            # "local", as None means a cluster that happens to run already, which takes no sizes
+            size = {} if address is not None else {"num_cpus": workers, "include_dashboard": False}
+            with _keeping_signals():
+                ray.init(address=address or "local", log_to_driver=False, **size)
+        self.workers = max(int(ray.cluster_resources().get("CPU", workers)), 1)
+        self.task = ray.remote(num_cpus=1, max_retries=0)(run_logged)
+        self.running: dict[Any, Job] = {}
+
+    @property
+    def free(self) -> int:
+        """How many jobs may be started now."""
+        return self.workers - len(self.running)
+
+    def start(self, job: Job) -> None:
+        """Starts a job."""
+        folder, log = str(job.folder.absolute()), str(job.log.absolute())
+        self.running[self.task.remote(self.function, folder, log)] = job
+
+    def finished(self) -> list[tuple[Job, str | None]]:
+        """Waits for a job to end; returns it with the reason if it failed."""
+        (reference,), _ = self.ray.wait(list(self.running), num_returns=1)
+        job = self.running.pop(reference)
+        try:
+            return [(job, self.ray.get(reference))]
+        except self.ray.exceptions.RayTaskError as error:  # what a task raised is wrapped
+            return [(job, _in_words(error.cause))]
+        except self.ray.exceptions.RayError as error:
+            return [(job, _in_words(error))]
+
+    def stop(self) -> None:
+        """Ends what is running, and the cluster if it was started here."""
+        for reference in self.running:
+            self.ray.cancel(reference, force=True)
+        self.running.clear()
+        if self.owned:
+            self.ray.shutdown()
+
+
+@contextlib.contextmanager
+def _keeping_signals() -> Iterator[None]:
+    """Behind the block signals mean what they did before; Ray would end the process without a word on SIGTERM."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    earlier = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in earlier.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import permutation_test
 
 from torchrl_koap.evaluation.offline import KIND
-from torchrl_koap.studies.summary import group_of
+from torchrl_koap.studies.table import group_of
 
 Outcome = Mapping[tuple[int, int], float]
 """Successes of a cell by (context, evaluation seed); errors of one without an environment by (trajectory, 0)."""
@@ -200,16 +200,3 @@ def compare_cells(
 
 def _unless_nan(value: Any) -> Any:
     return None if value != value else value
-
-
-def p_text(p: float | None) -> str:
-    """A p-value in words.
-
-    Examples:
-        >>> from torchrl_koap.studies.paired_comparison import p_text
-        >>> p_text(0.0312), p_text(0.00001), p_text(None)
-        ('0.031', '< 0.001', '–')
-    """
-    if p is None or not math.isfinite(p):
-        return "–"
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"

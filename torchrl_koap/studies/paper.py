@@ -1,23 +1,105 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Measured cells in the layout of the paper's tables, its own beside them."""
+"""Both tables of the paper as data, 165 cells, and measured cells in their layout beside them.
+
+A cell is a mean success and what the paper prints after its ``+-``, presumably the standard deviation over seeds. The
+paper's Stacking, which counts one box, is :data:`~torchrl_koap.tasks.TASKS`' ``stacking_unobserved_joints`` (its state)
+and, with the joints observed, ``stacking_1``. What the paper does not have is None here, never an estimate.
+"""
 
 from __future__ import annotations
 
+import functools
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from torchrl_koap.files import replacing_file
-from torchrl_koap.studies.paper_results import PaperCell, paper_cell, paper_levels
+from torchrl_koap.lookup import lookup
 from torchrl_koap.studies.plots import plot_average
-from torchrl_koap.studies.summary import Summary, percent, summarise
-from torchrl_koap.studies.table import as_markdown
+from torchrl_koap.studies.table import Summary, as_markdown, percent, summarise
 from torchrl_koap.tasks import TASKS
 
 AVERAGE = "plots/average.png"
 DEFAULT = "task's default"  # what pictures call the method that a task is trained with unless told otherwise
+
+
+@dataclass(frozen=True)
+class PaperCell:
+    """A cell of the paper's tables.
+
+    Args:
+        table (int): 1 (methods) or 2 (variants of KOAP).
+        level (int): label level, 1 for the fewest labels.
+        label_share (float): share of the labels at this level.
+        success (float): mean success in 0..1.
+        spread (float): what is printed after the ``+-``, in the same unit.
+    """
+
+    table: int
+    task: str
+    method: str
+    level: int
+    label_share: float
+    success: float
+    spread: float
+
+    @property
+    def text(self) -> str:
+        """Success and spread in percent."""
+        return f"{100 * self.success:.1f} +- {100 * self.spread:.1f}"
+
+
+@functools.cache
+def _content() -> dict[str, Any]:
+    return json.loads(files("torchrl_koap.studies").joinpath("paper_results.json").read_text(encoding="utf-8"))
+
+
+def paper_levels(task: str) -> tuple[float, ...]:
+    """Shares of labels of the paper's levels, the fewest first; empty for a task that is not in the paper."""
+    entries = [entry for entry in _content()["tasks"].values() if task in entry["tasks"]]
+    return tuple(percent / 100 for entry in entries for percent in entry["label_percent"])
+
+
+def paper_cells(table: int) -> list[PaperCell]:
+    """All cells of a table; a task that stands for one of the paper's in several ways has them in each.
+
+    Raises:
+        ValueError: for another table.
+    """
+    tables = _content()["tables"]
+    lookup(tuple(tables), str(table), "table of the paper")
+    return [
+        PaperCell(table, task, method, level, shares[level - 1] / 100, round(success / 100, 4), round(spread / 100, 4))
+        for name, methods in tables[str(table)].items()
+        for task in _content()["tasks"][name]["tasks"]
+        for method, cells in methods.items()
+        for shares in (_content()["tasks"][name]["label_percent"],)
+        for level, (success, spread) in enumerate(cells, start=1)
+    ]
+
+
+def paper_cell(task: str, method: str, level: int) -> PaperCell | None:
+    """A cell of the paper, None if it has no such one; of both tables the first; level 1 has the fewest labels."""
+    return _by_place().get((task, method, level))
+
+
+@functools.cache
+def _by_place() -> dict[tuple[str, str, int], PaperCell]:
+    cells = [cell for table in (2, 1) for cell in paper_cells(table)]  # table 1 goes before
+    return {(cell.task, cell.method, cell.level): cell for cell in cells}
+
+
+def paper_points(task: str) -> dict[str, list[tuple[float, float]]]:
+    """The cells of a task in both tables, each once: by method shares of the labels and successes in 0..1."""
+    points: dict[str, list[tuple[float, float]]] = {}
+    for cell in _by_place().values():
+        if cell.task == task:
+            points.setdefault(cell.method, []).append((cell.label_share, cell.success))
+    return points
 
 
 @dataclass(frozen=True)
@@ -59,7 +141,7 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
     Cells at shares that are no label level of their task are left out.
 
     Raises:
-        ValueError: as :func:`~torchrl_koap.studies.summary.summarise`.
+        ValueError: as :func:`~torchrl_koap.studies.table.summarise`.
     """
     found: dict[tuple[str, int, str], Summary] = {}
     for item in summarise(rows):
@@ -147,19 +229,21 @@ def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
 
 
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Writes ``paper_table.md`` and the picture of success averaged over tasks into a folder.
+    """Writes ``paper_table.md`` and the picture of success averaged over several tasks into a folder.
 
     Returns:
         dict: ``rows`` of the table, a ``sentence`` on KOAP and the paper's, and ``picture``, the path of the picture
-        below the folder, None if nothing is done that could be averaged.
+        below the folder, None if there is nothing to average. Nothing is written, and no rows are returned, if no cell
+        lies at a label level.
     """
     folder, entries = Path(folder), paper_entries(rows)
     table = layout_rows(entries)
     above, both = above_the_paper(entries)
     sentence = f"KOAP succeeds more often than the paper's KOAP in {above} of {both} cells." if both else ""
-    with replacing_file(folder / "paper_table.md") as aside:
-        aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
-    picture = AVERAGE if average_over_tasks(entries) else None
+    if table:
+        with replacing_file(folder / "paper_table.md") as aside:
+            aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
+    picture = AVERAGE if len({entry.task for entry in entries}) > 1 and average_over_tasks(entries) else None
     if picture is not None:
         draw_average(entries, folder / picture)
     return {"rows": table, "sentence": sentence, "picture": picture}

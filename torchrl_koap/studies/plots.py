@@ -18,8 +18,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 
 from torchrl_koap.reports.pictures import save_figure
 from torchrl_koap.reports.style import FAINT, INK, set_title, tidy
-from torchrl_koap.studies.paper_results import PaperCell
-from torchrl_koap.studies.summary import Summary, percent
+from torchrl_koap.studies.table import Summary, percent
 
 AXES = {
     "labels": "labelled share",
@@ -71,7 +70,7 @@ def plot_measure(
     measure: str = "success",
     *,
     by: Sequence[str] = ("labels",),
-    paper: Sequence[PaperCell] = (),
+    paper: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     methods: Sequence[str] | None = None,
     unit: str = "",
     label_unit: str = "",
@@ -79,15 +78,15 @@ def plot_measure(
     """Draws a measure of every method with its ends, a panel per entry of ``by``.
 
     Args:
-        summaries (sequence of Summary): of one task, see :func:`~torchrl_koap.studies.summary.summarise`.
+        summaries (sequence of Summary): of one task, see :func:`~torchrl_koap.studies.table.summarise`.
         path (str or Path): png to write.
         measure (str): of :data:`MEASURES`.
 
     Keyword Args:
         by (sequence of str): what the horizontal axes show, of :data:`AXES`. Along ``"demonstrations"`` there is a line
             per method and share of labels that was run with several of them.
-        paper (sequence of PaperCell): the paper's success: hollow and dashed, in the colour of the method. Drawn only
-            along ``"labels"``.
+        paper (mapping, optional): by method shares of the labels and successes of the paper: hollow and dashed, in the
+            colour of the method, along ``"labels"`` alone.
         methods (sequence of str, optional): all methods in the order that gives the colours. Default: as they come.
         unit (str): unit of the measure.
         label_unit (str): what the labels are counted in, as in the label of the axis: ``"windows"``.
@@ -101,8 +100,8 @@ def plot_measure(
     error = measure.endswith("error")
     if not panels or (error and min(_ends([line for lines in panels.values() for line in lines])) <= 0):
         raise ValueError(f"there is no {measure} to draw: no cell is done" + (" with one above 0" if error else ""))
-    for line in panels.get("labels", ()) if measure == "success" else ():
-        line.paper = [(cell.label_share, 100 * cell.success) for cell in paper if cell.method == line.name]
+    for line in panels.get("labels", ()) if paper else ():
+        line.paper = [(share, 100 * success) for share, success in paper.get(line.name, ())]
     if paper:
         title += "\nhollow, dashed: the paper, whose demonstrations are others"
     figure = Figure(figsize=(1.9 + 4.1 * len(panels), 4.1), layout="constrained")
@@ -194,26 +193,23 @@ def _name_lines(figure: Figure, lines: Sequence[_Line]) -> None:
 def _lines(
     summaries: Sequence[Summary], by: str, measure: str, factor: float, methods: Sequence[str] | None
 ) -> list[_Line]:
-    """A line per method; along the demonstrations one per method and share of labels."""
+    """A line per method; along the demonstrations, where several shares are labelled, one per method and share."""
     methods = list(methods or dict.fromkeys(item.method for item in summaries))
     shares = sorted({item.labels for item in summaries})
     several = by == "demonstrations" and len(shares) > 1
     styles, lines = method_styles(methods), {}
-    for method in methods:
-        for n, labels in enumerate(shares if several else [None]):  # colour tells the method, marker and dash the share
-            own = {"marker": _MARKERS[n % 13], "linestyle": _DASHES[n % 3]} if several else {}
-            name = f"{method}, {percent(labels)}" if several else method
-            lines[method, labels] = _Line(name, styles[method] | own)
-    for item in sorted(summaries, key=lambda item: item.mean(by) or 0):
-        place = item.mean(by)
-        if item.method in methods and place is not None and measure in item.measures:
-            found = item.measures[measure]
-            values = (factor * value for value in (found.mean, found.low, found.high))
-            lines[item.method, item.labels if several else None].points.append((place, *values))
-    drawn = [line for line in lines.values() if line.points]
-    if by == "demonstrations" and any(len(set(line.positions)) > 1 for line in drawn):
-        return [line for line in drawn if len(set(line.positions)) > 1]  # the others do not scale anything
-    return drawn
+    for item in sorted(summaries, key=lambda item: (methods.index(item.method), item.mean(by) or 0)):
+        place, found = item.mean(by), item.measures.get(measure)
+        if place is None or found is None:
+            continue
+        name, style, share = item.method, styles[item.method], shares.index(item.labels)
+        if several:  # colour tells the method, marker and dash the share
+            name = f"{name}, {percent(item.labels)}"
+            style = style | {"marker": _MARKERS[share % len(_MARKERS)], "linestyle": _DASHES[share % len(_DASHES)]}
+        values = (factor * value for value in (found.mean, found.low, found.high))
+        lines.setdefault(name, _Line(name, style)).points.append((place, *values))
+    several_places = [line for line in lines.values() if len(set(line.positions)) > 1]
+    return several_places if by == "demonstrations" and several_places else list(lines.values())
 
 
 def _ends(lines: Sequence[_Line]) -> list[float]:
@@ -240,20 +236,15 @@ def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
 def _log_x(axes: Axes, lines: Sequence[_Line], *, ticks: bool) -> None:
     """Logarithmic axis that ends at the data; ``ticks`` at the places themselves, where there is room."""
     places = sorted({value for line in lines for value in [*line.positions, *(place for place, _ in line.paper)]})
-    positive = [place for place in places if place > 0] or [1.0]
-    low, high = positive[0], positive[-1]
-    margin = max(1.12, (high / low) ** 0.06) if len(positive) > 1 else 2.0
-    if places[0] > 0:
-        axes.set_xscale("log")
-        axes.set_xlim(low / margin, high * margin)
-    else:  # no labels at all have their place left of the logarithmic part
-        axes.set_xscale("symlog", linthresh=low, linscale=0.3)
-        axes.set_xlim(-0.3 * low, high * margin)
+    low, high = places[0], places[-1]
+    margin = max(1.12, (high / low) ** 0.06) if len(places) > 1 else 2.0
+    axes.set_xscale("log")
+    axes.set_xlim(low / margin, high * margin)
     kept: list[float] = []
     for place in places:
-        if not kept or not kept[-1] or place / kept[-1] > (high * margin**2 / low) ** 0.085:
+        if not kept or place / kept[-1] > (high * margin**2 / low) ** 0.085:
             kept.append(place)
-    if ticks or len(positive) == 1 or places[0] <= 0:
+    if ticks or len(places) == 1:
         axes.xaxis.set_major_locator(FixedLocator(kept))
     elif high / low < 300:
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

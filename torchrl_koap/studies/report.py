@@ -3,18 +3,25 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torchrl_koap.files import replacing_file
-from torchrl_koap.reports.html import duration, write_page
-from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, Outcome, compare_cells, p_text
-from torchrl_koap.studies.paper_results import PaperCell
+from torchrl_koap.reports.html import write_page
+from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, Outcome, compare_cells
+from torchrl_koap.studies.paper import paper_points, write_paper_layout
 from torchrl_koap.studies.plots import plot_measure
-from torchrl_koap.studies.summary import Summary, cell_name, percent, plural, summarise
-from torchrl_koap.studies.table import markdown_table, table_rows, why_not_done, write_csv
+from torchrl_koap.studies.table import (
+    Summary,
+    markdown_table,
+    not_done,
+    percent,
+    plural,
+    summarise,
+    table_rows,
+    write_csv,
+)
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training.methods import METHODS
@@ -62,11 +69,11 @@ def write_study_report(
     *,
     title: str,
     options: Mapping[str, Any] | None = None,
-    paper: Sequence[PaperCell] = (),
     reference: str = "koap",
-    layout: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes ``table.md``, ``comparisons.csv``, pictures and ``index.html`` into the folder of a study.
+
+    Where windows are labelled, as in the paper, its figures stand beside those that were measured.
 
     Args:
         folder (str or Path): the folder; made if it is not there.
@@ -75,20 +82,17 @@ def write_study_report(
 
     Keyword Args:
         title, options: heading and options of the study.
-        paper (sequence of PaperCell): of :func:`~torchrl_koap.studies.paper_results.paper_points`.
         reference (str): method that all others are compared with.
-        layout (mapping, optional): of :func:`~torchrl_koap.studies.paper.write_paper_layout`, in place of ``paper``.
 
     Raises:
-        ValueError: if a cell occurs twice, or is done without its number of episodes and successes.
+        ValueError: if a cell occurs twice.
     """
-    folder = Path(folder)
-    summaries = summarise(rows)
+    folder, summaries = Path(folder), summarise(rows)
     compared = compare_cells(rows, outcomes or {}, reference=reference)
     with replacing_file(folder / "table.md") as aside:
         aside.write_text(markdown_table(rows), encoding="utf-8")
     write_csv(folder / "comparisons.csv", COMPARISON_COLUMNS, compared)
-    times, total = _times(rows)
+    windows = [row for row in rows if row.get("label_unit") == "window"]
     offline = any(item.offline for item in summaries)
     return write_page(
         "curve.html",
@@ -99,16 +103,12 @@ def write_study_report(
         **_what_was_run(rows),
         options=options or {},
         table=table_rows(summaries),
-        paper=[] if layout else _paper_rows(summaries, paper),
-        layout=layout,
+        layout=write_paper_layout(folder, windows) if windows else None,
         offline=offline,
-        figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows)), paper),
+        figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows))),
         compared=_comparison_rows(compared, reference, offline=offline),
         reference=reference,
-        not_done=[f"{cell_name(row)}: {why_not_done(row)}" for row in rows if row["status"] != "done"],
-        times=times,
-        total_time=total,
-        cells=[_cell(row) for row in rows],
+        not_done=not_done(rows),
     )
 
 
@@ -130,9 +130,7 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"run_sentence": f"{text}.", "done_sentence": done, "methods": known}
 
 
-def _draw(
-    folder: Path, summaries: Sequence[Summary], methods: Sequence[str], paper: Sequence[PaperCell]
-) -> list[dict[str, Any]]:
+def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) -> list[dict[str, Any]]:
     """Draws the pictures of every task and unit of the labels; what the page needs to show them."""
     groups = list(dict.fromkeys((item.task, item.label_unit) for item in summaries))
     figures = []
@@ -141,10 +139,8 @@ def _draw(
         shares = sorted({item.demonstrations for item in items})
         main = [item for item in items if item.demonstrations == shares[-1]]
         name = task if sum(task == other for other, _ in groups) == 1 else f"{task}_{label_unit}"
-        points = [cell for cell in paper if cell.task == task]
-        error = "relative_action_error"
-        if not any(item.mean(error) for item in main):
-            error = "action_error"
+        points = paper_points(task) if label_unit == "window" else {}
+        error = "relative_action_error" if any(item.mean("relative_action_error") for item in main) else "action_error"
         wanted: dict[str, dict[str, Any]] = {
             "success": {"by": ("labels", "labelled_transitions"), "paper": points},
             "mode_entropy": {},
@@ -180,16 +176,6 @@ def _figure(name: str, kind: str, task: str, more: str = "") -> dict[str, Any]:
     return {"title": f"{head}, {task}", "caption": caption + more, "source": source, "beside": not wide}
 
 
-def _paper_rows(summaries: Sequence[Summary], paper: Sequence[PaperCell]) -> list[dict[str, str]]:
-    ours = {(s.task, s.method, s.labels): s.measures["success"] for s in summaries if "success" in s.measures}
-    rows = []
-    for cell in paper:
-        item = ours.get((cell.task, cell.method, cell.label_share))
-        names = {"task": cell.task, "method": cell.method, "labels": percent(cell.label_share)}
-        rows.append(names | {"paper (%)": cell.text, "here (95 %)": "not run" if item is None else item.text})
-    return rows
-
-
 def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, offline: bool) -> list[dict[str, str]]:
     factor, form, head, unit = 100, "+.1f", "difference (points)", "contexts"
     if offline:
@@ -207,8 +193,8 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, o
             f"{reference} against": row["method"],
             head: "nothing in common" if row["difference"] is None else text(row["difference"]),
             "95 % interval": "–" if row["low"] is None else f"{text(row['low'])} to {text(row['high'])}",
-            "p": p_text(row["p"]),
-            "p (Holm)": p_text(row["p_holm"]),
+            "p": _p_text(row["p"]),
+            "p (Holm)": _p_text(row["p_holm"]),
             unit: str(row["contexts"] or 0),
             "seeds": str(row["seeds"] or 0),
             "n (pairs)": str(row["n"]),
@@ -217,31 +203,5 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, o
     ]
 
 
-def _times(rows: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, str]], float]:
-    """What the done cells of every task and method took, and all of them together (s)."""
-    done = [row for row in rows if row["status"] == "done"]
-    spent_by, total = [], 0.0
-    for task, method in dict.fromkeys((row["task"], row["method"]) for row in done):
-        cells = [row for row in done if (row["task"], row["method"]) == (task, method)]
-        spent = {"task": task, "method": method, "cells": str(len(cells))}
-        for name, head in (("train_seconds", "training per cell"), ("eval_seconds", "evaluation per cell")):
-            values = [row[name] for row in cells if row.get(name) is not None]
-            total += sum(values)
-            worst = f", at most {duration(max(values))}" if len(values) > 1 else ""
-            spent[head] = f"{duration(statistics.fmean(values))}{worst}" if values else "–"
-        spent_by.append(spent)
-    return spent_by, total
-
-
-def _cell(row: Mapping[str, Any]) -> dict[str, str]:
-    episodes = row.get("episodes")
-    spent = {"training": row.get("train_seconds"), "evaluation": row.get("eval_seconds")}
-    return {
-        "method": row["method"],
-        "labels": percent(row["labels"]),
-        "seed": str(row["seed"]),
-        "status": row["status"],
-        "success": f"{row['successes']} of {episodes}" if episodes else "–",
-        **{name: "–" if seconds is None else duration(seconds) for name, seconds in spent.items()},
-        "run": row.get("run") or "–",
-    }
+def _p_text(p: float | None) -> str:
+    return "–" if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,14 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import flatten_trajectories, save_ted, subsample_trajectories
-from torchrl_koap.evaluation import EvalConfig
-from torchrl_koap.runs.config import TrainConfig
-from torchrl_koap.runs.config_files import from_json, to_json
+from torchrl_koap.runs.config_files import changed_options, from_json, to_json
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
 from torchrl_koap.studies.launchers import Job, Machines, launch
-from torchrl_koap.studies.paper import write_paper_layout
-from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
-from torchrl_koap.studies.table import write_cells
+from torchrl_koap.studies.table import CELL_COLUMNS, write_csv
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import label_budget, load_demonstrations
 
@@ -138,39 +135,23 @@ def _check_folder(study: Study) -> None:
         if path.exists() and not all(entry.name.startswith(own) for entry in path.iterdir()):
             raise RunDirectoryError(f"{path} is not empty and no folder of `koap curve`; choose another --out")
         return
-    was, now = (_flat_options(to_json(options)) for options in (earlier, study))
-    changed = [name for name in now if name not in _MAY_CHANGE and was[name] != now[name]]
+    changed = [name for name in changed_options(earlier, study) if name not in _MAY_CHANGE]
+    values = [attrgetter(name)(earlier) for name in changed]
+    told = [f"{name} ({value})" for name, value in zip(changed, values, strict=True)]
     for name, before, after in (
         ("datasets", earlier.given_dataset, study.given_dataset),
         ("planners", earlier.given_planner, study.given_planner),
     ):
         if any(before(task) != after(task) for task in {*earlier.tasks} & {*study.tasks}):
-            changed.append(name)
-    if changed:
-        values = [", ".join(map(str, was[name])) if isinstance(was[name], list) else was[name] for name in changed]
-        told = ", ".join(f"{name} ({value})" for name, value in zip(changed, values, strict=True))
-        raise RunDirectoryError(f"{path} holds a study with another {told}; choose another --out")
-
-
-def _flat_options(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Options of all sections together, each by its name with the section."""
-    flat: dict[str, Any] = {}
-    for name, value in options.items():
-        inside = isinstance(value, Mapping)
-        flat |= _flat_options(value, f"{prefix}{name}.") if inside else {prefix + name: value}
-    return flat
+            told.append(f"{name} ({', '.join(vars(earlier)[name])})")
+    if told:
+        raise RunDirectoryError(f"{path} holds a study with another {', '.join(told)}; choose another --out")
 
 
 def _report(study: Study, table: _Table) -> Path:
-    """Writes the page; label levels of windows stand beside the paper's figures."""
-    rows, paper, layout = list(table.rows.values()), [], None
-    if study.label_unit == "window":
-        paper = [point for task in study.tasks for point in paper_points(task)]
-        layout = write_paper_layout(study.out, rows) if study.levels else None
     named = study.tasks[0] if len(study.tasks) == 1 else f"{len(study.tasks)} tasks"
-    options = {name: value for name, value in _flat_options(to_json(study)).items() if value not in (None, [])}
-    title = f"Label efficiency on {named}"
-    return write_study_report(study.out, rows, table.outcomes, title=title, options=options, paper=paper, layout=layout)
+    rows, title = list(table.rows.values()), f"Label efficiency on {named}"
+    return write_study_report(study.out, rows, table.outcomes, title=title, options=to_json(study))
 
 
 def _first_look(study: Study, task: Task) -> TensorDictBase | None:
@@ -236,7 +217,7 @@ class _Table:
 
     def write(self) -> None:
         """Writes the file."""
-        write_cells(self.study.out / "cells.csv", list(self.rows.values()))
+        write_csv(self.study.out / "cells.csv", CELL_COLUMNS, list(self.rows.values()))
         self._next = time.monotonic() + _EVERY
 
 
@@ -252,10 +233,12 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
             needs = planner
             if planner not in {job.folder for job in first}:
                 first.append(Job(planner))
-                _prepare(planner, study.planner_config(cell), None)
+                with suppress(OSError):  # where that cannot be written its own process will say why
+                    prepare_cell(planner, study.planner_config(cell), None)
         folder = study.out / cell.folder
         jobs[folder] = Job(folder, needs)
-        _prepare(folder, study.train_config(cell), study.eval_config(cell))
+        with suppress(OSError):
+            prepare_cell(folder, study.train_config(cell), study.eval_config(cell))
     places = {study.out / cell.folder: cell for cell in cells}
     alone = [job for job in jobs.values() if job.needs is None]  # they need not wait for a planner
     ordered = [*first, *alone, *(job for job in jobs.values() if job.needs is not None)]
@@ -266,14 +249,6 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
                 bar.set_postfix_str(job.folder.name + (" FAILED" if reason else ""))
                 if job.folder in places:
                     table.ended(places[job.folder], reason)
-
-
-def _prepare(folder: Path, config: TrainConfig, evaluation: EvalConfig | None) -> None:
-    """Says what a cell is to do; where that cannot be written its own process will say why."""
-    try:
-        prepare_cell(folder, config, evaluation)
-    except OSError:
-        return
 
 
 def _began(folder: Path) -> bool:

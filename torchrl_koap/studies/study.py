@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,10 @@ from torchrl_koap.evaluation.config import check_options
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.config import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
+from torchrl_koap.runs.config_files import fill_in
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.studies.cells import NOISE_STEP, Cell
-from torchrl_koap.studies.presets import PRESETS, USUAL
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.defaults import resolve
@@ -25,6 +25,57 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.trained import build_networks
 
 DEFAULT_TASK = "avoiding"
+PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
+# options of a Study by name, those of its sections in mappings of their own
+USUAL: dict[str, Any] = {
+    "methods": (
+        *("koap", "koap_untrained", "koap_labelled_only", "linear", "dd", "vae", "lapo", "dp", "relabel", "nonlinear"),
+        "pretrain",
+    ),
+    "labels": (0.01, 0.02, 0.05, 0.1, 0.25),
+    "first_seed_only": (),
+    "label_unit": "trajectory",
+    "demonstrations": (1.0,),
+    "seeds": 3,
+}
+_TABLE_1: dict[str, Any] = {
+    "tasks": PAPER_TASKS,
+    "methods": ("koap", "koap_paper", "koap_untrained", "linear_steps", "pca", "dd", "vae", "lapo", "dp"),
+    "labels": (),
+    "levels": (1, 2, 3, 4, 5),
+    "first_seed_only": (3, 4),
+    "label_unit": "window",
+    "planner": {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3},
+    "controller": {"steps": 1000},
+}
+PRESETS: dict[str, dict[str, Any]] = {
+    "table1": _TABLE_1,
+    "table2": _TABLE_1
+    | {
+        "tasks": ("avoiding", "stacking_unobserved_joints"),
+        "methods": (
+            *("koap", "koap_paper", "koap_sgd", "koap_labelled_only", "koap_untrained", "nonlinear", "pretrain"),
+            "relabel",
+        ),
+    },
+    "demonstrations": {
+        "tasks": ("avoiding",),
+        "methods": ("koap", "koap_paper", "koap_untrained", "pca", "linear_steps", "dd"),
+        "labels": (0.01,),
+        "demonstrations": (0.1, 0.25, 0.5, 1.0),
+        "controller": {"steps": 1000},
+    },
+    # a table that can be read, not one to be cited
+    "quick": _TABLE_1
+    | {
+        "levels": (1,),
+        "record": 48,
+        "seeds": 1,
+        "planner": _TABLE_1["planner"] | {"steps": 2000, "width": 256, "batch_size": 128},
+        "controller": {"steps": 200},
+        "evaluation": {"episodes": 10},
+    },
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +100,6 @@ class Study:
         seeds: number of seeds of label choice and training (default: 3).
         planners: finished run, or pretrained:NAME, whose planner all cells of a task share, or TASK=RUN for each;
             where none is given one is trained. It must know the same data, which nothing here can check.
-        planner_seeds: number of planners, trained with seeds 0, 1, ...; a cell of seed s has planner s modulo that.
         planner: network and training of planners, and of methods that have none but sample actions.
         controller: training of every controller.
         execution: how plans become actions.
@@ -75,7 +125,6 @@ class Study:
     demonstrations: tuple[float, ...] = ()
     seeds: int | None = None
     planners: tuple[str, ...] = ()
-    planner_seeds: int = 1
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     execution: ExecutionConfig = field(default_factory=ExecutionConfig)
@@ -106,8 +155,9 @@ class Study:
         """The run whose planner a cell takes over, None for a method without one."""
         if not get_method(cell.method).plans:
             return None
-        name = f"{cell.demonstrations:.15g}-seed{cell.seed % self.planner_seeds}"
-        return Path(self.given_planner(cell.task) or self.out / "planners" / cell.task / name)
+        return Path(
+            self.given_planner(cell.task) or self.out / f"planners/{cell.task}/{cell.demonstrations:.15g}-seed0"
+        )
 
     def cells(self) -> list[Cell]:
         """Lists the cells of a complete study in the order asked for; repeated names count once.
@@ -148,7 +198,7 @@ class Study:
             task=cell.task,
             labels=LabelConfig(trajectories=cell.demonstrations),
             planner=self.planner,
-            run=replace(self.run, seed=cell.seed % self.planner_seeds),
+            run=self.run,
         )
 
     def train_config(self, cell: Cell) -> TrainConfig:
@@ -190,7 +240,7 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     usual = USUAL | ({} if study.preset is None else lookup(PRESETS, study.preset, "preset"))
     if study.labels or study.levels:  # neither comes on top of the other
         usual |= {"labels": (), "levels": ()}
-    study = _filled_in(study, usual)
+    study = fill_in(study, usual)
     study = replace(
         study,
         out=study.out.absolute(),
@@ -198,27 +248,13 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
         tasks=study.tasks or _tasks_of(study.datasets),
         run=replace(study.run, plugins=plugins),
     )
-    for name in study.tasks:
-        study.task(name)
-    planners = {task: str(find_run(run).absolute()) for task, run in _by_task("planners", study.planners, study.tasks)}
     datasets = {task: os.path.abspath(path) for task, path in _by_task("datasets", study.datasets, study.tasks)}
-    return replace(study, planners=_named(planners), datasets=_named(datasets))
-
-
-def _named(paths: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(f"{task}={path}" for task, path in paths.items())
-
-
-def _filled_in(given: Any, usual: Mapping[str, Any]) -> Any:
-    """Options with the usual ones in place of those that are at their defaults; likewise in every section."""
-    found = {}
-    for option in fields(given):
-        value = vars(given)[option.name]
-        if isinstance(usual.get(option.name), Mapping):
-            found[option.name] = _filled_in(value, usual[option.name])
-        elif option.name in usual and value == option.default:
-            found[option.name] = usual[option.name]
-    return replace(given, **found)
+    planners = {task: find_run(run).absolute() for task, run in _by_task("planners", study.planners, study.tasks)}
+    datasets, planners = (tuple(f"{task}={path}" for task, path in to.items()) for to in (datasets, planners))
+    study = replace(study, datasets=datasets, planners=planners)
+    for name in study.tasks:
+        study.task(name)  # there must be one
+    return study
 
 
 def _tasks_of(datasets: Sequence[str]) -> tuple[str, ...]:
@@ -255,7 +291,7 @@ def check_study(study: Study) -> list[Cell]:
     Raises:
         ValueError: for unknown names, shares and numbers out of range, and methods whose networks cannot be built.
     """
-    for name, number in (("seeds", study.seeds), ("record", study.record), ("planner_seeds", study.planner_seeds)):
+    for name, number in (("seeds", study.seeds), ("record", study.record)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be >= 1, got {number}")
     if any(level < 1 for level in study.first_seed_only or ()):

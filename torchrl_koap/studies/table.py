@@ -1,73 +1,90 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The cells of a study as a file and as a table."""
+"""The cells of a study as a file, pooled over training seeds, and as a table; cells that are not done stay counted."""
 
 from __future__ import annotations
 
 import csv
 import math
+import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.files import replacing_file
-from torchrl_koap.lookup import lookup
-from torchrl_koap.studies.summary import STATUSES, Summary, cell_name, needed_when_done, percent, plural, summarise
 
-_KINDS = {
-    "task": str,
-    "method": str,
-    "labels": float,
-    "demonstrations": float,
-    "seed": int,
-    "label_unit": str,
-    "status": str,
-    "reason": str,
-    "labelled_units": int,
-    "labelled_transitions": int,
-    "trajectories_touched": int,
-    "episodes": int,
-    "successes": int,
-    "success_rate": float,
-    "success_low": float,
-    "success_high": float,
-    "mode_entropy": float,
-    "collisions": int,
-    "mean_steps": float,
-    "action_error": float,
-    "relative_action_error": float,
-    "relative_plan_error": float,
-    "kind": str,
-    "controller_updates": int,
-    "train_seconds": float,
-    "eval_seconds": float,
-    "run": str,
-}
-CELL_COLUMNS = tuple(_KINDS)
-_ALWAYS = ("task", "method", "labels", "demonstrations", "seed", "status")
-_WORDS = {int: "a whole number", float: "a finite number"}
+STATUSES = ("done", "failed", "missing")
+CELL_COLUMNS = (
+    *("task", "method", "labels", "demonstrations", "seed", "label_unit", "status", "reason"),
+    *("labelled_units", "labelled_transitions", "trajectories_touched"),
+    *("episodes", "successes", "success_rate", "success_low", "success_high", "mode_entropy", "collisions"),
+    *("mean_steps", "action_error", "relative_action_error", "relative_plan_error", "kind", "controller_updates"),
+    *("train_seconds", "eval_seconds", "run"),
+)
+_MEASURES = (
+    *("mode_entropy", "action_error", "relative_action_error", "relative_plan_error"),
+    *("labelled_transitions", "trajectories_touched", "train_seconds", "eval_seconds"),
+)
 
 
-def write_cells(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Writes cells as csv, aside first; what a row lacks, and what is not a finite number, stays empty.
+@dataclass(frozen=True)
+class Measure:
+    """A mean with its ends: of ``"success"`` the Wilson 95 % interval, of all others the least and greatest seed."""
 
-    Raises:
-        ValueError: for another column than :data:`CELL_COLUMNS`, or an unknown status.
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def text(self) -> str:
+        """A share with its ends in percent: ``50.0 % (20.0-80.0)``."""
+        return f"{percent(self.mean, 1)} ({100 * self.low:.1f}-{100 * self.high:.1f})"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All seeds of a method at one share of labels.
+
+    ``labels`` and ``demonstrations`` are shares; ``done``, ``failed`` and ``missing`` the seeds whose cell is that.
+    ``measures`` are ``"success"``, ``"seed_success"`` (worst and best seed) and those columns of numbers that some cell
+    has.
     """
-    for row in rows:
-        for name in row:
-            lookup(CELL_COLUMNS, name, "column of a cell")
-        lookup(STATUSES, row.get("status"), "status of a cell")
-    return write_csv(
-        Path(path), CELL_COLUMNS, [{name: _written(row.get(name)) for name in CELL_COLUMNS} for row in rows]
-    )
+
+    task: str
+    method: str
+    labels: float
+    demonstrations: float
+    label_unit: str
+    done: tuple[int, ...]
+    failed: tuple[int, ...]
+    missing: tuple[int, ...]
+    successes: int
+    episodes: int
+    measures: Mapping[str, Measure]
+
+    @property
+    def offline(self) -> bool:
+        """Whether cells are done and none was rolled out: a task without an environment."""
+        return bool(self.done) and not self.episodes
+
+    def mean(self, name: str) -> float | None:
+        """The mean of a measure, or ``labels`` or ``demonstrations``; None where no cell has it."""
+        if name in ("labels", "demonstrations"):
+            return self.labels if name == "labels" else self.demonstrations
+        return self.measures[name].mean if name in self.measures else None
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Writes rows as csv, aside first."""
+    """Writes rows as csv, aside first; what a row lacks, and what is not a finite number, stays empty.
+
+    Raises:
+        ValueError: for another column than those named.
+    """
     with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: _written(value) for name, value in row.items()} for row in rows)
     return path
 
 
@@ -77,69 +94,68 @@ def _written(value: Any) -> Any:
     return "" if value is None or (isinstance(value, float) and not math.isfinite(value)) else value
 
 
-def read_cells(path: str | Path) -> list[dict[str, Any]]:
-    """Reads a file of :func:`write_cells` with its types; empty numbers are None, columns may be in another order.
+def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
+    """Pools the seeds of every method and share of labels; methods and tasks keep their order, shares ascend.
+
+    The Wilson interval takes every episode for independent. The same contexts recur for every seed, so it is too narrow
+    where seeds differ more than chance: look at the range of the seeds beside it.
+
+    Cells have at least task, method, labels, seed and status.
 
     Raises:
-        ValueError: if the file is damaged; the message names it, the line and the column.
-        FileNotFoundError: if it is not there.
+        ValueError: if a cell occurs twice.
     """
-    path = Path(path)
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file, restkey="", strict=True)
-            lines = [(reader.line_num, line) for line in reader]
-            names = reader.fieldnames or []
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    for name in CELL_COLUMNS:
-        if name not in names:
-            raise ValueError(f"{path} lacks the column {name!r}")
-    rows = []
-    for number, line in lines:
-        where = f"{path}, line {number}"
-        if line.get("") is not None:
-            raise ValueError(f"{where}: more values than the {len(names)} columns")
-        row = {name: _read(line[name], name, where) for name in CELL_COLUMNS}
-        for name in _ALWAYS + (needed_when_done(row) if row["status"] == "done" else ()):
-            if row[name] in (None, ""):
-                raise ValueError(f"{where}, column {name!r}: empty")
-        rows.append(row)
-    return rows
+    groups: dict[tuple, dict[int, Mapping[str, Any]]] = {}
+    tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
+    for row in rows:
+        cells = groups.setdefault((tasks.index(row["task"]), *group_of(row), methods.index(row["method"])), {})
+        if row["seed"] in cells:
+            raise ValueError(f"the cell {cell_name(row)} occurs twice")
+        cells[row["seed"]] = row
+    return [
+        _summary(tasks[task], methods[method], labels, demonstrations, unit, groups[key])
+        for key in sorted(groups)
+        for task, unit, demonstrations, labels, method in [key]
+    ]
 
 
-def _read(text: str | None, name: str, where: str) -> Any:
-    kind = _KINDS[name]
-    if text is None:
-        raise ValueError(f"{where}, column {name!r}: the line ends before it")
-    if kind is str:
-        if name == "status" and text not in STATUSES:
-            raise ValueError(f"{where}, column 'status': expected one of {', '.join(STATUSES)}, got {text!r}")
-        return text
-    if not text:
-        return None
-    try:
-        value = kind(text)
-        if not math.isfinite(value):
-            raise ValueError
-    except ValueError:
-        raise ValueError(f"{where}, column {name!r}: expected {_WORDS[kind]}, got {text!r}") from None
-    return value
+def group_of(row: Mapping[str, Any]) -> tuple[str, float, float]:
+    """Unit of the labels, share of the demonstrations and share of the labels of a cell."""
+    demonstrations = row.get("demonstrations")
+    return row.get("label_unit") or "", 1.0 if demonstrations is None else demonstrations, row["labels"]
+
+
+def _summary(task: str, method: str, labels: float, demonstrations: float, unit: str, cells: Mapping) -> Summary:
+    seeds = {status: tuple(sorted(s for s, row in cells.items() if row["status"] == status)) for status in STATUSES}
+    done = [cells[seed] for seed in seeds["done"]]
+    rolled_out = [row for row in done if row.get("episodes")]
+    successes, episodes = (sum(row[name] for row in rolled_out) for name in ("successes", "episodes"))
+    values = {name: [row[name] for row in done if row.get(name) is not None] for name in _MEASURES}
+    finite = {name: [value for value in found if math.isfinite(value)] for name, found in values.items()}
+    measures = {name: Measure(statistics.fmean(v), min(v), max(v)) for name, v in finite.items() if v}
+    if episodes:
+        rates = [row["successes"] / row["episodes"] for row in rolled_out]
+        measures["success"] = Measure(successes / episodes, *wilson_interval(successes, episodes))
+        measures["seed_success"] = Measure(successes / episodes, min(rates), max(rates))
+    return Summary(
+        task, method, labels, demonstrations, unit, **seeds, successes=successes, episodes=episodes, measures=measures
+    )
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     """The table as text, a row per method and share of labels; columns without any value are left out."""
     units = {item.label_unit for item in summaries}
     labels = f"labels ({plural(*units)})" if len(units) == 1 and "" not in units else "labels"
-    offline = any(item.offline for item in summaries)
-    error = "action error (unit of the first column)" if offline else "action error (mm, mrad)"
+    error = "unit of the first column" if any(item.offline for item in summaries) else "mm, mrad"
     numbers = {  # heading to measure and form
         "mode entropy": ("mode_entropy", ".2f"),
         "action error (of the mean action's)": ("relative_action_error", ".3g"),
         "plan error (of standing still's)": ("relative_plan_error", ".3g"),
-        error: ("action_error", ".3g"),
+        f"action error ({error})": ("action_error", ".3g"),
         "labelled transitions": ("labelled_transitions", ",.0f"),
         "in trajectories": ("trajectories_touched", ".4g"),
+        "training (s)": ("train_seconds", ",.0f"),
+        "evaluation (s)": ("eval_seconds", ",.0f"),
     }
     rows = [
         {
@@ -147,13 +163,15 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
             labels: percent(item.labels) + (f" of {plural(item.label_unit)}" if len(units) > 1 else ""),
             "demonstrations used": percent(item.demonstrations),
             "method": item.method,
-            "success (95 %)": "–" if item.offline else _interval(item),
-            "n": "–" if item.offline else str(item.episodes),
+            **_success(item),
             "seeds": f"{len(item.done)} of {len(item.done) + len(item.failed) + len(item.missing)}",
-            "not done": _not_done(item),
-            "range of seeds": _range(item),
+            "not done": "; ".join(
+                f"{word}: seed {', '.join(map(str, seeds))}"
+                for word, seeds in (("failed", item.failed), ("missing", item.missing))
+                if seeds
+            ),
         }
-        | {head: _number(item.mean(name), form) for head, (name, form) in numbers.items()}
+        | {head: "–" if (v := item.mean(name)) is None else format(v, form) for head, (name, form) in numbers.items()}
         for item in summaries
     ]
     empty = {name for name in (rows[0] if rows else ()) if all(row[name] in ("", "–") for row in rows)}
@@ -164,23 +182,15 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     return [{name: text for name, text in row.items() if name not in empty} for row in rows]
 
 
-def _interval(item: Summary) -> str:
-    return item.measures["success"].text if "success" in item.measures else "no cell done"
-
-
-def _range(item: Summary) -> str:
-    if "seed_success" not in item.measures or len(item.done) < 2:
-        return "–"
-    return f"{100 * item.measures['seed_success'].low:.0f}-{100 * item.measures['seed_success'].high:.0f} %"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)
-
-
-def _not_done(item: Summary) -> str:
-    parts = [("failed", item.failed), ("missing", item.missing)]
-    return "; ".join(f"{word}: seed {', '.join(map(str, seeds))}" for word, seeds in parts if seeds)
+def _success(item: Summary) -> dict[str, str]:
+    """Success with its interval, number of rollouts, worst and best seed."""
+    if item.offline:
+        return {"success (95 %)": "–", "n": "–", "range of seeds": "–"}
+    text, spread = "no cell done", "–"
+    if "success" in item.measures:
+        text, seeds = item.measures["success"].text, item.measures["seed_success"]
+        spread = f"{100 * seeds.low:.0f}-{100 * seeds.high:.0f} %" if len(item.done) > 1 else "–"
+    return {"success (95 %)": text, "n": str(item.episodes), "range of seeds": spread}
 
 
 def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
@@ -196,16 +206,43 @@ def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The pooled table of all cells in markdown, and below it every cell that is not done with its reason."""
-    text = as_markdown(table_rows(summarise(rows)))
-    open_cells = [row for row in rows if row["status"] != "done"]
-    if open_cells:
-        verb = "is" if len(open_cells) == 1 else "are"
-        text += f"\n{len(open_cells)} of {len(rows)} cells {verb} not done:\n\n"
-        text += "".join(f"- {cell_name(row)}: {why_not_done(row)}\n" for row in open_cells)
+    text, left = as_markdown(table_rows(summarise(rows))), not_done(rows)
+    if left:
+        verb = "is" if len(left) == 1 else "are"
+        text += f"\n{len(left)} of {len(rows)} cells {verb} not done:\n\n" + "".join(f"- {line}\n" for line in left)
     return text
 
 
-def why_not_done(row: Mapping[str, Any]) -> str:
-    """Status of a cell and the reason of its failure, in one line."""
-    reason = " ".join((row.get("reason") or "").split())
-    return f"{row['status']}: {reason}" if reason else row["status"]
+def not_done(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line per cell that is not done, with the reason of its failure."""
+    left = [row for row in rows if row["status"] != "done"]
+    reasons = [" ".join((row.get("reason") or "").split()) for row in left]
+    return [
+        f"{cell_name(row)}: {row['status']}" + (f": {reason}" if reason else "")
+        for row, reason in zip(left, reasons, strict=True)
+    ]
+
+
+def cell_name(row: Mapping[str, Any]) -> str:
+    """A cell in words: ``avoiding, koap, 2 % labels, seed 1``."""
+    demonstrations = row.get("demonstrations")
+    used = "" if demonstrations in (None, 1.0) else f"{percent(demonstrations)} of the demonstrations, "
+    return f"{row['task']}, {row['method']}, {percent(row['labels'])} labels, {used}seed {row['seed']}"
+
+
+def percent(share: float | None, digits: int | None = None) -> str:
+    """A share in percent, with as few digits as it has if ``digits`` is not given; None gives a dash.
+
+    Examples:
+        >>> from torchrl_koap.studies.table import percent
+        >>> percent(0.02), percent(0.005), percent(2 / 3, 1), percent(None)
+        ('2 %', '0.5 %', '66.7 %', '–')
+    """
+    if share is None:
+        return "–"
+    return f"{100 * share:.6g} %" if digits is None else f"{100 * share:.{digits}f} %"
+
+
+def plural(unit: str) -> str:
+    """What the labels are counted in, in words; "" is any unit."""
+    return {"trajectory": "trajectories", "": "labels"}.get(unit, f"{unit}s")
