@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import io
 import re
-from typing import Any, get_args
+from typing import Any
 
-import tyro
 from pages import code, heading, table, toctree, write_page
 
-from torchrl_koap.commands.subcommands import Subcommand
+from torchrl_koap.commands.options import parse
+from torchrl_koap.commands.subcommands import GROUPS, Subcommand, described
 
 
 def setup(app: Any) -> dict[str, Any]:
@@ -23,39 +22,28 @@ def setup(app: Any) -> dict[str, Any]:
 
 def write_command_pages() -> None:
     """Writes ``generated/commands``: an index and a page per command."""
-    commands = {kind.__name__.lower(): kind for kind in get_args(Subcommand)}
-    for name, kind in commands.items():
-        write_page(
-            f"commands/{name}",
-            heading(f"koap {name}"),
-            summary(kind),
-            code(help_of(name), "text"),
-        )
+    rows, names = [], []
+    for group, commands in GROUPS.items():
+        for kind in commands:
+            name, (about, example) = kind.__name__.lower(), described(kind)
+            names.append(name)
+            rows.append((group, f":doc:`{name}`", about, f"``{example}``"))
+            words = ("--help-all",) if name == "train" else ("--help",)
+            write_page(f"commands/{name}", heading(f"koap {name}"), about, code(help_of(name, *words), "text"))
     write_page(
         "commands/index",
         heading("Every command and option"),
-        "What ``koap COMMAND --help`` prints, but for defaults that are ``None``. Fields of a configuration in Python "
+        "What ``koap COMMAND --help`` prints. Fields of a configuration in Python "
         "have the same names, with underscores, as in :class:`~torchrl_koap.runs.config.TrainConfig`.",
-        table(("command", "what it does"), [(f":doc:`{name}`", summary(kind)) for name, kind in commands.items()]),
-        toctree(commands, hidden=True),
+        table(("group", "command", "what it does", "example"), rows),
+        toctree(names, hidden=True),
     )
 
 
-def summary(kind: type) -> str:
-    """First paragraph of its docstring."""
-    return " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split())
-
-
-def help_of(name: str) -> str:
-    """What ``--help`` prints, without colours and frames."""
+def help_of(*words: str) -> str:
+    """What a help prints, without colours and lines."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        tyro.cli(Subcommand, args=[name, "--help"], prog="koap")
-    text = re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue())
-    lines = [line.strip("│").rstrip() for line in text.splitlines()]
-    lines = [re.sub(r"^[╭╰]─+\s?|\s?─*[╮╯]$", "", line) for line in lines]
-    text = "\n".join(line for line in lines if line.strip("─ ") or not line)
-    text = re.sub(r"\{None\}\|(?:\{(\[.*?\])\}|(\S+))", r"\1\2", text)
-    # what stood beside a shorter name goes back to its column
-    text = re.sub(r"^(  --\S+ \S+) +(?=\S)", lambda found: f"{found[1]:<27}", text, flags=re.MULTILINE)
-    return re.sub(r"\s*\(default:\s+None\)", "", text)
+        parse(Subcommand, words)
+    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line).rstrip() for line in out.getvalue().splitlines()]
+    return "\n".join(line for line in lines if line.strip("- ") or not line)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import socket
 import subprocess
 import sys
@@ -17,6 +18,8 @@ from tiny_runs import TINY, koap
 
 import torchrl_koap
 from torchrl_koap.commands.cli import HINT
+from torchrl_koap.commands.options import FIRST, parse
+from torchrl_koap.commands.subcommands import GROUPS, Subcommand
 from torchrl_koap.runs.run_directory import RunDirectory
 
 
@@ -37,6 +40,43 @@ def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
     assert left.value.code == 2
     out, err = capsys.readouterr()
     assert hint in err and "Traceback" not in err and out == ""
+
+
+def help_of(capsys, *words):
+    with pytest.raises(SystemExit) as left:
+        koap(*words)
+    assert left.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_commands_are_listed_in_groups_each_with_an_example_that_parses(capsys):
+    assert koap("--help") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if re.fullmatch(r"\w+:", line)] == [f"{name}:" for name in GROUPS]
+    assert max(map(len, lines)) <= 80
+    examples = [line.split("$ koap ")[1].split() for line in lines if "$ koap " in line]
+    assert [words[0] for words in examples] == [kind.__name__.lower() for group in GROUPS.values() for kind in group]
+    for words in examples:
+        assert type(parse(Subcommand, words)).__name__.lower() == words[0]
+
+
+def test_twelve_options_of_a_training_come_first_and_all_on_request(capsys):
+    first, every = help_of(capsys, "train", "--help"), help_of(capsys, "train", "--help-all")
+    assert len(re.findall(r"^.? ?--\w", first, re.MULTILINE)) == 12 and "--help-all" in first
+    assert "--planner.width N" in every and "planner options" in every and "--planner.width" not in first
+    for name in FIRST.keys() - {"labels", "config"}:
+        assert f"--{name}" in every
+
+
+@pytest.mark.parametrize("command", [kind.__name__.lower() for group in GROUPS.values() for kind in group])
+def test_every_default_is_shown_once_and_where_it_says_something(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = help_of(capsys, command, "--help-all" if command == "train" else "--help")
+    assert not re.findall(r"\{None\}|default: None|default: False|default: \)|--no-quiet|\[\w+ \[", text)
+    for option in re.split(r"\n.? ?(?=--)", text)[1:]:
+        assert option.count("(default") <= 1, option
+    assert f"Example: `koap {command} " in text
+    assert max(map(len, text.splitlines()[1:])) <= 80
 
 
 def test_as_a_program():

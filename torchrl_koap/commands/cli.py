@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
@@ -31,7 +31,6 @@ from torchrl_koap.commands.shell import (
 
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
-DESCRIPTION = "Imitation learning with few action labels. `koap --version` prints the version."
 HINT = "KOAP_TRACEBACK=1 shows where"
 _LONG = ("episode", "action_errors")  # entries of a result that are not printed
 _MAY_BE_EMPTY = ("--action-units", "--state-units")  # the unit of a number without one
@@ -72,10 +71,13 @@ def _run(arguments: Sequence[str]) -> int:
             print(f"koap {__version__}")
         return 0
     _check_words(arguments)
-    tyro, subcommand, check_options, without_progress_bars = _commands()
+    options, subcommands, without_progress_bars = _commands()
     with written_output(), wide_enough():
-        command = _parsed(tyro, subcommand, arguments)
-    check_options(command)
+        if arguments[:1] in (["-h"], ["--help"]):
+            print(subcommands.overview())
+            return 0
+        command = _parsed(options.parse, subcommands.Subcommand, arguments)
+    options.check_options(command)
     with without_progress_bars() if command.quiet else nullcontext():
         result = command()
     if not command.quiet:
@@ -84,24 +86,18 @@ def _run(arguments: Sequence[str]) -> int:
     return 1 if isinstance(result, Mapping) and result.get("failed") else 0
 
 
-def _parsed(tyro: Any, kind: Any, arguments: Sequence[str]) -> Any:
+def _parsed(parse: Callable[..., Any], kind: Any, arguments: Sequence[str]) -> Any:
     """The command; what one of our own checks refuses is raised as it is, what tyro refuses leaves with 2."""
-    if arguments[:1] == ["train"]:
-        from torchrl_koap.commands.options import expand, show_help
-
-        if {"-h", "--help"} & set(arguments):
-            show_help()
-        arguments = ["train", *expand(arguments[1:])]
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # its words for what our own checks say
-            return tyro.cli(kind, args=arguments, prog="koap", description=DESCRIPTION, console_outputs=False)
+            return parse(kind, arguments, console_outputs=False)
     except SystemExit as left:
         error = left.__context__
         while error is not None:
             if isinstance(error, ValueError) and _is_ours(error):
                 raise error from None
             error = error.__cause__ or error.__context__
-    return tyro.cli(kind, args=arguments, prog="koap", description=DESCRIPTION)
+    return parse(kind, arguments)
 
 
 def _is_ours(error: BaseException) -> bool:
@@ -131,10 +127,7 @@ def _commands() -> tuple[Any, ...]:
     loaded = "torchrl_koap.commands.subcommands" in sys.modules
     with nullcontext() if loaded else ending_at_once():
         try:
-            import tyro
-
-            from torchrl_koap.commands.options import check_options
-            from torchrl_koap.commands.subcommands import Subcommand
+            from torchrl_koap.commands import options, subcommands
             from torchrl_koap.runs.progress import without_progress_bars
         except (ImportError, AttributeError) as error:
             graphics = os.environ.get("MUJOCO_GL")
@@ -145,7 +138,7 @@ def _commands() -> tuple[Any, ...]:
             if backend and backend in str(error):
                 raise ValueError(f"MPLBACKEND={backend} is no backend of matplotlib; unset it") from error
             raise
-    return tyro, Subcommand, check_options, without_progress_bars
+    return options, subcommands, without_progress_bars
 
 
 def _is_expected(error: Exception) -> bool:

@@ -42,7 +42,9 @@ _ONE_FOR_ALL = ("action_kind", "action_units", "state_units")
 class Demos(Command):
     """Record scripted demonstrations.
 
-    Every demonstration is written as it comes (OUT/unfinished); the same command goes on with an interrupted recording.
+    The same command goes on with an interrupted recording (OUT/unfinished).
+
+    Example: `koap demos --task avoiding --out demos`
 
     Attributes:
         out: folder to write, for `koap train --dataset`. Must not hold demonstrations yet.
@@ -113,7 +115,11 @@ class Demos(Command):
 
 @dataclass(kw_only=True)
 class Convert(Command):
-    """Turn recordings of any robot, of which few or none have actions, into a data set that holds its whole task.
+    """Turn recordings of any robot, few with actions, into a data set.
+
+    It holds the whole task of the robot.
+
+    Example: `koap convert recordings --out arm --control-hz 30`
 
     Attributes:
         source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout,
@@ -220,7 +226,11 @@ class Convert(Command):
 
 @dataclass(kw_only=True)
 class Validate(Command):
-    """Check a folder of demonstrations and report every problem found, and what is right in form but unlikely.
+    """Report every problem of a folder of demonstrations.
+
+    Warnings name what is right in form but unlikely.
+
+    Example: `koap validate arm`
 
     Attributes:
         dataset: folder written by `koap demos`, `koap convert` or save_demonstrations, or of D3IL's raw pickles.

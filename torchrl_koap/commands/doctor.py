@@ -28,7 +28,9 @@ _LATER = ("eval.json", "inspect.json", "suggestions.json")  # files that a run m
 
 @dataclass(kw_only=True)
 class Doctor(Command):
-    """Print versions, processors, graphics and optional packages, or check every file of a run.
+    """Show versions and hardware, or check every file of a run.
+
+    Example: `koap doctor runs/arm`
 
     Attributes:
         run: run directory of `koap train` to check instead of this machine.

@@ -20,9 +20,11 @@ from torchrl_koap.vision.projection import load_encoder, projection_of
 
 @dataclass(kw_only=True)
 class Embed(Command):
-    """Embed the frames of `koap demos --embodiment` with a frozen network, for `koap train --dataset`.
+    """Embed camera frames with a frozen network.
 
-    Nothing is downloaded.
+    Frames are those of `koap demos --embodiment`. Nothing is downloaded.
+
+    Example: `koap embed videos --out embedded`
 
     Attributes:
         sources: folders of demonstrations, in the order in which the data set has them.

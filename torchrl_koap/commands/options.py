@@ -1,19 +1,26 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all commands have in common: their base class, what no option can mean, and short names of `koap train`'s."""
+"""What all commands have in common: their base class, how options are read and explained, what none can mean."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
+from tyro.constructors import (
+    MISSING_NONPROP,
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
 from torchrl_koap.files import read_bytes
 from torchrl_koap.runs.config import TrainConfig
@@ -24,24 +31,30 @@ LARGEST = 2**53  # beyond it a number is not even counted exactly
 Config = TypeVar("Config")
 # the fields of a configuration are options of the command itself: `--steps`, not `--config.steps`
 Options = Annotated[Config, tyro.conf.arg(name="")]
-# short names of the options that most calls need: option, what follows, help
-SHORT: dict[str, tuple[str, str, str]] = {
-    "--dataset": ("--dataset", "DIR", "folder with demonstrations, such as `koap demos --out DIR` records"),
-    "--out": ("--out", "DIR", "run directory to write"),
-    "--task": ("--task", "NAME", "name of the task (default: that of the data set)"),
-    "--method": ("--method", "NAME", "koap, linear, dd, dp, mpc, ... (default: the task's)"),
-    "--labels": ("--labels", "NUMBER", "labels that may be seen: 5 trajectories, or 0.02 of them (default: all)"),
-    "--preset": ("--controller.preset", "NAME", "variant of KOAP: default, semi_supervised or paper"),
-    "--steps": ("--planner.steps", "N", "updates of the planner (default: the task's)"),
-    "--strategy": ("--execution.strategy", "NAME", "how plans become actions: feedback or open_loop"),
-    "--seed": ("--run.seed", "N", "of label choice, initialisation and batches"),
-    "--device": ("--run.device", "NAME", "cpu or cuda"),
-    "--threads": ("--run.threads", "N", "torch threads"),
-    "--resume": ("--run.resume", "", "go on with an interrupted run"),
-    "--logger": ("--run.logger", "NAME", "csv, wandb or tensorboard"),
-    "--plugin": ("--run.plugin", "NAME", "module that registers tasks or methods"),
-    "--config": ("--config", "FILE", "JSON file of options in the same sections; options of the call win"),
+# short names of the options of `koap train` that are in a section
+SHORT = {
+    "--preset": "controller.preset",
+    "--steps": "planner.steps",
+    "--strategy": "execution.strategy",
+    **{f"--{name}": f"run.{name}" for name in ("seed", "device", "threads", "resume", "logger")},
+    "--plugin": "run.plugins",
 }
+# what `koap train --help` shows
+FIRST = {
+    "out": (Path, "run directory to write."),
+    "dataset": (Path, "folder with demonstrations, such as `koap demos` or `koap convert` write."),
+    "task": (str, "name of the task (default: that of the data set)."),
+    "method": (str, "koap, linear, dd, dp, mpc, ... (default: the task's)."),
+    "labels": (float, "labels that may be seen: 5 trajectories, or 0.02 of them (default: all)."),
+    "preset": (str, "variant of KOAP: default, semi_supervised or paper (default: the task's)."),
+    "steps": (int, "updates of the planner at most (default: the task's)."),
+    "seed": (int, "seed of label choice, initialisation and batches (default: 0)."),
+    "device": (str, "cpu or cuda (default: cpu)."),
+    "threads": (int, "torch threads (default: 1)."),
+    "resume": (bool, "go on with an interrupted run."),
+    "config": (Path, "JSON file of options, in the sections of `--help-all`; options of the call win."),
+}
+_PLACEHOLDERS = {int: "N", float: "NUMBER", str: "NAME", Path: "PATH"}
 
 
 @dataclass(kw_only=True)
@@ -86,7 +99,7 @@ def _check_folder(path: Path, option: str) -> None:
 
 
 def expand(words: Sequence[str]) -> list[str]:
-    """Replaces short options by those that they stand for, and ``--config FILE`` by the options in the file.
+    """Replaces ``--labels NUMBER`` by the option of its kind, and ``--config FILE`` by the options in the file.
 
     Raises:
         RunDirectoryError: if the file is not there, or holds other things than options.
@@ -94,27 +107,22 @@ def expand(words: Sequence[str]) -> list[str]:
 
     Examples:
         >>> from torchrl_koap.commands.options import expand
-        >>> expand(["--steps", "20", "--labels", "0.02", "--seed=3"])
-        ['--planner.steps', '20', '--labels.fraction', '0.02', '--run.seed=3']
+        >>> expand(["--steps", "20", "--labels", "0.02"])
+        ['--steps', '20', '--labels.fraction', '0.02']
     """
     found: list[str] = []
     from_file: list[str] = []
     rest = iter(words)
     for word in rest:
         name, equals, value = word.partition("=")
-        name = name.replace("_", "-")
         if name == "--help-all":
             found.append("--help")
-        elif name == "--no-resume":
-            found.append("--run.no-resume")
         elif name in ("--labels", "--config"):
             value = value if equals else next(rest, "")
             if name == "--config":
                 from_file += _words_of(Path(value), {"labels"} if "--labels" in words else set())
             else:
                 found += [f"--labels.{_kind_of(value)}", value]
-        elif name in SHORT:
-            found.append(SHORT[name][0] + equals + value)
         else:
             found.append(word)
     return [*from_file, *found]
@@ -147,7 +155,7 @@ def _flat(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{name}.")
         elif isinstance(value, bool):
-            yield f"{prefix}{name}" if value else f"{prefix}no-{name}"
+            yield from (f"{prefix}{name}",) if value else ()
         elif isinstance(value, list):
             if name == "plugins":
                 yield from (word for plugin in value for word in (f"{prefix}plugin", plugin))
@@ -157,16 +165,71 @@ def _flat(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
             yield from (f"{prefix}{name}", str(value))
 
 
-def show_help() -> None:
-    """Prints the options that most calls need, and leaves."""
-    page = argparse.ArgumentParser(
-        prog="koap train",
-        usage="koap train --dataset DIR --out DIR [options]",
-        description="Train planner and controller on demonstrations of which few have action labels. `koap train"
-        " --help-all` shows every option, by section.",
+def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
+    """Makes a command of the words of a call; ``--help`` among them prints its options and leaves.
+
+    Args:
+        kind (type): a dataclass, or a union of those that the first word chooses from.
+        arguments (sequence of str): the words.
+        how: what else :func:`tyro.cli` takes.
+
+    Raises:
+        SystemExit: with 2 for a wrong call, after a message on stderr; with 0 after a help.
+    """
+    arguments, short = list(arguments), dict[Any, str]()
+    if arguments[:1] == ["train"] and {"-h", "--help"} & set(arguments):
+        about = "Train planner and controller. `koap train --help-all` shows every option."
+        kind, arguments, how = _first_page(), ["--help"], how | {"prog": "koap train", "description": about}
+    elif arguments[:1] == ["train"]:
+        sections = get_type_hints(TrainConfig)
+        short = {(sections[path.split(".")[0]], path.split(".")[1]): option for option, path in SHORT.items()}
+        arguments = ["train", *expand(arguments[1:])]
+    registry = ConstructorRegistry()
+    registry.struct_rule(partial(_described, short, []))
+    return tyro.cli(kind, args=arguments, registry=registry, **({"prog": "koap"} | how))
+
+
+def _first_page() -> type:
+    """A dataclass of the options that most calls need."""
+    options: list[Any] = []
+    for name, (kind, about) in FIRST.items():
+        default = [] if name == "out" else [False if kind is bool else None]
+        options.append(
+            (name, Annotated[kind | None if default == [None] else kind, tyro.conf.arg(help=about)], *default)
+        )
+    return make_dataclass("Train", options, kw_only=True)
+
+
+def _described(short: Mapping[Any, str], inside: list[Any], info: StructTypeInfo) -> StructConstructorSpec | None:
+    """What tyro makes of a dataclass, but plain placeholders, short names, and only defaults that say something."""
+    if inside or not is_dataclass(info.type):
+        return None
+    inside.append(info)  # the question goes to tyro's own rules
+    spec: Any = ConstructorRegistry.get_struct_spec(info)
+    inside.clear()
+    return replace(spec, fields=tuple(_option(each, short.get((info.type, each.name))) for each in spec.fields))
+
+
+def _option(spec: StructFieldSpec, short: str | None) -> StructFieldSpec:
+    kind: Any = spec.type
+    base, *rest = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+    name = spec.name.upper() if spec.default in (tyro.MISSING, MISSING_NONPROP) else f"[{spec.name.upper()}]"
+    about = tyro.conf.arg(
+        metavar=_placeholder(base, name if tyro.conf.Positional in rest else None),
+        help_behavior_hint=None if tyro.conf.UseAppendAction in rest else _default,
+        aliases=[short] if short else None,
     )
-    for name, (_, kind, about) in SHORT.items():
-        options: dict[str, Any] = {"metavar": kind} if kind else {"action": "store_true"}
-        page.add_argument(name, help=about, **options)
-    page.print_help()
-    sys.exit(0)
+    flag = [tyro.conf.FlagCreatePairsOff] if spec.default is False else []
+    return replace(spec, type=Annotated[(base, about, *flag, *rest)])
+
+
+def _placeholder(kind: Any, name: str | None) -> str | None:
+    """N, NAME, ... or the given name; with dots where several follow."""
+    inner = [part for part in get_args(kind) if part is not type(None)]
+    if get_origin(kind) is tuple:
+        return f"{_placeholder(inner[0], name)} ..."
+    return _placeholder(inner[0], name) if inner else name or _PLACEHOLDERS.get(kind)
+
+
+def _default(value: str) -> str:
+    return "" if value in ("None", "False", "") else f"(default: {value})"

@@ -38,7 +38,9 @@ from torchrl_koap.training import TrainConfig, Trained, train
 
 @dataclass(kw_only=True)
 class Train(Command):
-    """Train planner and controller on demonstrations of which few have action labels.
+    """Train planner and controller from few action labels.
+
+    Example: `koap train --dataset arm --out runs/arm --labels 5`
 
     Attributes:
         config: all options.
@@ -53,7 +55,11 @@ class Train(Command):
 
 @dataclass(kw_only=True)
 class Eval(Command):
-    """Evaluate a trained run, in closed loop or, without an environment, on recorded data, and write its report.
+    """Evaluate a run by rollouts or on recorded data; write its report.
+
+    `--strategy` to `--limits` are those of the training unless given.
+
+    Example: `koap eval runs/arm`
 
     Attributes:
         run: run directory of `koap train`, or pretrained:NAME, a trained policy of the repository.
@@ -86,7 +92,11 @@ class Eval(Command):
 
 @dataclass(kw_only=True)
 class Inspect(Command):
-    """Find out which part of a trained run fails, and what its latent actions hold.
+    """Find out which part of a run fails and what latent actions hold.
+
+    `--strategy` to `--limits` are those of the training unless given.
+
+    Example: `koap inspect runs/arm`
 
     Attributes:
         run: run directory of `koap train`, or pretrained:NAME.
@@ -108,7 +118,11 @@ class Inspect(Command):
 
 @dataclass(kw_only=True)
 class Suggest(Command):
-    """Say which unlabelled demonstrations of a trained run to label next; no label outside the budget is read.
+    """Say which unlabelled demonstrations to label next.
+
+    No label outside the budget of the run is read.
+
+    Example: `koap suggest runs/arm`
 
     Attributes:
         run: run directory of `koap train`.
@@ -127,7 +141,9 @@ class Suggest(Command):
 
 @dataclass(kw_only=True)
 class Latency(Command):
-    """Run a control loop in real time with a trained policy and count the steps that come too late.
+    """Count the steps of a control loop in real time that come too late.
+
+    Example: `koap latency runs/arm`
 
     Attributes:
         run: run directory of `koap train`, or pretrained:NAME.
@@ -144,7 +160,11 @@ class Latency(Command):
 
 @dataclass(kw_only=True)
 class Export(Command):
-    """Write the whole policy, its controller and its denoiser, and compare each with the original (1e-5).
+    """Write a policy for torch.export, ONNX Runtime or AOTInductor.
+
+    Policy, controller and denoiser are compared with the originals (1e-5).
+
+    Example: `koap export runs/arm --format onnx`
 
     Attributes:
         run: run directory of `koap train`, or pretrained:NAME.
@@ -186,7 +206,11 @@ class Export(Command):
 
 @dataclass(kw_only=True)
 class Curve(Command):
-    """Measure success against the number of labels: tasks x methods x shares of labels x seeds.
+    """Measure success against the number of labels.
+
+    A study has tasks x methods x shares of labels x seeds.
+
+    Example: `koap curve --tasks avoiding --labels 0.02 0.1 --out curve`
 
     Attributes:
         config: all options.
@@ -204,7 +228,11 @@ class Curve(Command):
 
 @dataclass(kw_only=True)
 class Bench(Curve):
-    """Reproduce a table of the paper: `koap curve --preset table1` by another name.
+    """Reproduce a table of the paper.
+
+    Short for `koap curve --preset table1` or `table2`.
+
+    Example: `koap bench --table 1 --out bench`
 
     Attributes:
         table: 1 (methods) or 2 (variants).

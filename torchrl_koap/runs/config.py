@@ -184,9 +184,9 @@ class TrainConfig:
             "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or another name in
             torchrl_koap.training.methods.METHODS, those that plugins register included (default: the task's).
         labels: which labels may be seen.
-        planner: its network and training.
-        controller: its variant and training.
-        execution: how plans become actions.
+        planner: its network and training (default: the task's).
+        controller: its variant and training (default: the method's).
+        execution: how plans become actions (default: the task's).
         run: seed, machine, log.
 
     Examples:
