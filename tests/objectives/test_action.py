@@ -14,7 +14,7 @@ from torchrl_koap.objectives import ActionLoss, KOAPLoss
 
 def make_loss(seed=0, **options):
     torch.manual_seed(seed)
-    network = SupervisedInverseDynamics(3, 2, hidden_dims=(16,), num_past=1, **normalizers())
+    network = SupervisedInverseDynamics(3, 2, num_past=1, **normalizers())
     return ActionLoss(network, **options)
 
 

@@ -11,7 +11,7 @@ from torchrl_koap.data import LabelBudget, cut_windows, flatten_trajectories, se
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, ridge
 from torchrl_koap.training.closed_form import fit_closed_form
 
-MODULES = ("koopman.inverse_dynamics", "baselines.linear", "baselines.principal")
+MODULES = ("koopman.inverse_dynamics", "baselines.regression")
 LENGTHS = (25, 18, 31, 40, 22)
 CONTROLLERS = [("koap", "default"), ("koap", "paper"), ("koap", "absolute"), ("linear", "default")]
 

@@ -1,12 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
-from torchrl_koap.modules.baselines.linear import LinearInverseDynamics
-from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
-from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
-from torchrl_koap.modules.baselines.quantized import FiniteScalarQuantizer, QuantizedInverseDynamics
-from torchrl_koap.modules.baselines.supervised import SupervisedInverseDynamics
-from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
+from torchrl_koap.modules.baselines.latents import (
+    FiniteScalarQuantizer,
+    QuantizedInverseDynamics,
+    VariationalInverseDynamics,
+)
+from torchrl_koap.modules.baselines.networks import NonlinearInverseDynamics, SupervisedInverseDynamics
+from torchrl_koap.modules.baselines.regression import LinearInverseDynamics, PrincipalInverseDynamics
 from torchrl_koap.modules.execution.agent import Agent
 from torchrl_koap.modules.execution.asynchronous import AsynchronousAgent
 from torchrl_koap.modules.execution.command_decoder import CommandDecoder, CommandRegression

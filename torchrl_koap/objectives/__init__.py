@@ -9,8 +9,7 @@ from torchrl_koap.objectives.koap import (
     KoopmanReconstructionLoss,
     LatentActionLoss,
 )
-from torchrl_koap.objectives.quantized import QuantizedDynamicsLoss
-from torchrl_koap.objectives.variational import VariationalLoss
+from torchrl_koap.objectives.latents import QuantizedDynamicsLoss, VariationalLoss
 
 __all__ = [
     "ActionLoss",

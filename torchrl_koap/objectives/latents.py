@@ -1,10 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-r"""The loss of the variational auto-encoder of windows.
-
-.. math::
-    L = \overline{|g_\psi(u_t) - s_t|^2} + \beta \, \overline{D_{KL}(q(u_t \mid x_{0:T}) \,\|\, N(0, 1))},
-    \qquad u_t = \mu_t + \sigma_t \epsilon
-"""
+"""Losses that teach latents without labels: of latent action policies (LAPO), and of the auto-encoder of windows."""
 
 from __future__ import annotations
 
@@ -15,12 +10,49 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 
-from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
+from torchrl_koap.modules.baselines.latents import QuantizedInverseDynamics, VariationalInverseDynamics
 from torchrl_koap.objectives.base import WindowLoss
 
 
+class QuantizedDynamicsLoss(WindowLoss):
+    r"""Computes the error of the next step, predicted from the past and the code of the transition, ``loss_dynamics``.
+
+    .. math::
+        L = \overline{|h_\psi(x_{t-n}, \dots, x_t, u_t) - (x_{t+1} - x_t)|^2}
+
+    No label is read: actions are decoded by :class:`~torchrl_koap.objectives.ActionLoss`, afterwards. Args as for
+    :class:`~torchrl_koap.objectives.base.WindowLoss`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import QuantizedInverseDynamics
+        >>> from torchrl_koap.objectives import QuantizedDynamicsLoss
+        >>> loss = QuantizedDynamicsLoss(QuantizedInverseDynamics(2, 2))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_dynamics"].shape
+        torch.Size([])
+    """
+
+    network: QuantizedInverseDynamics
+    out_keys = ["loss_dynamics"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the loss from ``state``."""
+        state, recorded = self._inputs(tensordict)
+        span = self.network.valid_frames(state.shape[-2])
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            predicted, step = self.network.predict_step(state, span)
+            error = (predicted - step).square().mean(-1)
+        return TensorDict({"loss_dynamics": self._reduce(error, recorded[..., span.start : span.stop])})
+
+
 class VariationalLoss(WindowLoss):
-    """Computes the error of what frames read, reconstructed from sampled latents, and the divergence of the latents.
+    r"""Computes the error of what frames read, reconstructed from sampled latents, and the divergence of the latents.
+
+    .. math::
+        L = \overline{|g_\psi(u_t) - s_t|^2} + \beta \, \overline{D_{KL}(q(u_t \mid x_{0:T}) \,\|\, N(0, 1))},
+        \qquad u_t = \mu_t + \sigma_t \epsilon
 
     The squared error is averaged over the entries of a reconstruction, at unit scale; the divergence is summed over
     those of a latent. No label is read: :class:`~torchrl_koap.objectives.ActionLoss` fits the action decoder.

@@ -1,9 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""KOAP with nonlinear maps: plain loops, which term trains what, learning."""
+"""The supervised perceptron, and KOAP with nonlinear maps: frames read, plain loops, which term trains what."""
 
 from __future__ import annotations
 
-import pytest
 import torch
 from inverse_dynamics_test_base import (
     ACTION,
@@ -14,18 +13,25 @@ from inverse_dynamics_test_base import (
     partly_labelled,
     reached,
 )
-from tensordict import TensorDict
 
-from torchrl_koap.modules import NonlinearInverseDynamics
+from torchrl_koap.modules import NonlinearInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.objectives import KOAPLoss
 
 SPAN = range(2, 6)
 
 
+class TestSupervisedInverseDynamics(InverseDynamicsTestBase):
+    reads = (-2, -1, 0, 1, 3)
+    latent = False
+
+    def make_network(self, seed=0, **options):
+        torch.manual_seed(seed)
+        return SupervisedInverseDynamics(3, 2, num_past=2, look_ahead=(1, 3), **normalizers(), **options)
+
+
 def make_network(seed=0, **options):
     torch.manual_seed(seed)
-    sizes = {"latent_dim": 6, "hidden_dims": (16,), "lifting_dims": (12,), "num_past": 2, "look_ahead": (2, 3)}
-    return NonlinearInverseDynamics(3, 2, **sizes, **normalizers(), **options)
+    return NonlinearInverseDynamics(3, 2, num_past=2, look_ahead=(2, 3), **normalizers(), **options)
 
 
 class TestNonlinearInverseDynamics(InverseDynamicsTestBase):
@@ -75,34 +81,3 @@ def test_one_term_trains_only_what_it_should():
         "loss_koopman": {"lifting", "latent_action", "dynamics"},
         "loss_action": {"latent_action", "action_decoder"},
     }
-
-
-def test_the_successor_may_not_be_read():
-    with pytest.raises(ValueError, match="look_ahead offsets must be >= 2"):
-        NonlinearInverseDynamics(3, 2, look_ahead=(1, 2))
-
-
-def test_it_learns_curved_actions_from_some_labels_beside_unlabelled_windows():
-    """Actions that bend with the step: a = v + v^2 / 2 for paths of random constant velocity v."""
-    generator = torch.Generator().manual_seed(0)
-    velocity = torch.randn(1280, 1, 2, generator=generator)
-    state = torch.randn(1280, 1, 2, generator=generator) + 0.1 * velocity * torch.arange(8.0)[:, None]
-    action = (velocity + velocity.square() / 2).expand(-1, 8, -1).clone()
-    data = TensorDict({"state": state, "action": action}, [1280])
-    data["has_action"] = torch.zeros(1280, 8, 1, dtype=torch.bool)
-    data["has_action"][:128] = True
-    torch.manual_seed(0)
-    network = NonlinearInverseDynamics(2, 2, latent_dim=8, hidden_dims=(64, 64), num_past=1, look_ahead=(2, 3))
-    network.prepare(data["state"][:1024])
-    loss, unseen = KOAPLoss(network), data[1024:]
-    before = loss(unseen)
-    optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
-    for _ in range(250):
-        sum(loss(data[torch.randint(1024, (64,), generator=generator)]).values()).backward()
-        optimizer.step()
-        optimizer.zero_grad()
-    after = loss(unseen)
-    for key in ("loss_reconstruction", "loss_koopman"):
-        assert after[key] < 0.2 * before[key], (key, before[key], after[key])
-    error = (network(unseen.select("state"))["action"] - unseen["action"])[:, 1:5].square().mean()
-    assert error < 0.1, error  # the mean action has error 1.5, the best linear map of the step 0.5

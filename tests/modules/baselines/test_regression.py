@@ -1,14 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Ridge regression on raw frames: exact on a linear system, aligned in time, blind to hidden labels."""
+"""Ridge regressions: exact on a linear system, blind to hidden labels; components of windows, and their number."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from inverse_dynamics_test_base import InverseDynamicsTestBase, normalizers
+from inverse_dynamics_test_base import InverseDynamicsTestBase, normalizers, partly_labelled
 from tensordict import TensorDict
 
-from torchrl_koap.modules import LinearInverseDynamics
+from torchrl_koap.modules import LinearInverseDynamics, PrincipalInverseDynamics
 
 
 class TestLinearInverseDynamics(InverseDynamicsTestBase):
@@ -56,20 +56,6 @@ def test_ridge_reads_no_action_outside_the_mask():
         models[0].fit_labels(windows, torch.zeros_like(mask))
 
 
-def test_groups_are_left_out_together():
-    """With the same action all over a group, leaving out single steps looks better than leaving out the group."""
-    generator = torch.Generator().manual_seed(0)
-    windows = linear_windows(30)
-    windows["action"] = torch.randn(30, 1, 2, generator=generator, dtype=torch.float64).expand(30, 12, 2).clone()
-    windows["state"] = windows["state"] * 0.01 + torch.randn(30, 1, 3, generator=generator, dtype=torch.float64)
-    mask = torch.ones(30, 12, dtype=torch.bool)
-    errors = []
-    for groups in (None, torch.arange(30)):
-        model = LinearInverseDynamics(3, 2, num_past=2, look_ahead=5).double()
-        errors.append(model.fit_labels(windows, mask, groups=groups)["held_out_error"])
-    assert errors[1] > errors[0]
-
-
 def test_constant_columns_do_not_disturb_the_ridge():
     windows = linear_windows(40)
     constant = torch.full((40, 12, 1), 7.0, dtype=torch.float64)
@@ -80,6 +66,48 @@ def test_constant_columns_do_not_disturb_the_ridge():
     torch.testing.assert_close(predicted, windows["action"][:, 2:7], atol=1e-4, rtol=0)
 
 
-def test_look_ahead_of_the_next_state_is_refused():
-    with pytest.raises(ValueError, match="must be >= 2"):
-        LinearInverseDynamics(2, 2, look_ahead=1)
+def make_windows(columns=3, num=80):
+    torch.manual_seed(0)
+    return torch.randn(num, 17, columns).cumsum(1)
+
+
+class TestPrincipalInverseDynamics(InverseDynamicsTestBase):
+    def make_network(self, seed=0, **options):
+        torch.manual_seed(seed)
+        sizes = {"counts": (4,), "num_past": 2, "look_ahead": (2, 3)}
+        return PrincipalInverseDynamics(3, 2, **sizes, **normalizers(), **options)
+
+    def fitted(self, network):
+        network = super().fitted(network)
+        network.finish(partly_labelled(20)["state"].to(network.state_normalizer.scale))
+        return network
+
+
+@pytest.mark.parametrize("num", [30, 400])  # fewer windows than columns, and more
+def test_components_are_those_of_the_windows(num):
+    states = make_windows(num=num)
+    model = PrincipalInverseDynamics(3, 2, counts=(8,))
+    model.prepare(states)
+    model.finish(states)
+    rows = model.reader(states, range(8, 9)).flatten(0, -2).double()
+    expected = torch.linalg.svd(rows, full_matrices=False)[2][:8]
+    torch.testing.assert_close((model.basis.double() @ expected.mT).abs(), torch.eye(8).double(), atol=1e-3, rtol=0)
+
+
+def test_the_number_of_components_is_chosen_by_labels_left_out():
+    states = make_windows()
+    windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [80])
+    model = PrincipalInverseDynamics(3, 2, counts=(2, 48))
+    model.prepare(states)
+    model.finish(states)
+    mask = torch.zeros(80, 17, dtype=torch.bool)
+    mask[:, 8] = True
+    fit = model.fit_labels(windows, mask, groups=torch.arange(80) // 10)
+    assert int(model.gate.sum()) == 48 and fit["labels_used"] == 80
+    error = (model(windows.select("state"))["action"] - windows["action"])[:, 8].square().mean().sqrt()
+    assert error < 0.1 * windows["action"].square().mean().sqrt()
+
+
+def test_more_components_than_columns_are_not_asked_for():
+    model = PrincipalInverseDynamics(1, 1)
+    assert model.basis.shape == (16, 16)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latent action policies (LAPO) with a quantised latent: what the next state needs beyond the past, as a code."""
+"""Controllers with a latent that unlabelled windows teach: codes (LAPO), and a variational auto-encoder of windows."""
 
 from __future__ import annotations
 
@@ -9,8 +9,13 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from torchrl_koap.modules.baselines.networks import LAYERS
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
 from torchrl_koap.modules.windows import WindowReader
+
+LATENT_DIM = 16
+LEVELS = (8, 5, 5, 5) * 2  # two codebooks of 1000 codes side by side
+WINDOW = 16  # frames that the auto-encoder reads as a whole
 
 
 class FiniteScalarQuantizer(nn.Module):
@@ -23,21 +28,17 @@ class FiniteScalarQuantizer(nn.Module):
 
     after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle one: they lie half a level
     lower, and the shift ``s`` keeps 0 at the code 0. There is no codebook to train and no term for it in a loss; a
-    codebook is the ``prod(levels)`` codes there are. Several of them stand side by side.
+    codebook is the ``prod(levels)`` codes there are.
 
     Args:
         features (int): size ``m`` of what is quantised; a linear map takes it to the entries of the codes, and a second
             one the codes back to ``m``.
 
     Keyword Args:
-        levels (sequence of int): levels of every entry, 3 or more. Defaults to ``(8, 5, 5, 5)``, 1000 codes.
-        num_codebooks (int): number ``C`` of codes side by side. Defaults to ``2``.
-
-    Shape:
-        ``forward``: ``[*B, m] -> [*B, m]``; codes are ``[*B, C * len(levels)]``.
+        levels (sequence of int): levels of every entry, 3 or more. Defaults to two times ``(8, 5, 5, 5)``.
 
     Raises:
-        ValueError: for fewer than 3 levels or no codebook.
+        ValueError: for fewer than 3 levels.
 
     Examples:
         >>> import torch
@@ -49,24 +50,22 @@ class FiniteScalarQuantizer(nn.Module):
         [-1.0, -1.0, 0.0, 0.0, 0.75, 1.0, 0.0, 0.5]
     """
 
-    def __init__(self, features: int, *, levels: Sequence[int] = (8, 5, 5, 5), num_codebooks: int = 2):
+    def __init__(self, features: int, *, levels: Sequence[int] = LEVELS):
         super().__init__()
         if not levels or min(levels) < 3:
             raise ValueError(f"every entry of a code needs 3 levels or more, got levels {tuple(levels)}")
-        if num_codebooks < 1:
-            raise ValueError(f"num_codebooks must be >= 1, got {num_codebooks}")
-        self.levels = tuple(levels) * num_codebooks
+        self.levels = tuple(levels)
         self.project_in = nn.Linear(features, len(self.levels))
         self.project_out = nn.Linear(len(self.levels), features)
 
     def bound(self, values: Tensor) -> Tensor:
-        """Squashes values ``[*B, C * len(levels)]`` to the range of the levels, which are the whole numbers in it."""
+        """Squashes values ``[*B, len(levels)]`` to the range of the levels, which are the whole numbers in it."""
         levels = torch.tensor(self.levels, dtype=values.dtype, device=values.device)
         half_range, offset = (levels - 1) / 2, (levels % 2 == 0).to(values.dtype) / 2
         return half_range * (values + (offset / half_range).atanh()).tanh() - offset
 
     def quantize(self, values: Tensor) -> Tensor:
-        """Rounds values to codes ``[*B, C * len(levels)]`` in [-1, 1]; the gradient is that of :meth:`bound`."""
+        """Rounds values to codes ``[*B, len(levels)]`` in [-1, 1]; the gradient is that of :meth:`bound`."""
         bounded = self.bound(values)
         half = torch.tensor([number // 2 for number in self.levels], device=values.device)
         return (bounded + (bounded.round() - bounded).detach()) / half
@@ -89,8 +88,6 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
     from the code alone. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, and:
 
     Keyword Args:
-        latent_dim (int): size ``m`` of a latent, before the quantisation and after it. Defaults to ``16``.
-        hidden_dims (sequence of int): widths of the three networks. Defaults to ``(128, 128)``.
         look_ahead (int or sequence of int): offsets ``k``; 1 must be one of them, the transition that is encoded.
 
     Raises:
@@ -111,8 +108,6 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         state_dim: int,
         action_dim: int,
         *,
-        latent_dim: int = 16,
-        hidden_dims: Sequence[int] = (128, 128),
         num_past: int = 4,
         look_ahead: int | Sequence[int] = (1, 2, 3, 4, 5),
         **kwargs,
@@ -120,12 +115,10 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         reader = WindowReader(state_dim, num_past=num_past, look_ahead=look_ahead, min_offset=1)
         if reader.look_ahead[0] != 1:
             raise ValueError(f"look_ahead must contain 1, the transition that is encoded, got {reader.look_ahead}")
-        layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
-        super().__init__(reader, MLP(latent_dim, action_dim, **layers), **kwargs)
-        self.latent_dim = latent_dim
-        self.encoder = MLP(reader.num_features, latent_dim, **layers)
-        self.quantizer = FiniteScalarQuantizer(latent_dim)
-        self.dynamics = MLP((num_past + 1) * state_dim + latent_dim, state_dim, **layers)
+        super().__init__(reader, MLP(LATENT_DIM, action_dim, **LAYERS), **kwargs)
+        self.encoder = MLP(reader.num_features, LATENT_DIM, **LAYERS)
+        self.quantizer = FiniteScalarQuantizer(LATENT_DIM)
+        self.dynamics = MLP((num_past + 1) * state_dim + LATENT_DIM, state_dim, **LAYERS)
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Infers quantised latents ``[*B, len(frames), m]`` of a window of raw states ``[*B, T, d]``."""
@@ -141,3 +134,63 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         read, size = self.reader(self.normalize_state(state), frames), self.reader.state_dim
         past, step, _ = read.tensor_split(((self.num_past + 1) * size, (self.num_past + 2) * size), -1)
         return self.dynamics(torch.cat([past, self.quantizer(self.encoder(read))], -1)), step
+
+
+class VariationalInverseDynamics(LatentInverseDynamics):
+    r"""Encodes a whole window into a Gaussian latent per frame; samples of it are decoded into what the frame read.
+
+    .. math::
+        q(u_t \mid x_{0:T}) = N(\mu_\theta(h_t), \sigma^2_\theta(h_t)), \quad h = \mathrm{LSTM}_\theta(s_{0:T}), \qquad
+        \hat s_t = g_\psi(u_t), \qquad a_t = d_\phi(u_t), \quad u_t \sim q
+
+    with ``s_t`` the present state and the steps to and from it (:class:`~torchrl_koap.modules.WindowReader`), and an
+    LSTM that runs over the window in both directions. Trained in two stages, as the paper says:
+    :class:`~torchrl_koap.objectives.VariationalLoss` on all windows, then :class:`~torchrl_koap.objectives.ActionLoss`
+    with ``freeze_latents`` and ``sample`` on the labelled frames. Where it acts it reads the mean. Args as for
+    :class:`~torchrl_koap.modules.InverseDynamics`, without ``num_past`` and ``look_ahead``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import VariationalInverseDynamics
+        >>> model = VariationalInverseDynamics(2, 2)
+        >>> window = torch.randn(1, 16, 2)
+        >>> changed = torch.cat([window[:, :-1], window[:, -1:] + 1], 1)
+        >>> bool((model.infer(window)[:, 1] != model.infer(changed)[:, 1]).any())  # the whole window is read
+        True
+        >>> model.sample(window).shape
+        torch.Size([1, 16, 16])
+    """
+
+    samples_latents = True
+    num_window_frames = WINDOW
+
+    def __init__(self, state_dim: int, action_dim: int, **kwargs):
+        reader = WindowReader(state_dim, num_past=1, look_ahead=1, min_offset=1)
+        super().__init__(reader, MLP(LATENT_DIM, action_dim, **LAYERS), **kwargs)
+        self.context = nn.LSTM(reader.num_features, 128, batch_first=True, bidirectional=True)
+        self.encoder = nn.Linear(2 * 128, 2 * LATENT_DIM)
+        self.decoder = MLP(LATENT_DIM, reader.num_features, num_cells=(128,), activation_class=nn.ReLU)
+
+    def posterior(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Infers the distribution of the latents of a window of raw states ``[*B, T, d]``.
+
+        Returns:
+            tuple of Tensor: what every frame read ``[*B, len(frames), 3 d]``, at unit scale; mean and log-variance of
+            the latents ``[*B, len(frames), m]``.
+        """
+        read = self.reader(self.normalize_state(state))  # [*B, T, F]
+        context, _ = self.context(read.reshape(-1, *read.shape[-2:]))
+        context = context.reshape(*read.shape[:-1], 2 * self.context.hidden_size)
+        if frames is not None:
+            read, context = (part[..., frames.start : frames.stop, :] for part in (read, context))
+        mean, log_variance = self.encoder(context).chunk(2, -1)
+        return read, mean, log_variance.clamp(-10.0, 10.0)  # one odd window must not overflow the exponential
+
+    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Infers the means ``[*B, len(frames), m]`` of the latents of a window of raw states ``[*B, T, d]``."""
+        return self.posterior(state, frames)[1]
+
+    def sample(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Samples latents ``[*B, len(frames), m]`` of a window of raw states ``[*B, T, d]``."""
+        _, mean, log_variance = self.posterior(state, frames)
+        return mean + (0.5 * log_variance).exp() * torch.randn_like(mean)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The controller with quantised latents: codes, plain loops, what may reach what, learning in two stages."""
+"""Latents without labels: codes, and the auto-encoder of windows, in plain loops; both learn in two stages."""
 
 from __future__ import annotations
 
@@ -23,8 +23,13 @@ from inverse_dynamics_test_base import (
 from loss_test_base import LossTestBase
 from tensordict import TensorDict
 
-from torchrl_koap.modules import FiniteScalarQuantizer, QuantizedInverseDynamics
-from torchrl_koap.objectives import ActionLoss, QuantizedDynamicsLoss
+from torchrl_koap.modules import (
+    FiniteScalarQuantizer,
+    QuantizedInverseDynamics,
+    SupervisedInverseDynamics,
+    VariationalInverseDynamics,
+)
+from torchrl_koap.objectives import ActionLoss, QuantizedDynamicsLoss, VariationalLoss
 
 SPAN = range(2, 6)
 LEVELS = [(8, 5, 5, 5), (3, 4), (6,), (5, 3, 8)]
@@ -32,8 +37,7 @@ LEVELS = [(8, 5, 5, 5), (3, 4), (6,), (5, 3, 8)]
 
 def make_network(seed=0, **options):
     torch.manual_seed(seed)
-    sizes = {"latent_dim": 6, "hidden_dims": (16,), "num_past": 2, "look_ahead": (1, 3)}
-    return QuantizedInverseDynamics(3, 2, **sizes, **normalizers(), **options)
+    return QuantizedInverseDynamics(3, 2, num_past=2, look_ahead=(1, 3), **normalizers(), **options)
 
 
 class TestQuantizedInverseDynamics(InverseDynamicsTestBase):
@@ -106,8 +110,8 @@ def test_each_stage_trains_what_it_should():
 def test_an_action_is_a_function_of_the_code_alone():
     """Two frames with one code have one action, whatever their states; few levels make such pairs."""
     network = make_network()
-    network.quantizer = FiniteScalarQuantizer(6, levels=(3,))
-    state = 5 * torch.randn(30, T, 3, generator=torch.Generator().manual_seed(2))
+    network.quantizer = FiniteScalarQuantizer(16, levels=(3, 3))
+    state = 20 * torch.randn(30, T, 3, generator=torch.Generator().manual_seed(2))
     written = network(TensorDict({"state": state}, [30]))
     action, latent = written["action"].flatten(0, 1), written["latent_action"].flatten(0, 1)
     codes, member = (latent * 1e4).round().unique(dim=0, return_inverse=True)
@@ -125,7 +129,7 @@ def test_look_ahead_must_hold_the_transition():
 def test_two_stages_learn_actions_from_few_labels():
     data = few_labels()
     torch.manual_seed(0)
-    network = QuantizedInverseDynamics(2, 2, hidden_dims=(64, 64), num_past=1, look_ahead=(1, 2))
+    network = QuantizedInverseDynamics(2, 2, num_past=1, look_ahead=(1, 2))
     network.prepare(data["state"][:1024])
     unseen = data[1024:]
     train(
@@ -145,7 +149,7 @@ def test_two_stages_learn_actions_from_few_labels():
 class TestFiniteScalarQuantizer:
     @pytest.mark.parametrize("levels", LEVELS)
     def test_every_level_is_reached_and_no_other(self, levels):
-        quantizer = FiniteScalarQuantizer(7, levels=levels, num_codebooks=1).double()
+        quantizer = FiniteScalarQuantizer(7, levels=levels).double()
         grid = torch.linspace(-9, 9, 4001, dtype=torch.float64)[:, None].expand(-1, len(levels))
         codes = quantizer.quantize(grid)
         for column, count in enumerate(levels):
@@ -155,14 +159,8 @@ class TestFiniteScalarQuantizer:
             assert (codes[1:, column] >= codes[:-1, column]).all()
         assert codes.abs().max() == 1
 
-    @pytest.mark.parametrize("levels", LEVELS)
-    def test_there_are_as_many_codes_as_the_product_of_the_levels(self, levels):
-        quantizer = FiniteScalarQuantizer(7, levels=levels, num_codebooks=1)
-        values = 5 * torch.rand(60_000, len(levels), generator=torch.Generator().manual_seed(0)) - 2.5
-        assert len(quantizer.quantize(values).unique(dim=0)) == math.prod(levels)  # equal codes: bit for bit
-
     def test_zero_is_the_code_zero_and_in_the_middle_of_its_level(self):
-        quantizer = FiniteScalarQuantizer(7, num_codebooks=1).double()
+        quantizer = FiniteScalarQuantizer(7, levels=(8, 5, 5, 5)).double()
         zero = torch.zeros(4, dtype=torch.float64)
         torch.testing.assert_close(quantizer.bound(zero), zero, atol=1e-15, rtol=0)
         assert (quantizer.quantize(zero) == 0).all()
@@ -175,7 +173,7 @@ class TestFiniteScalarQuantizer:
         assert quantizer.quantize(torch.full((8,), 1e9)).isfinite().all()
 
     def test_gradients_are_those_of_the_bounded_value(self):
-        quantizer = FiniteScalarQuantizer(7, num_codebooks=1).double()
+        quantizer = FiniteScalarQuantizer(7, levels=(8, 5, 5, 5)).double()
         values = (5 * torch.rand(50, 4, dtype=torch.float64) - 2.5).requires_grad_()
         (straight,) = torch.autograd.grad(quantizer.quantize(values).sum(), values)
         levels = torch.tensor([8.0, 5.0, 5.0, 5.0], dtype=torch.float64)
@@ -185,14 +183,139 @@ class TestFiniteScalarQuantizer:
         quantizer(torch.randn(5, 7, dtype=torch.float64)).sum().backward()
         assert all(value.grad.isfinite().all() and (value.grad != 0).any() for value in quantizer.parameters())
 
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            ({"levels": (8, 2)}, r"3 levels or more, got levels \(8, 2\)"),
-            ({"levels": ()}, "3 levels or more"),
-            ({"num_codebooks": 0}, "num_codebooks must be >= 1, got 0"),
-        ],
-    )
-    def test_what_cannot_be_a_code_is_refused(self, options, message):
-        with pytest.raises(ValueError, match=message):
-            FiniteScalarQuantizer(16, **options)
+    @pytest.mark.parametrize("levels", [(8, 2), ()])
+    def test_what_cannot_be_a_code_is_refused(self, levels):
+        with pytest.raises(ValueError, match="every entry of a code needs 3 levels or more"):
+            FiniteScalarQuantizer(16, levels=levels)
+
+
+WHOLE = range(1, T - 1)
+
+
+def make_autoencoder(seed=0, **options):
+    torch.manual_seed(seed)
+    return VariationalInverseDynamics(3, 2, **normalizers(), **options)
+
+
+def noisy_windows(*batch):
+    noise = torch.randn(*batch, len(WHOLE), 16, generator=torch.Generator().manual_seed(5))
+    return partly_labelled(*batch).set("latent_noise", noise)
+
+
+class TestVariationalInverseDynamics(InverseDynamicsTestBase):
+    def make_network(self, seed=0, **options):
+        return make_autoencoder(seed, **options)
+
+    def test_an_action_depends_on_the_frames_it_may_read_and_no_others(self):
+        network, state = self.make_network(), partly_labelled(1)["state"][0]
+        latent = network.infer(state)
+        for changed in (0, T - 1):  # of every frame, the whole window
+            other = state.clone()
+            other[changed] += 1
+            assert (network.infer(other) != latent).any(-1).all()
+        assert network.valid_frames(T) == WHOLE and network.num_window_frames == 16 and network.num_past == 1
+
+
+class TestVariationalLoss(LossTestBase):
+    default_keys = {**KEYS, "noise": "latent_noise"}
+    in_names, out_keys = ("state",), ("loss_reconstruction", "loss_kl")
+    coefficients = {"kl_coeff": "loss_kl"}
+    learning_rate = 1e-2
+    test_compiled_equals_eager = None  # torch's LSTM in two directions is not traced
+
+    def make_loss(self, seed=0, **options):
+        return VariationalLoss(make_autoencoder(seed), **{"kl_coeff": 1.0, **options})
+
+    def make_batch(self, *batch):
+        return noisy_windows(*batch)
+
+    def counted(self, batch, key, elements):
+        counts = recorded(batch, WHOLE)
+        assert (elements[~counts] == 0).all() and (elements[counts] > 0).all()
+        return int(counts.sum())
+
+
+def autoencoder_terms(network, batch):
+    """Terms of every frame that counts, from the definition."""
+    reconstruction, divergence = [], []
+    for window in range(len(batch)):
+        x = (batch["state"][window] - STATE["offset"]) / STATE["scale"]
+        ends = [x[:1], x, x[-1:]]
+        steps = torch.cat(ends).diff(dim=0)
+        read = torch.cat([steps[:-1], x, steps[1:]], -1)
+        context, _ = network.context(read[None])
+        for t in WHOLE:
+            if batch["padded"][window, t] or batch["padded"][window, t + 1]:
+                continue
+            mean, log_variance = network.encoder(context[0, t]).split(16)
+            sample = mean + torch.exp(log_variance / 2) * batch["latent_noise"][window, t - WHOLE.start]
+            reconstruction.append(((network.decoder(sample) - read[t]) ** 2).mean())
+            normal = torch.distributions.Normal(mean, torch.exp(log_variance / 2))
+            divergence.append(torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0)).sum())
+    return torch.stack(reconstruction).mean(), torch.stack(divergence).mean()
+
+
+def test_values_autoencoder_terms():
+    network, batch = make_autoencoder(), noisy_windows(6)
+    assert 0 < recorded(batch, WHOLE).sum() < recorded(batch, WHOLE).numel()
+    reconstruction, divergence = autoencoder_terms(network, batch)
+    losses = VariationalLoss(network)(batch)
+    torch.testing.assert_close(losses["loss_reconstruction"], reconstruction)
+    torch.testing.assert_close(losses["loss_kl"], 0.01 * divergence)
+
+
+def test_noise_is_drawn_anew_where_none_is_handed_in_and_a_wrong_one_is_refused():
+    loss, batch = VariationalLoss(make_autoencoder()), noisy_windows(6)
+    free = batch.exclude("latent_noise")
+    assert loss(free)["loss_reconstruction"] != loss(free)["loss_reconstruction"]
+    assert loss(free)["loss_kl"] == loss(batch)["loss_kl"]  # the divergence is not sampled
+    batch["latent_noise"] = torch.zeros(6, T, 16)
+    with pytest.raises(ValueError, match=r"'latent_noise' must be \[6, 7, 16\], got \[6, 9, 16\]"):
+        loss(batch)
+
+
+def test_a_far_window_stays_finite():
+    network, batch = make_autoencoder(), noisy_windows(6)
+    batch["state"] *= 1e5
+    losses = VariationalLoss(network)(batch)
+    sum(losses.values()).backward()
+    assert all(value.isfinite() for value in losses.values())
+    assert all(value.grad is None or value.grad.isfinite().all() for value in network.parameters())
+
+
+def test_each_stage_of_the_autoencoder_trains_what_it_should():
+    network, batch = make_autoencoder(), noisy_windows(6)
+    assert reached(network, sum(VariationalLoss(network)(batch).values())) == {"context", "encoder", "decoder"}
+    loss = ActionLoss(network, freeze_latents=True, sample=True)
+    assert reached(network, loss(batch)["loss_action"]) == {"action_decoder"}
+
+
+def test_the_action_decoder_is_fitted_to_samples_and_acts_on_the_mean():
+    network, batch = make_autoencoder(), noisy_windows(6)
+    loss = ActionLoss(network, freeze_latents=True, sample=True)
+    assert loss(batch)["loss_action"] != loss(batch)["loss_action"]
+    written = network(batch.select("state"))
+    assert torch.equal(written["action"], network(batch.select("state"))["action"])
+    assert torch.equal(written["latent_action"], network.posterior(batch["state"])[1])
+
+
+def test_samples_and_frozen_latents_need_a_network_that_has_them():
+    supervised = SupervisedInverseDynamics(2, 2)
+    for asked, message in (
+        ({"sample": True}, "samples were asked"),
+        ({"freeze_latents": True}, "freeze_latents was asked"),
+    ):
+        with pytest.raises(ValueError, match=f"{message} for, but SupervisedInverseDynamics has no latents"):
+            ActionLoss(supervised, **asked)
+
+
+def test_the_autoencoder_learns_actions_from_few_labels():
+    data = few_labels()
+    torch.manual_seed(0)
+    network = VariationalInverseDynamics(2, 2)
+    network.prepare(data["state"][:1024])
+    decoder = ActionLoss(network, freeze_latents=True, sample=True)
+    train(network, data, (VariationalLoss(network), 200, 1024), (decoder, 200, 32))
+    unseen = data[1024:]
+    error = (network(unseen.select("state"))["action"] - unseen["action"])[:, 1:10].square().mean()
+    assert error < 0.2, error  # the mean action has error 1

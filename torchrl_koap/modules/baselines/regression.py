@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Ridge regression on principal components of unlabelled windows: what linear unsupervised learning gives by itself."""
+"""Ridge regressions: on raw frames without a latent, and on principal components of unlabelled windows."""
 
 from __future__ import annotations
 
@@ -10,13 +10,60 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
+from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, ridge
 from torchrl_koap.modules.windows import WindowReader
 
 COUNTS = (2, 4, 8, 16, 32, 64)
 MOST_WINDOWS = 4096  # of which components are computed, evenly spaced among all
+
+
+class LinearInverseDynamics(InverseDynamics):
+    """Predicts the action by ridge regression on the raw frames ``x_{t-n}, ..., x_t, x_{t+k}``, without a latent.
+
+    It reads labelled frames only; there is nothing to train. Args as for
+    :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2`` as for KOAP.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import LinearInverseDynamics
+        >>> windows = TensorDict({"state": torch.randn(50, 10, 2)}, [50])
+        >>> windows["action"] = windows["state"].roll(-8, 1) - windows["state"]  # x_{t+8} - x_t
+        >>> model = LinearInverseDynamics(2, 2)
+        >>> fit = model.fit_labels(windows, torch.ones(50, 10, dtype=torch.bool))
+        >>> bool((model(windows.clone())["action"][:, 1] - windows["action"][:, 1]).abs().max() < 1e-3)
+        True
+    """
+
+    def __init__(
+        self, state_dim: int, action_dim: int, *, num_past: int = 1, look_ahead: int | Sequence[int] = 8, **kwargs
+    ):
+        super().__init__(WindowReader(state_dim, num_past=num_past, look_ahead=look_ahead, relative=False), **kwargs)
+        self.inputs = Normalizer(self.reader.num_features)
+        self.decoder = LinearActionDecoder(self.reader.num_features, action_dim)
+
+    def _read(self, state: Tensor, frames: range | None = None) -> Tensor:
+        return self.reader(self.normalize_state(state), frames)
+
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Applies the regression to the frames read, at unit spread."""
+        return self.decoder.linear(self.inputs(self._read(state, frames)))
+
+    @torch.no_grad()
+    def fit_labels(
+        self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None, **_: Any
+    ) -> dict[str, Any]:
+        """Fits the regression on the labelled frames."""
+        inputs, action, groups = self.labelled_frames(self._read, windows, mask, groups)
+        spread = inputs.std(0, correction=0)
+        self.inputs.offset.copy_(inputs.mean(0))
+        self.inputs.scale.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
+        fit = ridge(self.inputs(inputs), action, groups=groups, input_noise=INPUT_NOISE)
+        self.decoder.assign(fit)
+        return fit.summary()
 
 
 class PrincipalInverseDynamics(LatentInverseDynamics):
@@ -28,12 +75,11 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
 
     Keyword Args:
         counts (sequence of int): numbers of components to choose among. Defaults to ``(2, 4, 8, 16, 32, 64)``.
-        penalty (float): ridge where fewer than three trajectories have labels. Defaults to ``0.15``.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
+        >>> from torchrl_koap.modules import PrincipalInverseDynamics
         >>> states = torch.randn(60, 17, 3).cumsum(1)
         >>> model = PrincipalInverseDynamics(3, 2, counts=(4, 48))
         >>> model.prepare(states), model.finish(states)
@@ -55,13 +101,11 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         counts: Sequence[int] = COUNTS,
         num_past: int = 8,
         look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
-        penalty: float = DEFAULT_PENALTY,
         **kwargs,
     ):
         reader = WindowReader(state_dim, num_past=num_past, look_ahead=look_ahead)
         self._counts = tuple(sorted({min(count, reader.num_features) for count in counts}))
         super().__init__(reader, LinearActionDecoder(self._counts[-1], action_dim), **kwargs)
-        self.penalty = penalty
         self.register_buffer("basis", torch.eye(self._counts[-1], reader.num_features))
         self.register_buffer("gate", torch.ones(self._counts[-1]))
 
@@ -95,7 +139,7 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         self.gate.fill_(1.0)
         latent, action, groups = self.labelled_frames(self.infer, windows, mask, groups)
         numbers = torch.arange(len(self.gate), device=self.gate.device)
-        options = {"groups": groups, "default_penalty": self.penalty, "input_noise": INPUT_NOISE, "bias": False}
+        options = {"groups": groups, "default_penalty": DEFAULT_PENALTY, "input_noise": INPUT_NOISE, "bias": False}
         fits = {count: ridge(latent * (numbers < count), action, **options) for count in self._counts}
         best = min(fits, key=lambda count: fits[count].error)
         self.gate.copy_(numbers < best)
