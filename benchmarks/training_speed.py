@@ -94,7 +94,7 @@ def planners(repeats: int) -> Iterable[tuple[object, ...]]:
     for batch in (1, 60):
         history = windows["state"][:batch, : planner.history]
         with torch.no_grad():
-            seconds = median_seconds(lambda history=history: planner.plan(history), repeats)
+            seconds = median_seconds(lambda history=history: planner.sample(history), repeats)
         plans.append(f"{1e3 * seconds:.2f}")
     yield "planner", "default (10 DPM-Solver++ steps)", size_of(planner.denoiser), f"{updates:.2f}", *plans, COMMAND
 

@@ -162,7 +162,7 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
 
 def test_recorded_futures_travel_in_an_entry_of_their_own():
     recorded = RecordedFutures(torch.arange(2 * 3 * 14 * 2.0).reshape(2, 3, 14, 2))
-    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2))
+    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2))
     policy = make_policy(planner, EchoController(), state_of=(0, 1), execution=Execution(replan_interval=1, blend=0.0))
     observed, init = torch.zeros(2, 2, 2), torch.ones(2, 1, dtype=torch.bool)
     for step in (0, 1, 2, 2):
@@ -183,7 +183,7 @@ def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
         return [episode(0.0, steps=24) for _ in seeds]
 
     monkeypatch.setattr(diagnosis, "roll_out", noted)
-    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
     policy = make_policy(planner, EchoController(), state_of=(0, 1))
     followed = follow_recordings(policy, AVOIDING, data, None, episodes=5)
     assert [futures[0, 0, 0, 0].item() for futures in plans] == [4.0, 5.0]

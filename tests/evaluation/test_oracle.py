@@ -30,13 +30,13 @@ def futures_of(start, speed, horizon=14):
 
 
 def policy_of(planner=None, **options):
-    planner = planner or StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
+    planner = planner or StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
     follower = OracleFollower(TASK, blend=0.0, **options)
     return make_policy(planner, state_of=TASK.state_of, follower=follower, execution=Execution(replan_interval=1))
 
 
 def follow(speeds, **options):
-    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2))
+    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2))
     policy = policy_of(planner, **options)
     start = AvoidingEnv(1).reset()["observation"][0, 2:]
     futures = torch.stack([futures_of(start, speed) for speed in speeds])

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What the losses of planner and Diffusion Policy must do alike, as a base class, and the formula of what they fit."""
+"""What the losses of planner and Diffusion Policy must do alike, as a base class, and the formula of the noise."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ import torch
 from loss_test_base import LossTestBase
 from torchrl.objectives import SoftUpdate
 
-PREDICTIONS = ("epsilon", "sample")
 
-
-def noised_and_target(network, prediction, clean, noise, time):
-    """Noised sequences and what the denoiser should answer, by the formula of the schedule."""
+def noised(network, clean, noise, time):
+    """Noised sequences by the formula of the schedule."""
     signal = network.schedule.signal.to(clean.dtype)[time.long()][:, None, None]
-    return signal * clean + (1 - signal**2).sqrt() * noise, {"epsilon": noise, "sample": clean}[prediction]
+    return signal * clean + (1 - signal**2).sqrt() * noise
 
 
 class DenoisingLossTestBase(LossTestBase):

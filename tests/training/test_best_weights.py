@@ -24,7 +24,7 @@ def sample():
 def training(path, score, *, stop=None, num_steps=100, **options):
     """A small planner, checked every 10 updates; killed after ``stop`` updates."""
     torch.manual_seed(0)
-    planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=8, depth=1), state_dim=2, horizon=6)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=8), state_dim=2, horizon=6)
     planner.fit_normalizers(torch.randn(64, 8, 2).cumsum(1))
     loss = PlannerLoss(planner)
     average, best = SoftUpdate(loss, eps=0.9), BestWeights(loss, score, every=10)

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.objectives import SoftUpdate
 
-from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner, make_koopman_inverse_dynamics
+from torchrl_koap.modules import MLPDenoiser, StatePlanner, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
@@ -112,7 +112,7 @@ class Planner:
 
     def __init__(self, seed=0):
         torch.manual_seed(seed)
-        planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=16, depth=1), NoiseSchedule(), state_dim=2, horizon=6)
+        planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=16), state_dim=2, horizon=6)
         planner.fit_normalizers(self.windows(64))
         self.loss = PlannerLoss(planner)
         self.average = SoftUpdate(self.loss, eps=0.8)
@@ -251,9 +251,7 @@ def _koopman_loss():
 
 
 def _planner_loss():
-    return PlannerLoss(
-        StatePlanner(MLPDenoiser(2, 4, horizon=6, width=16, depth=1), NoiseSchedule(), state_dim=2, horizon=6)
-    )
+    return PlannerLoss(StatePlanner(MLPDenoiser(2, 4, horizon=6, width=16), state_dim=2, horizon=6))
 
 
 @pytest.mark.parametrize("make", [_koopman_loss, _planner_loss])

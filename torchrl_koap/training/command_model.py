@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
 from torchrl_koap.modules import CommandDecoder
-from torchrl_koap.modules.planning.relative_positions import RelativePosition, RelativePositionFeatures
+from torchrl_koap.modules.planning.relative_positions import relative_features
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 
@@ -81,7 +81,7 @@ def build_decoder(columns: dict[str, Any], action_dim: int) -> CommandDecoder:
     """
     own = {name: columns[name] for name in ("state_dim", "commands", "actions")}
     pairs = [[None if part is None else slice(*part) for part in pair] for pair in columns.get("relative", ())]
-    features = RelativePositionFeatures([RelativePosition(*pair) for pair in pairs]) if pairs else None
+    features = relative_features(pairs)
     return CommandDecoder(**own, action_dim=action_dim, features=features)
 
 

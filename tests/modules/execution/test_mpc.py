@@ -23,7 +23,7 @@ def mpc_of(response=None, look_ahead=11, **options):
 
 def policy_of(response=None, **execution):
     torch.manual_seed(0)
-    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2, num_steps=2)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2, num_steps=2)
     return make_policy(
         planner, response or sluggish(), state_of=(2, 3), changes=(0, 1), execution=Execution(**execution)
     )

@@ -52,7 +52,7 @@ class Still(StatePlanner):
 def test_agent_environment_and_evaluation_act_alike_bit_for_bit(horizon, candidates):
     """Horizons times columns that are no multiple of 16 included, in which torch fills tensors."""
     torch.manual_seed(0)
-    planner = Still(MLPDenoiser(4, 8, horizon=horizon, width=8, depth=1), state_dim=4, horizon=horizon, num_steps=2)
+    planner = Still(MLPDenoiser(4, 8, horizon=horizon, width=8), state_dim=4, horizon=horizon, num_steps=2)
     policy = make_policy(
         planner,
         make_koopman_inverse_dynamics(4, 2),
@@ -80,7 +80,7 @@ def test_the_episode_of_a_seed_in_an_evaluation_is_that_of_an_agent():
     from torchrl_koap.envs import AvoidingEnv
 
     torch.manual_seed(0)
-    planner = StatePlanner(MLPDenoiser(2, 4, horizon=13, width=8, depth=1), state_dim=2, horizon=13, num_steps=2)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=13, width=8), state_dim=2, horizon=13, num_steps=2)
     planner.fit_normalizers(0.01 * torch.randn(50, 15, 2).cumsum(1))
     policy = make_policy(planner, make_koopman_inverse_dynamics(2, 2), state_of=(2, 3), max_steps=9)
     (episode,) = roll_out(policy, AvoidingEnv, [7], max_steps=9)

@@ -245,7 +245,7 @@ def test_every_action_of_parallel_workers_that_reset_by_themselves(copied_proces
 @pytest.mark.parametrize("kind", KINDS)
 def test_batches_of_any_shape_agree_with_the_flat_one_noise_included(kind, batch):
     torch.manual_seed(0)
-    denoiser = MLPDenoiser(2, 4, horizon=14, width=8, depth=1)
+    denoiser = MLPDenoiser(2, 4, horizon=14, width=8)
     if kind == "chunks":
         policy = make_policy(DiffusionPolicy(denoiser, state_dim=2, action_dim=2), state_of=(0, 1))
     else:

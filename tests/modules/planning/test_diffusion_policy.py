@@ -24,7 +24,7 @@ def make_policy(**options):
     torch.manual_seed(0)
     features = options.get("features")
     width = 2 * options.get("history", 2) + (features.num_features if features is not None else 0)
-    denoiser = MLPDenoiser(3, width, horizon=options.get("horizon", 14), width=16, depth=1)
+    denoiser = MLPDenoiser(3, width, horizon=options.get("horizon", 14), width=16)
     return DiffusionPolicy(denoiser, state_dim=2, action_dim=3, **options)
 
 

@@ -50,16 +50,6 @@ def test_a_plan_comes_back_and_known_states_are_kept():
     torch.testing.assert_close(again[:, :4], plan[:3, :4], atol=1e-5, rtol=1e-5)
 
 
-def test_the_state_dict_holds_it_and_one_without_is_as_before():
-    model, other = planner(True), planner(True)
-    model.fit_normalizers(walks(40), groups=torch.arange(40))
-    other.load_state_dict(model.state_dict())
-    noise = torch.randn(2, 14, 2)
-    with torch.no_grad():
-        assert torch.equal(model.sample(walks(2)[:, :2], noise), other.sample(walks(2)[:, :2], noise))
-    assert not any(name.startswith("forecast") for name in planner(False).state_dict())
-
-
 def test_what_does_not_carry_over_is_not_forecast():
     """Six trajectories, each with a condition and a sequence of its own, which have nothing to do with each other."""
     generator = torch.Generator().manual_seed(0)

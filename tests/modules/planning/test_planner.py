@@ -14,7 +14,7 @@ from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner, Tempo
 
 def make_planner(**options):
     torch.manual_seed(0)
-    denoiser = MLPDenoiser(2, 2 * options.get("history", 2), horizon=options.get("horizon", 14), width=16, depth=1)
+    denoiser = MLPDenoiser(2, 2 * options.get("history", 2), horizon=options.get("horizon", 14), width=16)
     return StatePlanner(denoiser, state_dim=2, **options)
 
 
@@ -35,12 +35,9 @@ class TestStatePlanner(SamplerTestBase):
 class Bimodal(nn.Module):
     """The optimal prediction of the clean plan if it is -1 or +1 with equal chances."""
 
-    def __init__(self, schedule):
-        super().__init__()
-        self.schedule = schedule
-
     def forward(self, x, time, condition):
-        signal, noise = (level[time.long()][..., None, None] for level in (self.schedule.signal, self.schedule.noise))
+        schedule = NoiseSchedule()
+        signal, noise = (level[time.long()][..., None, None] for level in (schedule.signal, schedule.noise))
         return torch.tanh(signal * x / noise**2)
 
 
@@ -67,8 +64,7 @@ def test_relative_coordinates_do_not_move_with_the_data():
 
 @pytest.mark.parametrize("exploration", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
 def test_both_modes_of_a_bimodal_future_appear(exploration):
-    schedule = NoiseSchedule(num_train_steps=200)
-    planner = StatePlanner(Bimodal(schedule), schedule, state_dim=1, history=1, horizon=1, relative=False, num_steps=40)
+    planner = StatePlanner(Bimodal(), state_dim=1, history=1, horizon=1, relative=False, num_steps=40)
     torch.manual_seed(0)
     with set_exploration_type(exploration):
         plans = planner.sample(torch.zeros(600, 1, 1))

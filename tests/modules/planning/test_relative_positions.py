@@ -11,7 +11,6 @@ import torch
 from torchrl_koap.modules import StatePlanner, TemporalUnet
 from torchrl_koap.modules.planning.relative_positions import (
     NEAR,
-    RelativePosition,
     RelativePositionFeatures,
     relative_features,
 )
@@ -26,7 +25,7 @@ def state(tool, box, yaw, goal_yaw=0.0):
 
 
 def test_a_position_seen_from_a_turned_box_by_hand():
-    relations = RelativePositionFeatures([RelativePosition(TOOL, BOX, YAW, GOAL_YAW)])
+    relations = RelativePositionFeatures([(TOOL, BOX, YAW, GOAL_YAW)])
     found = relations(state((0.5, 0.31, 0.2), (0.5, 0.3), math.pi / 2, goal_yaw=math.pi / 2 + 0.3))
     gap = torch.tensor([0.01, 0.0, 0.2], dtype=torch.float64)  # ahead of the box, which looks along y; height as it is
     wanted = torch.cat([torch.tensor([math.cos(0.3), math.sin(0.3)], dtype=torch.float64), gap])
@@ -36,7 +35,7 @@ def test_a_position_seen_from_a_turned_box_by_hand():
 
 
 def test_moving_and_turning_everything_changes_nothing():
-    relations = RelativePositionFeatures([RelativePosition(slice(0, 2), BOX, YAW, GOAL_YAW)])
+    relations = RelativePositionFeatures([(slice(0, 2), BOX, YAW, GOAL_YAW)])
     angle, shift = 0.7, torch.tensor([0.2, -0.1], dtype=torch.float64)
     turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64)
     before = state((0.5, 0.31, 0.2), (0.45, 0.2), 0.4, 1.1)
@@ -49,7 +48,7 @@ def test_moving_and_turning_everything_changes_nothing():
 
 
 def test_only_the_present_frame_counts_and_batches_are_kept():
-    relations = RelativePositionFeatures([RelativePosition(TOOL, BOX)])
+    relations = RelativePositionFeatures([(TOOL, BOX)])
     history = torch.randn(2, 3, 4, 9)
     found = relations(history)
     assert found.shape == (2, 3, relations.num_features)
@@ -58,7 +57,7 @@ def test_only_the_present_frame_counts_and_batches_are_kept():
 
 
 def test_a_millimetre_near_the_box_is_felt():
-    relations = RelativePositionFeatures([RelativePosition(TOOL, BOX)])
+    relations = RelativePositionFeatures([(TOOL, BOX)])
     near = relations(state((0.501, 0.3, 0), (0.5, 0.3), 0)) - relations(state((0.5, 0.3, 0), (0.5, 0.3), 0))
     far = relations(state((0.801, 0.3, 0), (0.5, 0.3), 0)) - relations(state((0.8, 0.3, 0), (0.5, 0.3), 0))
     assert near.abs().max() == pytest.approx(math.tanh(0.001 / NEAR[1])) and near.abs().max() > 50 * far.abs().max()

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Networks that predict the clean sequence (or the noise) in a noisy sequence of states."""
+"""Networks that predict the clean sequence in a noisy one."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import math
 
 import torch
 from torch import Tensor, nn
+
+EMBEDDING_DIM = 32  # of a step
 
 
 class StepEmbedding(nn.Module):
@@ -18,8 +20,6 @@ class StepEmbedding(nn.Module):
 
     def __init__(self, embedding_dim: int):
         super().__init__()
-        if embedding_dim < 4 or embedding_dim % 2:
-            raise ValueError(f"embedding_dim must be even and at least 4, got {embedding_dim}")
         half = embedding_dim // 2
         self.register_buffer("frequencies", torch.exp(torch.arange(half) * (-math.log(10000.0) / (half - 1))))
         self.network = nn.Sequential(
@@ -71,27 +71,24 @@ class Denoiser(nn.Module):
     Keyword Args:
         frequencies (int): octaves of the condition's Fourier features.
         condition_width (int): width ``w`` of the :class:`ConditionEncoder`.
-        embedding_dim (int): width ``e`` of the step embedding, even and at least 4. Defaults to 32.
 
     Raises:
-        ValueError: for sizes that are not possible; at the call for a sequence or condition of another shape.
+        ValueError: at the call for a sequence or condition of another shape.
     """
 
-    def __init__(
-        self, state_dim: int, condition_dim: int, *, frequencies: int, condition_width: int, embedding_dim: int = 32
-    ):
+    def __init__(self, state_dim: int, condition_dim: int, *, frequencies: int, condition_width: int):
         super().__init__()
         self.state_dim, self.condition_dim = state_dim, condition_dim
-        self.step_embedding = StepEmbedding(embedding_dim)
+        self.step_embedding = StepEmbedding(EMBEDDING_DIM)
         self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=condition_width)
-        self.context_dim = embedding_dim + condition_width
+        self.context_dim = EMBEDDING_DIM + condition_width
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
-        """Predicts ``[N, H, d]`` from sequences ``[N, H, d]``, embedded steps ``[N, e]`` and conditions ``[N, w]``."""
+        """Predicts ``[N, H, d]`` from sequences ``[N, H, d]``, embedded steps ``[N, 32]`` and conditions ``[N, w]``."""
         raise NotImplementedError
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Predicts what the schedule asks for, ``[*B, H, d]``, from noisy sequences.
+        """Predicts clean sequences ``[*B, H, d]`` from noisy ones.
 
         Args:
             sequence (Tensor): noisy sequences ``[*B, H, d]``.
@@ -122,7 +119,6 @@ class MLPDenoiser(Denoiser):
         width (int): hidden width. Defaults to 512.
         depth (int): number of residual layers. Defaults to 4.
         frequencies (int): octaves of the condition's Fourier features. Defaults to 1.
-        **options: ``embedding_dim``, width of the step embedding.
 
     Examples:
         >>> import torch
@@ -141,9 +137,8 @@ class MLPDenoiser(Denoiser):
         width: int = 512,
         depth: int = 4,
         frequencies: int = 1,
-        **options: int,
     ):
-        super().__init__(state_dim, condition_dim, frequencies=frequencies, condition_width=width, **options)
+        super().__init__(state_dim, condition_dim, frequencies=frequencies, condition_width=width)
         self.horizon = horizon
         self.first = nn.Linear(horizon * state_dim + self.context_dim, width)
         self.layers = nn.ModuleList(

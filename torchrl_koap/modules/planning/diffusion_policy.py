@@ -10,7 +10,6 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torchrl_koap.modules.normalizer import Normalizer
-from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
 ACTION_CHUNK = "action_chunk"
@@ -54,7 +53,6 @@ class DiffusionPolicy(ConditionalSampler):
     def __init__(
         self,
         denoiser: nn.Module,
-        schedule: NoiseSchedule | None = None,
         *,
         state_dim: int,
         action_dim: int,
@@ -65,7 +63,7 @@ class DiffusionPolicy(ConditionalSampler):
         if action_dim < 1:
             raise ValueError(f"action_dim must be at least 1, got {action_dim}")
         options |= {"relative": relative, "out_keys": out_keys}
-        super().__init__(denoiser, schedule, state_dim=state_dim, width=action_dim, **options)
+        super().__init__(denoiser, state_dim=state_dim, width=action_dim, **options)
         self.action_dim = action_dim
         self.action_normalizer = Normalizer(action_dim)
 

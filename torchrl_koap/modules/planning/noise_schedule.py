@@ -5,8 +5,8 @@ A noisy sequence at time ``t`` is
 
     x_t = signal(t) x_0 + noise(t) eps,    eps ~ N(0, I),    signal^2 + noise^2 = 1
 
-with ``t`` counted in training steps ``0 .. N-1``. Solvers walk from much noise to none: pure functions in
-:data:`SOLVERS`, to which adding one is a function and a line.
+with ``t`` counted in training steps ``0 .. 49``. Networks predict ``x_0``. Solvers walk from much noise to none: pure
+functions in :data:`SOLVERS`, to which adding one is a function and a line.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.lookup import lookup
 
-PREDICTIONS = ("sample", "epsilon")
+NUM_TRAIN_STEPS = 50
 
 
 class NoiseLevel(NamedTuple):
@@ -31,21 +31,20 @@ class NoiseLevel(NamedTuple):
     noise: float
 
 
-Denoise = Callable[[Tensor, NoiseLevel], tuple[Tensor, Tensor]]
+Denoise = Callable[[Tensor, NoiseLevel], Tensor]
 
 
 def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
     """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0): clean sequences ``[*B, H, d]``.
 
     Args:
-        denoise (callable): ``denoise(x, level)`` gives the clean sequence and the noise that the network sees in ``x``,
-            both ``[*B, H, d]``.
+        denoise (callable): ``denoise(x, level)`` gives the clean sequence ``[*B, H, d]`` seen in ``x``.
         x (Tensor): start noise ``[*B, H, d]``.
         levels (sequence of NoiseLevel): stops from much noise to none, one more than steps.
     """
     for level, after in zip(levels[:-1], levels[1:], strict=True):
-        sample, epsilon = denoise(x, level)
-        x = sample * after.signal + epsilon * after.noise
+        sample = denoise(x, level)
+        x = sample * after.signal + (x - sample * level.signal) / level.noise * after.noise
     return x
 
 
@@ -56,7 +55,7 @@ def dpm_solver_2m(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> 
     """
     previous, previous_step = None, 0.0
     for level, after in zip(levels[:-1], levels[1:], strict=True):
-        sample, _ = denoise(x, level)
+        sample = denoise(x, level)
         if after.noise == 0:
             return sample * after.signal
         step = math.log(after.signal / after.noise) - math.log(level.signal / level.noise)
@@ -71,23 +70,10 @@ def dpm_solver_2m(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> 
 SOLVERS = {"dpm++2m": dpm_solver_2m, "ddim": ddim}
 
 
-def squared_cosine(num_train_steps: int) -> Tensor:
-    """Computes the signal variance after each step, nearly a squared cosine (Nichol and Dhariwal 2021), float64."""
-    edges = torch.arange(num_train_steps + 1, dtype=torch.float64) / num_train_steps
-    kept = torch.cos((edges + 0.008) / 1.008 * math.pi / 2).square()
-    return (kept[1:] / kept[:-1]).clamp_min(1e-3).cumprod(0)
-
-
 class NoiseSchedule(nn.Module):
-    """Adds noise to sequences of a squared-cosine schedule, says what a network predicts, and removes noise again.
+    """Adds noise to sequences, and removes it again.
 
-    Args:
-        prediction (str): what the network predicts, ``"sample"`` the clean sequence or ``"epsilon"`` the noise.
-            Defaults to ``"sample"``.
-        num_train_steps (int): number ``N`` of noise levels in training. Defaults to 50.
-
-    Raises:
-        ValueError: for an unknown prediction (the nearest name is suggested), or fewer than one step.
+    The variance of the signal falls nearly as a squared cosine in 50 steps (Nichol and Dhariwal 2021).
 
     Examples:
         >>> import torch
@@ -99,14 +85,12 @@ class NoiseSchedule(nn.Module):
         True
     """
 
-    def __init__(self, prediction: str = "sample", num_train_steps: int = 50):
+    def __init__(self):
         super().__init__()
-        lookup(PREDICTIONS, prediction, "prediction")
-        if num_train_steps < 1:
-            raise ValueError(f"num_train_steps must be at least 1, got {num_train_steps}")
-        self.prediction, self.num_train_steps = prediction, num_train_steps
         with torch.device("cpu"):  # the numbers are read below, also where modules are built without storage
-            variance = squared_cosine(num_train_steps)
+            edges = torch.arange(NUM_TRAIN_STEPS + 1, dtype=torch.float64) / NUM_TRAIN_STEPS
+            kept = torch.cos((edges + 0.008) / 1.008 * math.pi / 2).square()
+            variance = (kept[1:] / kept[:-1]).clamp_min(1e-3).cumprod(0)
         signal, noise = variance.sqrt(), (1 - variance).sqrt()
         # Solvers read numbers from here: exact in every dtype, no device synchronisation, constants for torch.compile.
         self._levels = tuple(zip(signal.tolist(), noise.tolist(), strict=True))
@@ -116,7 +100,7 @@ class NoiseSchedule(nn.Module):
 
     def sample_time(self, like: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draws training times ``[*B]``, in training steps, of the type and device of sequences ``[*B, H, d]``."""
-        time = torch.randint(self.num_train_steps, like.shape[:-2], device=like.device, generator=generator)
+        time = torch.randint(NUM_TRAIN_STEPS, like.shape[:-2], device=like.device, generator=generator)
         return time.to(like.dtype)
 
     def add_noise(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
@@ -125,34 +109,16 @@ class NoiseSchedule(nn.Module):
         signal, amplitude = self.signal[index].to(time.dtype), self.noise[index].to(time.dtype)
         return signal[..., None, None] * sample + amplitude[..., None, None] * noise
 
-    def target(self, sample: Tensor, noise: Tensor) -> Tensor:
-        """What the network should predict of :meth:`add_noise`: the clean sequence or the noise."""
-        return noise if self.prediction == "epsilon" else sample
-
     def noise_levels(self, num_steps: int) -> list[NoiseLevel]:
         """Lists the stops of a solver, one more than steps, evenly spaced from the noisiest level to no noise.
 
         Raises:
             ValueError: if the number of steps is out of range.
         """
-        if not 1 <= num_steps <= self.num_train_steps:
-            raise ValueError(f"num_steps must lie in 1..{self.num_train_steps} (num_train_steps), got {num_steps}")
-        times = [round(self.num_train_steps * (num_steps - step) / num_steps) - 1 for step in range(num_steps)]
+        if not 1 <= num_steps <= NUM_TRAIN_STEPS:
+            raise ValueError(f"num_steps must lie in 1..{NUM_TRAIN_STEPS}, the steps of training, got {num_steps}")
+        times = [round(NUM_TRAIN_STEPS * (num_steps - step) / num_steps) - 1 for step in range(num_steps)]
         return [*(NoiseLevel(float(time), *self._levels[time]) for time in times), NoiseLevel(0.0, 1.0, 0.0)]
-
-    def split(
-        self, output: Tensor, x: Tensor, level: NoiseLevel, prefix: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Splits noisy sequences ``x`` of a level into the clean ones and the noise that a network output stands for.
-
-        All are ``[*B, H, d]``; ``prefix`` as for :meth:`solve`.
-        """
-        sample = output if self.prediction == "sample" else (x - output * level.noise) / level.signal
-        if prefix is not None:
-            sample = torch.cat([prefix, sample[..., prefix.shape[-2] :, :]], -2)
-        elif self.prediction == "epsilon":
-            return sample, output
-        return sample, (x - sample * level.signal) / level.noise
 
     def solve(
         self,
@@ -166,7 +132,7 @@ class NoiseSchedule(nn.Module):
         """Turns noise into sequences ``[*B, H, d]``.
 
         Args:
-            network (callable): ``network(x [*B, H, d], time [*B]) -> [*B, H, d]``, its output read as ``prediction``.
+            network (callable): ``network(x [*B, H, d], time [*B]) -> [*B, H, d]``, the clean sequence.
             noise (Tensor): start noise ``[*B, H, d]``, standard normal.
             num_steps (int): number of solver steps.
             solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
@@ -180,7 +146,8 @@ class NoiseSchedule(nn.Module):
         """
         run, levels, batch = lookup(SOLVERS, solver, "solver"), self.noise_levels(num_steps), noise.shape[:-2]
 
-        def denoise(x: Tensor, level: NoiseLevel) -> tuple[Tensor, Tensor]:
-            return self.split(network(x, x.new_full(batch, level.time)), x, level, prefix)
+        def denoise(x: Tensor, level: NoiseLevel) -> Tensor:
+            sample = network(x, x.new_full(batch, level.time))
+            return sample if prefix is None else torch.cat([prefix, sample[..., prefix.shape[-2] :, :]], -2)
 
         return run(denoise, noise, levels)

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torchrl_koap import keys
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.forecast import LinearForecast
-from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
 
@@ -57,7 +56,6 @@ class StatePlanner(ConditionalSampler):
     def __init__(
         self,
         denoiser: nn.Module,
-        schedule: NoiseSchedule | None = None,
         *,
         state_dim: int,
         relative: bool = True,
@@ -66,7 +64,7 @@ class StatePlanner(ConditionalSampler):
         **options: Any,
     ):
         options |= {"relative": relative, "out_keys": out_keys}
-        super().__init__(denoiser, schedule, state_dim=state_dim, width=state_dim, **options)
+        super().__init__(denoiser, state_dim=state_dim, width=state_dim, **options)
         entries = self.horizon * state_dim
         self.plan_normalizer = Normalizer(entries)
         self.forecast = LinearForecast(len(self.condition_normalizer.scale), entries) if forecast else None

@@ -9,29 +9,11 @@ These numbers only ever join the planner's condition; plans stay states.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 NEAR = (0.05, 0.015)  # m; distances that the magnified copies resolve
-
-
-@dataclass(frozen=True)
-class RelativePosition:
-    """One position as seen from another.
-
-    Args:
-        place (slice): state columns of the position, 2 or 3 of them.
-        origin (slice): state columns of the position it is seen from; where it has 2, the height is taken as it is.
-        yaw (slice, optional): state columns ``cos, sin`` of the yaw of the frame it is seen in.
-        other_yaw (slice, optional): ``cos, sin`` of a yaw to be told relative to that frame, too.
-    """
-
-    place: slice
-    origin: slice
-    yaw: slice | None = None
-    other_yaw: slice | None = None
 
 
 class RelativePositionFeatures(nn.Module):
@@ -43,42 +25,44 @@ class RelativePositionFeatures(nn.Module):
     for every position ``p`` to an origin ``o`` with yaw ``theta``; heights are not turned.
 
     Args:
-        pairs (sequence of RelativePosition): positions and what they are seen from.
+        pairs (sequence): state columns of up to four parts each: a position of 2 or 3 columns; the position it is seen
+            from, whose height is taken as it is where it has 2; ``cos, sin`` of the yaw of the frame it is seen in;
+            ``cos, sin`` of a yaw to be told relative to that frame, too.
 
     Shape:
         history of states ``[*B, h, d]`` to ``[*B, num_features]``; the last frame counts.
     """
 
-    def __init__(self, pairs: Sequence[RelativePosition]):
+    def __init__(self, pairs: Sequence[Sequence[slice]]):
         super().__init__()
-        self.pairs = tuple(pairs)
+        self.pairs = [(*pair, None, None)[:4] for pair in pairs]
 
     @property
     def num_features(self) -> int:
         """Number of features."""
-        sizes = (pair.place.stop - pair.place.start for pair in self.pairs)
-        return sum((1 + len(NEAR)) * size for size in sizes) + sum(2 for pair in self.pairs if pair.other_yaw)
+        sizes = (place.stop - place.start for place, *_ in self.pairs)
+        return sum((1 + len(NEAR)) * size for size in sizes) + sum(2 for *_, turned in self.pairs if turned)
 
     def forward(self, history: Tensor) -> Tensor:
         """Features of the last frame."""
         state = history[..., -1, :]
         parts = []
-        for pair in self.pairs:
-            place, origin = state[..., pair.place], state[..., pair.origin]
+        for *positions, yaw, turned in self.pairs:
+            place, origin = (state[..., columns] for columns in positions)
             shared = min(place.shape[-1], origin.shape[-1])
             gap = torch.cat([place[..., :shared] - origin[..., :shared], place[..., shared:]], -1)
-            if pair.yaw is not None:
-                frame = state[..., pair.yaw]
+            if yaw is not None:
+                frame = state[..., yaw]
                 gap = torch.cat([_turn_back(gap[..., :2], frame), gap[..., 2:]], -1)
-                if pair.other_yaw is not None:
-                    parts.append(_turn_back(state[..., pair.other_yaw], frame))
+                if turned is not None:
+                    parts.append(_turn_back(state[..., turned], frame))
             parts += [gap, *(torch.tanh(gap / near) for near in NEAR)]
         return torch.cat(parts, -1)
 
 
 def relative_features(pairs: Sequence[Sequence[slice]]) -> RelativePositionFeatures | None:
     """Makes the features of a task from its columns, ``Task.relative_columns()``; None where it has no pair of them."""
-    return RelativePositionFeatures([RelativePosition(*pair) for pair in pairs]) if pairs else None
+    return RelativePositionFeatures(pairs) if pairs else None
 
 
 def _turn_back(vector: Tensor, yaw: Tensor) -> Tensor:

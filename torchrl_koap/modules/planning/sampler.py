@@ -24,10 +24,8 @@ class ConditionalSampler(TensorDictModuleBase):
     give one fixed mode. For evaluations that can be repeated put standard normal noise into the entry ``noise_key``.
 
     Args:
-        denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])``, of the shape
-            of the sequence.
-        schedule (NoiseSchedule, optional): noise levels and what the denoiser predicts. Defaults to
-            ``NoiseSchedule()``.
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])``, the clean
+            sequence.
 
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
@@ -52,7 +50,6 @@ class ConditionalSampler(TensorDictModuleBase):
     def __init__(
         self,
         denoiser: nn.Module,
-        schedule: NoiseSchedule | None = None,
         *,
         state_dim: int,
         width: int,
@@ -74,8 +71,7 @@ class ConditionalSampler(TensorDictModuleBase):
         if len(in_keys) != 1 or len(out_keys) != 1:
             raise ValueError(f"one in_key and one out_key are needed, got {in_keys} and {out_keys}")
         self.in_keys, self.out_keys, self.noise_key = list(in_keys), list(out_keys), noise_key
-        self.denoiser = denoiser
-        self.schedule = NoiseSchedule() if schedule is None else schedule
+        self.denoiser, self.schedule = denoiser, NoiseSchedule()
         lookup(SOLVERS, solver, "solver")
         self.schedule.noise_levels(num_steps)  # refuses a number out of range
         self.solver, self.num_steps = solver, num_steps
@@ -159,10 +155,10 @@ class ConditionalSampler(TensorDictModuleBase):
         with torch.no_grad():
             noise = torch.randn_like(sequence) if noise is None else noise
             time = self.schedule.sample_time(sequence) if time is None else time.to(sequence.dtype)
-            noisy, target = self.schedule.add_noise(sequence, noise, time), self.schedule.target(sequence, noise)
+            noisy = self.schedule.add_noise(sequence, noise, time)
         with torch.autocast(sequence.device.type, dtype, enabled=dtype is not None):
             predicted = self.denoiser(noisy, time, condition)
-        return (predicted - target).square()
+        return (predicted - sequence).square()
 
     def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draws start noise ``[*B, H, width]`` for histories ``[*B, h, d]``, standard normal."""

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from torchrl_koap.modules.planning.denoisers import Denoiser
 
+KERNEL, GROUPS = 5, 8  # width of the convolutions in steps; groups of the group norm
+
 
 class TemporalUnet(Denoiser):
     """One-dimensional U-Net over the steps of a plan, conditioned by FiLM (Janner et al. 2022; Chi et al. 2023).
@@ -29,16 +31,11 @@ class TemporalUnet(Denoiser):
         condition_dim (int): number ``c`` of condition columns.
 
     Keyword Args:
-        channels (sequence of int): channels per level. Defaults to ``(32, 64)``.
-        kernel_size (int): odd width of the convolutions in steps. Defaults to 5.
-        blocks_per_level (int): residual blocks per level on either side. Defaults to 1.
-        groups (int): groups of the group norm; must divide every entry of ``channels``. Defaults to 8.
+        channels (sequence of int): channels per level, multiples of 8. Defaults to ``(32, 64)``.
         frequencies (int): octaves of the condition's Fourier features. Defaults to 4.
-        condition_width (int): width of their encoder. Defaults to 128.
-        **options: ``embedding_dim``, width of the step embedding.
 
     Raises:
-        ValueError: if a size is not possible; the message names the argument.
+        ValueError: for other channels.
 
     Examples:
         >>> import torch
@@ -48,53 +45,32 @@ class TemporalUnet(Denoiser):
         torch.Size([3, 14, 2])
     """
 
-    def __init__(
-        self,
-        state_dim: int,
-        condition_dim: int,
-        *,
-        channels: Sequence[int] = (32, 64),
-        kernel_size: int = 5,
-        blocks_per_level: int = 1,
-        groups: int = 8,
-        frequencies: int = 4,
-        condition_width: int = 128,
-        **options: int,
-    ):
-        options |= {"frequencies": frequencies, "condition_width": condition_width}
-        super().__init__(state_dim, condition_dim, **options)
+    def __init__(self, state_dim: int, condition_dim: int, *, channels: Sequence[int] = (32, 64), frequencies: int = 4):
+        super().__init__(state_dim, condition_dim, frequencies=frequencies, condition_width=128)
         channels = tuple(channels)
-        if not channels or any(width < 1 or width % groups for width in channels):
-            raise ValueError(f"channels must be multiples of groups ({groups}), got {channels}")
-        if kernel_size < 1 or kernel_size % 2 == 0:
-            raise ValueError(f"kernel_size must be odd, got {kernel_size}")
-        if blocks_per_level < 1:
-            raise ValueError(f"blocks_per_level must be at least 1, got {blocks_per_level}")
+        if not channels or any(width < 1 or width % GROUPS for width in channels):
+            raise ValueError(f"channels must be multiples of {GROUPS}, got {channels}")
         self.multiple = max(8, 2 ** (len(channels) - 1))  # steps that plans are padded to a multiple of
 
-        def blocks(width_in: int, width_out: int) -> nn.ModuleList:
-            widths = [width_in] + [width_out] * blocks_per_level
-            return nn.ModuleList(
-                _Block(a, b, kernel_size, groups) for a, b in zip(widths[:-1], widths[1:], strict=True)
-            )
+        def block(width_in: int, width_out: int) -> nn.ModuleList:
+            return nn.ModuleList([_Block(width_in, width_out)])  # of one: pretrained weights are named so
 
         levels = list(zip((state_dim, *channels[:-1]), channels, strict=True))
-        self.down = nn.ModuleList(blocks(*level) for level in levels)
+        self.down = nn.ModuleList(block(*level) for level in levels)
         self.shrink = nn.ModuleList(nn.Conv1d(width, width, 3, stride=2, padding=1) for width in channels[:-1])
-        self.middle = blocks(channels[-1], channels[-1])
-        self.up = nn.ModuleList(blocks(2 * width_out, width_in) for width_in, width_out in reversed(levels[1:]))
+        self.middle = block(channels[-1], channels[-1])
+        self.up = nn.ModuleList(block(2 * width_out, width_in) for width_in, width_out in reversed(levels[1:]))
         self.grow = nn.ModuleList(
             nn.ConvTranspose1d(width, width, 4, stride=2, padding=1) for width in reversed(channels[:-1])
         )
         self.head = nn.Sequential(
-            nn.Conv1d(channels[0], channels[0], kernel_size, padding=kernel_size // 2),
-            nn.GroupNorm(groups, channels[0]),
+            nn.Conv1d(channels[0], channels[0], KERNEL, padding=KERNEL // 2),
+            nn.GroupNorm(GROUPS, channels[0]),
             nn.SiLU(),
             nn.Conv1d(channels[0], state_dim, 1),
         )
         # One matrix product serves the FiLM of all blocks: at batch 1 the number of calls is what costs.
-        stages = (*self.down, self.middle, *self.up)
-        self._film_sizes = [2 * block.width for blocks in stages for block in blocks]
+        self._film_sizes = [2 * stage.width for (stage,) in (*self.down, self.middle, *self.up)]
         self.film = nn.Sequential(nn.SiLU(), nn.Linear(self.context_dim, sum(self._film_sizes)))
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
@@ -108,33 +84,27 @@ class TemporalUnet(Denoiser):
         films = iter(film.unsqueeze(-1).split(self._film_sizes, 1))
 
         kept = []
-        for level, blocks in enumerate(self.down):
-            for block in blocks:
-                x = block(x, next(films))
+        for level, (block,) in enumerate(self.down):
+            x = block(x, next(films))
             kept.append(x)
             if level < len(self.shrink):
                 x = self.shrink[level](x)
-        for block in self.middle:
-            x = block(x, next(films))
-        for blocks, grow in zip(self.up, self.grow, strict=True):
-            x = torch.cat([x, kept.pop()], 1)
-            for block in blocks:
-                x = block(x, next(films))
-            x = grow(x)
+        x = self.middle[0](x, next(films))
+        for (block,), grow in zip(self.up, self.grow, strict=True):
+            x = grow(block(torch.cat([x, kept.pop()], 1), next(films)))
         return self.head(x)[..., :horizon].transpose(1, 2)
 
 
 class _Block(nn.Module):
     """Two convolutions with a FiLM between them and a residual path around them."""
 
-    def __init__(self, width_in: int, width: int, kernel_size: int, groups: int):
+    def __init__(self, width_in: int, width: int):
         super().__init__()
         self.width = width
-        padding = kernel_size // 2
-        self.first = nn.Conv1d(width_in, width, kernel_size, padding=padding)
-        self.first_norm = nn.GroupNorm(groups, width)
-        self.second = nn.Conv1d(width, width, kernel_size, padding=padding)
-        self.second_norm = nn.GroupNorm(groups, width)
+        self.first = nn.Conv1d(width_in, width, KERNEL, padding=KERNEL // 2)
+        self.first_norm = nn.GroupNorm(GROUPS, width)
+        self.second = nn.Conv1d(width, width, KERNEL, padding=KERNEL // 2)
+        self.second_norm = nn.GroupNorm(GROUPS, width)
         self.shortcut = nn.Conv1d(width_in, width, 1) if width_in != width else nn.Identity()
         self.activation = nn.SiLU()
 
