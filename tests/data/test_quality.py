@@ -75,7 +75,7 @@ def test_short_trajectories_are_named():
 
 def test_actions_that_never_change_are_named():
     assert warnings([PATH], [torch.cat([PATH[1:, :1], ACTIONS], 1)], acting=["v", "grip"]) == [
-        "action 'grip' is 1 in all labels: a policy always commands that"
+        "action 'grip' is 1 in all labels: controllers command that, method dp something near it"
     ]
     assert constant_columns(np.array([[1.0, np.nan], [2.0, 5.0], [2.0, 5.0]])) == [2.0, 5.0]
 

@@ -47,12 +47,13 @@ WRONG: dict[Any, tuple[str, ...]] = {
 RIGHT = {
     "convert": ("--name n0nsense", "--out /dev/null/below"),
     "demos": ("--seed 0",),
-    "eval": ("--seed 0",),
-    "inspect": ("--seed 0",),
+    "eval": ("--seed 0", "--limits inf"),
+    "inspect": ("--seed 0", "--limits inf"),
     "suggest": ("--seed 0",),
     "train": (
         *("--run.seed 0", "--controller.steps 0", "--labels.episodes -1", "--labels.episodes 0"),
         *("--planner.held-out 0", "--planner.octaves 0", "--execution.blend 0", "--execution.lead 0"),
+        "--execution.limits inf",
     ),
 }
 RIGHT["curve"] = RIGHT["bench"] = (*RIGHT["train"], "--evaluation.seed 0")

@@ -19,11 +19,12 @@ from torchrl_koap.runs.run_directory import RunDirectoryError
         {"labels": LabelConfig(episodes=(1, 4)), "run": RunConfig(plugins=("math",), seed=3)},
         {"planner": PlannerConfig(network="mlp", width=64, source="runs/a"), "execution": ExecutionConfig(blend=0.5)},
         {"method": "dp", "labels": LabelConfig(count=3), "controller": ControllerConfig(columns="all")},
+        {"execution": ExecutionConfig(limits=float("inf"))},
     ],
 )
 def test_what_is_written_may_be_read(options):
     config = TrainConfig(out="run", task="avoiding", **options)
-    assert from_json(TrainConfig, json.loads(json.dumps(to_json(config))), "config.json") == config
+    assert from_json(TrainConfig, json.loads(json.dumps(to_json(config), allow_nan=False)), "config.json") == config
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,8 @@ def test_what_is_written_may_be_read(options):
         ({"labels": {"episodes": [8, "a"]}}, r"a.json: labels.episodes must be a list of int, got \[8, 'a'\]"),
         ({"planner": {"learning_rate": "x" * 99}}, "planner.learning_rate must be a number or null, got 'x+..."),
         ({"out": 3}, "a.json: out must be a path, got 3"),
+        ({"execution": {"blend": "inf"}}, r"a.json: blend must be in \[0, 1\), got inf"),
+        ({"planner": {"network": "inf", "steps": "inf"}}, "a.json: planner.steps must be int or null, got 'inf'"),
         ({"planner": {"steps": 0}}, "a.json: planner.steps must be >= 1, got 0"),
         ({"labels": {"cuont": 5}}, "a.json: unknown option labels.cuont: did you mean labels.count?"),
         ({"steps": 5}, "a.json: unknown option steps: steps is in section planner or section controller"),

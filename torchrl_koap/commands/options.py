@@ -28,6 +28,7 @@ from torchrl_koap.runs.config_files import FACTS, from_json
 from torchrl_koap.runs.run_directory import RunDirectoryError
 
 LARGEST = 2**53  # beyond it a number is not even counted exactly
+_MAY_BE_INFINITE = ("limits",)
 Config = TypeVar("Config")
 # the fields of a configuration are options of the command itself: `--steps`, not `--config.steps`
 Options = Annotated[Config, tyro.conf.arg(name="")]
@@ -77,13 +78,16 @@ def check_options(options: Any) -> None:
     """Checks the options of a command, those of its configurations included.
 
     Raises:
-        ValueError: for numbers that are NaN, infinite or beyond 2^53, and an ``out`` that lies below a file.
+        ValueError: for numbers that are NaN, infinite or beyond 2^53, and an ``out`` that lies below a file. Infinite
+            limits of commands are right.
     """
     for field in fields(options):
         value, option = getattr(options, field.name), f"--{field.name.replace('_', '-')}"
         if is_dataclass(value):
             check_options(value)
         for number in value if isinstance(value, tuple) else (value,):
+            if number == math.inf and field.name in _MAY_BE_INFINITE:
+                continue
             if isinstance(number, float) and not math.isfinite(number):
                 raise ValueError(f"{option} must be a finite number, got {number}")
             if isinstance(number, (int, float)) and abs(number) > LARGEST:

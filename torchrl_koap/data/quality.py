@@ -58,7 +58,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *_leaps(frames, called, task.state_names),
         *_stillness(frames, called),
         *(
-            f"action {name!r} is {value:g} in all labels: a policy always commands that"
+            f"action {name!r} is {value:g} in all labels: controllers command that, method dp something near it"
             for name, value in constants
             if value is not None
         ),

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.modules import ExecutionConfig
+from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import writable_folder
@@ -63,7 +64,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     check_options(config)
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
-    trained = Trained.load(writable_folder(run, config.out))
+    trained = Trained.load(writable_folder(run, config.out)).with_ranges(config.dataset)
     directory, task = RunDirectory(trained.folder), trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)
@@ -71,7 +72,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    where = _place_of(task, config)
+    where = place_of(task, config)
     errors, actions = evaluate_actions(trained, config.dataset)
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -98,7 +99,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     learned = config.execution if policy.execution.strategy != "oracle" else ExecutionConfig()
     timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
     result |= measure_latency(timed, task.observation_dim)
-    result |= errors | limited_commands(policy) | {"execution": asdict(policy.execution), "episode": rows}
+    result |= errors | limited_commands(policy) | {"execution": to_json(policy.execution), "episode": rows}
     if config.env is not None:
         result |= {"env": config.env, "success_key": config.success_key}
     rollouts = rollouts_to_tensors(
@@ -124,7 +125,7 @@ def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     policy = trained_policy(trained, config.execution)
     result, actions = evaluate_offline(trained, config)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
-    result["seed"] = config.seed
+    result |= {"seed": config.seed, "execution": to_json(policy.execution)}
     if actions:
         save_tensors(trained.folder / "actions.safetensors", actions)
     RunDirectory(trained.folder).write_json("eval.json", result)
@@ -163,7 +164,7 @@ def _refuse_contexts(rollouts_per_context: int, contexts_file: Path | None, wher
 
 
 @dataclass(frozen=True)
-class _Place:
+class Place:
     """Where a run is rolled out."""
 
     make_env: Callable[[int], Any]  # of a number of parallel episodes
@@ -174,18 +175,22 @@ class _Place:
     contexts: np.ndarray | None = None
 
 
-def _place_of(task: Task, config: EvalConfig) -> _Place:
-    """The task's own environment, or the one of Gymnasium that was asked for."""
+def place_of(task: Task, config: EvalConfig) -> Place:
+    """Finds the task's own environment, or the one of Gymnasium that was asked for.
+
+    Raises:
+        ValueError: if there is no such environment, it is not of the task's widths, or contexts do not suffice.
+    """
     if config.env is None:
         numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
         make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
-        return _Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+        return Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
     _refuse_contexts(config.rollouts_per_context, config.contexts_file, "an environment of Gymnasium")
     from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
 
     make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
     probe = make_env(1)
     probe.close()
-    return _Place(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)
+    return Place(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)

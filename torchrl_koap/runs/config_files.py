@@ -7,6 +7,7 @@ import difflib
 import functools
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import types
@@ -38,8 +39,9 @@ def read_config(run: RunDirectory) -> TrainConfig:
 
 
 def to_json(config: Any) -> dict[str, Any]:
-    """Returns options as ``json`` reads them, section by section."""
-    return json.loads(json.dumps(asdict(config), default=os.fspath))
+    """Returns options as ``json`` reads them, section by section; infinity, which JSON does not know, as ``"inf"``."""
+    text = json.dumps(asdict(config), default=os.fspath)
+    return json.loads(text, parse_constant=lambda word: word.replace("Infinity", "inf"))
 
 
 def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
@@ -67,6 +69,8 @@ def _read(kind: Any, content: Any, path: str, prefix: str, known: tuple[str, ...
         if is_dataclass(kinds[name]):
             values[name] = _read(kinds[name], value, path, f"{prefix}{name}.", known)
         else:
+            if value == "inf" and _fits(math.inf, kinds[name]):
+                value = math.inf
             if not _fits(value, kinds[name]):
                 wanted = f"{prefix}{name} must be {_words(kinds[name])}"
                 raise RunDirectoryError(f"{path}: {wanted}, got {_short(value)}")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.evaluation import EvalConfig
+from torchrl_koap.evaluation.closed_loop import place_of
 from torchrl_koap.evaluation.config import check_options
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
@@ -309,6 +310,9 @@ def check_study(study: Study) -> list[Cell]:
     contexts = study.evaluation.contexts_file
     if contexts is not None and not Path(contexts).is_file():
         raise ValueError(f"contexts_file: there is no file {contexts}")
+    if study.evaluation.env is not None:
+        for task in study.tasks:
+            place_of(study.task(task), study.evaluation)
     cells = study.cells()
     sampling = [name for name in study.methods if not get_method(name).plans]
     if study.execution.strategy == "open_loop" and sampling:

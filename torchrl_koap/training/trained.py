@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ from torchrl_koap.training.datasets import label_budget, load_demonstrations
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
-from torchrl_koap.training.policy_facts import policy_facts
+from torchrl_koap.training.policy_facts import command_ranges, policy_facts
 
 FORMAT, VERSION = "torchrl_koap policy", 2
 
@@ -195,6 +197,12 @@ class Trained:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
         gripper = decoder_columns(self.task)["gripper"] if isinstance(self.controller, CommandDecoder) else None
         ranges = self.results.get("command_ranges")
+        if ranges is None and execution.limits != math.inf:
+            warnings.warn(
+                f"{self.folder or 'this training'} stores no range of demonstrated commands: they are not limited;"
+                " `koap eval RUN --dataset DIR` stores it",
+                stacklevel=2,
+            )
         facts = policy_facts(self.task, columns=self.columns, gripper=gripper, ranges=ranges)
         if self.method.plans:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
@@ -221,6 +229,27 @@ class Trained:
                 " directory?): say where it is with --dataset"
             )
         return load_demonstrations(where, self.task)
+
+    def with_ranges(self, dataset: str | None = None) -> Trained:
+        """Finds the range of the demonstrated commands, and stores it in the folder, if the training did not.
+
+        Args:
+            dataset (str, optional): as for :meth:`data`. Where the data are not there the range stays unknown.
+
+        Returns:
+            Trained: the same with ``command_ranges`` in its results.
+        """
+        if self.results.get("command_ranges") is not None or self.folder is None:
+            return self
+        try:
+            labelled, _ = self.hide_labels(self.data(dataset))
+        except RunDirectoryError:
+            if dataset is not None:
+                raise
+            return self
+        results = dict(self.results) | {"command_ranges": command_ranges(self.task, labelled)}
+        RunDirectory(self.folder).write_json("summary.json", results)
+        return replace(self, results=results)
 
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
         """Hides all labels that the training did not see: their actions are NaN.
