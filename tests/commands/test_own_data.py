@@ -89,8 +89,14 @@ def test_export_and_latency(run, tmp_path, capsys, monkeypatch):
         "policy.pt2",
         "controller.pt2",
         "denoiser.pt2",
+        "policy.json",
     }
-    assert "policy ms eager" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "policy ms eager" in printed and "open loop between plans" in printed
+    facts = json.loads((tmp_path / "exported" / "policy.json").read_text())
+    observed, acted = facts["policy"]["inputs"]["observations"], facts["policy"]["outputs"]["actions"]
+    assert (observed["columns"], acted["columns"]) == (["q1", "q2", "goal1", "goal2"], ["dq1", "dq2"])
+    assert acted["units"] == ["rad", "rad"] and facts["policy"]["control_hz"] == 20
     assert koap("latency", run, "--steps", 10) == 0
     assert "late_steps" in capsys.readouterr().out
     assert koap("latency", run, "--steps", 10, "--async-replan") == 0

@@ -104,7 +104,7 @@ def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd
     assert koap("inspect", "pretrained:avoiding", "--out", out, *looked) == 0
     assert "findings" in json.loads((out / "inspect.json").read_text())
     assert koap("export", "pretrained:avoiding", "--out", exported, "--no-latency") == 0
-    assert len(list(exported.iterdir())) == 3
+    assert len(list(exported.iterdir())) == 4  # and policy.json
     assert koap("latency", "pretrained:avoiding", "--steps", "2") == 0
     written = {path.name for path in (policies / "avoiding").iterdir()}
     assert not {"inspect.json", "exported", "plots"} & written

@@ -33,6 +33,7 @@ from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import check_logger, log_scores, open_logger, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.studies import Machines, Study, run_study
+from torchrl_koap.tasks import Task
 from torchrl_koap.training import TrainConfig, Trained, train
 
 
@@ -162,7 +163,8 @@ class Latency(Command):
 class Export(Command):
     """Write a policy for torch.export, ONNX Runtime or AOTInductor.
 
-    Policy, controller and denoiser are compared with the originals (1e-5).
+    Policy, controller and denoiser are compared with the originals (1e-5, relative). Every file, and policy.json, say
+    what goes in and comes out: names, units, order of frames, noise, steps per plan.
 
     Example: `koap export runs/arm --format onnx`
 
@@ -189,10 +191,10 @@ class Export(Command):
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
         out.mkdir(parents=True, exist_ok=True)
         parts = [part for part in PARTS if part != "controller" or isinstance(policy.follower, InverseDynamicsFollower)]
-        result: dict[str, Any] = {}
+        columns, result, about = _columns(trained.task), dict[str, Any](), dict[str, Any]()
         with progress_bar(len(parts), "export", unit="part") as bar:
             for part in parts:
-                what = exportable(policy, part, observation_dim=trained.task.observation_dim)
+                what = exportable(policy, part, columns=columns)
                 file = out / f"{part}{suffix}"
                 loaded = export_part(what, file, kind=self.format)
                 result[part] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
@@ -200,8 +202,22 @@ class Export(Command):
                 if self.latency:
                     times = time_calls({"eager": what.module, self.format: loaded}, tuple(what.inputs.values()))
                     result[f"{part} ms"] = times
+                about[part] = {"file": file.name, **what.facts}
                 bar.update()
-        return result
+        RunDirectory(out).write_json("policy.json", {"task": trained.task.name, **about})
+        return result | {"note": about["policy"]["note"]}
+
+
+def _columns(task: Task) -> dict[str, dict[str, str]]:
+    """Name to unit of what an exported policy reads and writes; the parts of our own tasks tell their metres."""
+    parts = {part: range(task.observation_dim)[columns] for part, columns in task.observation.items()}
+    metres = [part.endswith(("_xy", "_xyz", "_position")) for part, columns in parts.items() for _ in columns]
+    units = task.observation_units or ["m" if metre else "" for metre in metres]
+    return {
+        "observations": dict(zip(task.observation_names, units, strict=True)),
+        "states": dict(zip(task.state_names, task.state_units, strict=True)),
+        "actions": dict(zip(task.action_names, task.action_units, strict=True)),
+    }
 
 
 @dataclass(kw_only=True)

@@ -26,7 +26,7 @@ def seen(command, position, batch=()):
 def test_the_command_ends_within_the_lead_on_every_axis(batch, dtype):
     observed = seen((0.50, 0.30), (0.45, 0.38), batch).to(dtype)
     action = torch.full((*batch, 3), 0.2, dtype=dtype)
-    held = CommandLimits([0, 1], lead=0.1, **COLUMNS)(observed, action)
+    held, _ = CommandLimits([0, 1], lead=0.1, **COLUMNS)(observed, action)
     now = observed[..., -1, :]
     torch.testing.assert_close(now[..., :2] + held[..., :2] - now[..., 2:], torch.full((*batch, 2), 0.1, dtype=dtype))
     assert (held[..., 2] == 0.2).all() and (action == 0.2).all()  # the third is not one of the command's
@@ -35,7 +35,7 @@ def test_the_command_ends_within_the_lead_on_every_axis(batch, dtype):
 def test_actions_within_the_lead_are_left_alone():
     action = 0.04 * torch.rand(1000, 2)
     limits = CommandLimits([0, 1], lead=0.1, **COLUMNS)
-    assert torch.equal(limits(seen((0.5, 0.3), (0.45, 0.33), [1000]), action), action)  # bit by bit
+    assert torch.equal(limits(seen((0.5, 0.3), (0.45, 0.33), [1000]), action)[0], action)  # bit by bit
 
 
 def test_a_blocked_robot_turns_back_as_soon_as_its_policy_does():
@@ -44,7 +44,9 @@ def test_a_blocked_robot_turns_back_as_soon_as_its_policy_does():
         command, place = torch.zeros(2), torch.zeros(2)
         for step in range(60):
             action = torch.tensor([0.01 if step < 30 else -0.01, 0.0])  # forwards for 30 steps, then backwards
-            command = command + (action if limits is None else limits(torch.cat([command, place]).expand(1, 4), action))
+            command = command + (
+                action if limits is None else limits(torch.cat([command, place]).expand(1, 4), action)[0]
+            )
             place = torch.minimum(place + 0.5 * (command - place), torch.tensor([0.02, 1.0]))  # a wall
             if step >= 30 and place[0] < 0.019 and name not in turned:
                 turned[name] = step - 30
@@ -52,8 +54,8 @@ def test_a_blocked_robot_turns_back_as_soon_as_its_policy_does():
 
 
 def test_a_gain_multiplies_changes_of_a_command_alone():
-    assert CommandLimits([0, 2], gain=1.5)(torch.zeros(1, 1), torch.ones(4, 3)).tolist() == [[1.5, 1.0, 1.5]] * 4
-    both = CommandLimits([0, 1], gain=3.0, lead=0.1, **COLUMNS)(seen((0, 0), (0, 0)), torch.tensor([0.02, 0.05]))
+    assert CommandLimits([0, 2], gain=1.5)(torch.zeros(1, 1), torch.ones(4, 3))[0].tolist() == [[1.5, 1.0, 1.5]] * 4
+    both, _ = CommandLimits([0, 1], gain=3.0, lead=0.1, **COLUMNS)(seen((0, 0), (0, 0)), torch.tensor([0.02, 0.05]))
     torch.testing.assert_close(both, torch.tensor([0.06, 0.1]))
 
 
@@ -88,8 +90,10 @@ def test_commands_stay_in_the_demonstrated_range_and_those_outside_are_counted(k
     torch.testing.assert_close(held(td.clone())["action"], kept)  # the gain comes after it
     torch.testing.assert_close(wide(td.clone())["action"], off(td.clone())["action"], rtol=0, atol=0)
     assert (held.limited.tolist(), wide.limited.tolist(), plain.limited.tolist()) == ([3, 3], [0, 3], [0, 0])
-    exported = held.decode_ahead(td["observation_history"], torch.zeros(3, *plain.noise_shape))
+    exported, outside = held.decode_ahead(td["observation_history"], torch.zeros(3, *plain.noise_shape))
     assert exported[..., 2].max() <= 2 * 0.75 * low and held.limited.tolist() == [3, 3]
+    assert outside.shape == (3, 2) and outside[:, 0].all()
+    assert not plain.decode_ahead(td["observation_history"], torch.zeros(3, *plain.noise_shape))[1].any()
 
 
 @pytest.mark.parametrize("kind", ["feedback", "open_loop", "chunks"])
@@ -104,7 +108,7 @@ def test_every_kind_of_policy_applies_them_alike_in_rollouts_and_for_export(kind
     assert torch.equal(double[chunk], free[chunk])  # so the gain does not count twice in open loop
     assert torch.equal(near["action"][..., :2], free["action"][..., :2])
     assert (near["action"][..., 2].abs() == 0.25).all() and free["action"][..., 2].abs().min() > 0.25
-    decoded = [policy.decode_ahead(td["observation_history"], noise) for policy in (plain, twice, held)]
+    decoded = [policy.decode_ahead(td["observation_history"], noise)[0] for policy in (plain, twice, held)]
     torch.testing.assert_close(decoded[1], decoded[0] * gains)
     torch.testing.assert_close(decoded[2][..., 2], decoded[1][..., 2].clamp(-0.25, 0.25))
 
@@ -119,9 +123,9 @@ def test_a_task_says_which_columns_they_are():
     limits = policy_for("sorting", lead=0.1).limits
     observation = torch.zeros(1, get_task("sorting").observation_dim)
     observation[:, :2] = 1.0  # the last command, a metre ahead
-    torch.testing.assert_close(limits(observation, torch.zeros(2)), torch.tensor([-0.9, -0.9]))
+    torch.testing.assert_close(limits(observation, torch.zeros(2))[0], torch.tensor([-0.9, -0.9]))
     gain = policy_for("stacking", gain=1.5).limits
-    assert gain(torch.zeros(1, 1), torch.ones(8)).tolist() == [1.5] * 7 + [1.0]  # the gripper opens as it did
+    assert gain(torch.zeros(1, 1), torch.ones(8))[0].tolist() == [1.5] * 7 + [1.0]  # the gripper opens as it did
 
 
 def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):

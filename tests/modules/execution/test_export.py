@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,20 +18,32 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     make_policy,
 )
-from torchrl_koap.modules.execution.export import SUFFIXES, ExportError, export_part, exportable
+from torchrl_koap.modules.execution.export import FACTS, SUFFIXES, ExportError, export_part, exportable, relative_gap
+
+needs_onnx = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
+    reason="ONNX is not installed (extra 'onnx')",
+)
+COLUMNS = {
+    "observations": {"cx": "m", "cy": "m", "x": "m", "y": "m"},
+    "states": {"x": "m", "y": "m"},
+    "actions": {"dx": "m", "dy": "m", "grip": ""},
+}
 
 
-def policy(**execution):
+def policy(ranges=None, columns=None, **execution):
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
-    controller = make_koopman_inverse_dynamics(2, 3)
-    columns = {"commands": [0, 1], "states": [0, 1]}
+    controller = make_koopman_inverse_dynamics(2 if columns is None else len(columns), 3)
     return make_policy(
         planner,
         controller,
         state_of=(2, 3),
         changes=(0, 1),
-        commanded=columns,
+        commanded={"commands": [0, 1], "states": [0, 1]},
+        columns=columns,
+        ranges=ranges,
+        control_hz=30.0,
         execution=Execution(**execution),
     )
 
@@ -42,68 +56,104 @@ def chunks():
 
 def test_the_stateless_policy_is_the_open_loop_one():
     whole = policy()
-    what = exportable(whole, observation_dim=4)
+    what = exportable(whole, columns=COLUMNS)
     with torch.no_grad():
-        actions = what.module(*what.inputs.values())
+        actions, limited = what.module(*what.inputs.values())
         observed = what.inputs["observations"]
         assert {name: list(value.shape) for name, value in what.inputs.items()} == {
             "observations": [1, 5, 4],
             "noise": [1, 14, 2],
         }
         plan = whole.plan(observed, what.inputs["noise"])
-    assert actions.shape == (1, 4, 3)
+    assert actions.shape == (1, 4, 3) and not limited.any()
     torch.testing.assert_close(actions[:, 0], whole.act(observed, plan, 0))
 
 
 def test_gain_and_command_limit_are_exported(tmp_path):
-    what = exportable(policy(gain=1.5, lead=0.01), observation_dim=4)
+    what = exportable(policy(gain=1.5, lead=0.01), columns=COLUMNS)
     loaded = export_part(what, tmp_path / "policy.pt2")
     observed, noise = what.inputs["observations"] + 0.2, what.inputs["noise"]
     now = observed[0, -1]
-    ahead = now[:2] - now[2:] + loaded(observed, noise)[0, :, :2]
+    ahead = now[:2] - now[2:] + loaded(observed, noise)[0][0, :, :2]
     assert (ahead.abs() <= 0.01 + 1e-6).all() and (ahead.abs() > 0.0099).any()
 
 
 @pytest.mark.parametrize("part", ["policy", "controller", "denoiser"])
 def test_every_part_comes_back_from_its_file(part, tmp_path):
-    what = exportable(policy(), part, observation_dim=4)
+    what = exportable(policy(), part, columns=COLUMNS)
     loaded = export_part(what, tmp_path / f"{part}.pt2")
-    other = [value + 0.1 for value in what.inputs.values()]
+    other = [value + 0.1 for value in what.batch(7)]  # the batch is dynamic
     with torch.no_grad():
         torch.testing.assert_close(loaded(*other), what.module(*other), atol=1e-5, rtol=1e-5)
 
 
 def test_a_diffusion_policy_is_exported_too(tmp_path):
-    what = exportable(chunks(), observation_dim=4)
-    assert export_part(what, tmp_path / "policy.pt2")(*what.inputs.values()).shape == (1, 4, 3)
+    what = exportable(chunks(), columns=COLUMNS)
+    assert export_part(what, tmp_path / "policy.pt2")(*what.inputs.values())[0].shape == (1, 4, 3)
     with pytest.raises(ValueError, match="has no inverse dynamics to export"):
-        exportable(chunks(), "controller", observation_dim=4)
+        exportable(chunks(), "controller", columns=COLUMNS)
 
 
-@pytest.mark.skipif(
-    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
-    reason="ONNX is not installed (extra 'onnx')",
-)
-def test_onnx(tmp_path):
-    what = exportable(policy(), "controller", observation_dim=4)
-    loaded = export_part(what, tmp_path / "controller.onnx", kind="onnx")
+@needs_onnx
+def test_onnx_is_called_as_its_metadata_say(tmp_path):
+    import onnxruntime
+
+    frames, noise = torch.randn(5, 5, 4), torch.randn(5, 14, 2)
     with torch.no_grad():
-        torch.testing.assert_close(loaded(*what.inputs.values()), what.module(*what.inputs.values()))
+        usual = float(policy().decode_ahead(frames, noise)[0][..., 0].abs().median())
+        whole = policy(ranges=[(-usual / 2, usual / 2), None, None], replan_interval=3)  # widened by half
+        expected, held = whole.decode_ahead(frames, noise)
+    export_part(exportable(whole, columns=COLUMNS), tmp_path / "policy.onnx", kind="onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    facts = session.get_modelmeta().custom_metadata_map
+    inputs, outputs = json.loads(facts["inputs"]), json.loads(facts["outputs"])
+    assert [entry.name for entry in session.get_inputs()] == list(inputs)
+    assert [entry.name for entry in session.get_outputs()] == list(outputs)
+    assert [entry.shape for entry in session.get_inputs()] == [entry["shape"] for entry in inputs.values()]
+    actions, limited = session.run(None, {"observations": frames.numpy(), "noise": noise.numpy()})
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+    np.testing.assert_array_equal(limited, held)
+    assert actions.shape == (5, int(facts["steps_per_plan"]), 3) and limited.any() and not limited.all()
+    assert np.abs(actions[..., 0]).max() == pytest.approx(usual) and float(facts["control_hz"]) == 30.0
+
+
+def test_facts_are_in_the_file_of_torch_export(tmp_path):
+    export_part(exportable(policy(columns=[1]), "controller", columns=COLUMNS), tmp_path / "a.pt2")
+    found = {FACTS: ""}
+    torch.export.load(tmp_path / "a.pt2", extra_files=found)
+    facts = json.loads(found[FACTS])
+    assert facts["inputs"]["states"] == {
+        "shape": ["batch", 19, 1],
+        "type": "float32",
+        "meaning": "raw units, oldest frame first: those observed, then those planned",
+        "columns": ["y"],
+        "units": ["m"],
+    }
+    assert facts["outputs"]["actions"]["columns"] == ["dx", "dy", "grip"]
+    assert facts["steps_per_plan"] == 4 and "open loop between plans" in facts["note"]
+
+
+def test_differences_are_relative():
+    flags = torch.zeros(2, dtype=torch.bool)
+    large, small = torch.tensor([-2e-6, 1e-9]), torch.tensor([-2.002e-6, 1e-9])
+    assert relative_gap((small, flags), (large, flags)) == pytest.approx(1e-3, rel=1e-3)
+    assert relative_gap((0 * large,), (0 * large,)) == 0
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)  # minutes of g++
 def test_aotinductor(tmp_path):
-    what = exportable(policy(), observation_dim=4)
-    export_part(what, tmp_path / "policy.aoti.pt2", kind="aoti")
+    what = exportable(policy(), columns=COLUMNS)
+    loaded = export_part(what, tmp_path / "policy.aoti.pt2", kind="aoti")
+    assert loaded.get_metadata()["steps_per_plan"] == "4"
 
 
 def test_faults(tmp_path):
-    what = exportable(policy(), "controller", observation_dim=4)
+    what = exportable(policy(), "controller", columns=COLUMNS)
     with pytest.raises(ValueError, match="unknown export format 'onxx'; did you mean 'onnx'"):
         export_part(what, tmp_path / "x", kind="onxx")
     with pytest.raises(ValueError, match="unknown part of a policy 'denoisr'; did you mean 'denoiser'"):
-        exportable(policy(), "denoisr", observation_dim=4)
+        exportable(policy(), "denoisr", columns=COLUMNS)
     with pytest.raises(ExportError, match="differs from the policy by"):
         export_part(what, tmp_path / "x.pt2", tolerance=-1.0)
     assert set(SUFFIXES) == {"torch", "onnx", "aoti"}

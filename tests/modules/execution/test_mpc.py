@@ -88,7 +88,7 @@ def test_chunks_for_export_begin_with_the_action_of_the_step():
     policy = policy_of()
     assert policy.history == 3
     observed, noise = torch.randn(3, 3, 4), torch.randn(3, *policy.noise_shape)
-    chunk = policy.decode_ahead(observed, noise)
+    chunk, _ = policy.decode_ahead(observed, noise)
     assert chunk.shape == (3, 4, 2)
     td = TensorDict({"observation_history": observed, "is_init": torch.ones(3, 1, dtype=torch.bool), "noise": noise}, 3)
     torch.testing.assert_close(policy(td)["action"], chunk[:, 0])

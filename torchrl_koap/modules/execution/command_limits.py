@@ -53,7 +53,7 @@ class CommandLimits(nn.Module):
         >>> limits = CommandLimits([0, 1], lead=0.1, commands=[0, 1], positions=[2, 3])
         >>> ahead = torch.tensor([[0.59, 0.2, 0.5, 0.2]])  # commanded and measured xy (m)
         >>> limits(ahead, torch.full([2], 0.02))
-        tensor([0.0100, 0.0200])
+        (tensor([0.0100, 0.0200]), tensor(False))
     """
 
     def __init__(
@@ -84,15 +84,18 @@ class CommandLimits(nn.Module):
         for name, columns in {"actions": actions, "commands": commands, "positions": positions}.items():
             self.register_buffer(name, torch.as_tensor(list(columns), dtype=torch.long), persistent=False)
 
-    def forward(self, observations: Tensor, action: Tensor) -> Tensor:
+    def forward(self, observations: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """What is left of an action ``[*B, act]``, by observations ``[*B, history, obs]``, the present one last.
 
         What is within the limits keeps its bits, for episodes with contacts turn out otherwise for a rounding error.
-        """
-        return self.paced(observations, self.in_range(action))
 
-    def in_range(self, action: Tensor) -> Tensor:
-        """Actions ``[*B, act]`` clipped to their ranges."""
+        Returns:
+            tuple: the action ``[*B, act]``, and whether a column left its range, bool ``[*B]``.
+        """
+        held = self._in_range(action)
+        return self._paced(observations, held), (held != action).any(-1)
+
+    def _in_range(self, action: Tensor) -> Tensor:
         if self.ends is None:
             return action
         if action.shape[-1] != len(self.ends):
@@ -100,8 +103,8 @@ class CommandLimits(nn.Module):
         low, high = self.ends.to(action.dtype).unbind(-1)
         return action.clamp(low, high)
 
-    def paced(self, observations: Tensor, action: Tensor) -> Tensor:
-        """Actions ``[*B, act]`` with gain and lead; the other arguments are those of :meth:`forward`."""
+    def _paced(self, observations: Tensor, action: Tensor) -> Tensor:
+        """Actions ``[*B, act]`` with gain and lead."""
         if self.gain != 1:
             factors = torch.ones(action.shape[-1], dtype=action.dtype, device=action.device)
             action = action * factors.index_fill(0, self.actions, self.gain)

@@ -3,15 +3,17 @@
 
 What is exported is :meth:`~torchrl_koap.modules.PlanningPolicy.decode_ahead`: observations and start noise in, the next
 actions out, gain and command limit included, the solver's loop unrolled inside. Whoever calls it keeps the last
-observations and counts steps.
+observations and counts steps. Every file says what goes in and comes out (:attr:`Exportable.facts`).
 """
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +27,22 @@ from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 SUFFIXES = {"torch": ".pt2", "onnx": ".onnx", "aoti": ".aoti.pt2"}
 PARTS = ("policy", "controller", "denoiser")
+FACTS = "facts.json"  # inside of a file of torch.export
+_BATCHES = (1, 3)  # that what is read back is tried with
+_MEANINGS = {
+    "observations": "raw units, oldest frame first, the present one last; at the start the first one is repeated",
+    "noise": "standard normal numbers, drawn anew for every call",
+    "states": "raw units, oldest frame first: those observed, then those planned",
+    "actions": "raw units, the next control step first",
+    "limited": "which of these actions had left their range and were held at its end",
+}
+_OPEN_LOOP = (
+    "Exported chunks are open loop between plans: all actions of a call are decided by its observations. Execute one"
+    " per control step, then call again. Strategy 'feedback' looks at every step; its figures are not those of this"
+    " file."
+)
+
+Outputs = tuple[Tensor, ...]
 
 
 class ExportError(RuntimeError):
@@ -32,13 +50,13 @@ class ExportError(RuntimeError):
 
 
 class _WholePolicy(nn.Module):
-    """Observations ``[B, history, obs]`` and noise to the next actions ``[B, interval, act]``."""
+    """Observations ``[B, history, obs]`` and noise to the next actions ``[B, interval, act]``, and which were held."""
 
     def __init__(self, policy: PlanningPolicy):
         super().__init__()
         self.policy = policy
 
-    def forward(self, observations: Tensor, noise: Tensor) -> Tensor:
+    def forward(self, observations: Tensor, noise: Tensor) -> Outputs:
         return self.policy.decode_ahead(observations, noise)
 
 
@@ -49,21 +67,45 @@ class _Controller(nn.Module):
         super().__init__()
         self.controller = controller
 
-    def forward(self, states: Tensor) -> Tensor:
+    def forward(self, states: Tensor) -> Outputs:
         out = self.controller(TensorDict({self.controller.in_key: states}, batch_size=states.shape[:1]))
-        return out.get(self.controller.out_key)
+        return (out.get(self.controller.out_key),)
+
+
+class _Denoiser(nn.Module):
+    """Noisy sequences ``[B, H, w]``, noise levels ``[B]`` and conditions ``[B, c]`` to predictions ``[B, H, w]``."""
+
+    def __init__(self, denoiser: nn.Module):
+        super().__init__()
+        self.denoiser = denoiser
+
+    def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Outputs:
+        return (self.denoiser(sequence, time, condition),)
 
 
 @dataclass(frozen=True)
 class Exportable:
-    """A part of a policy as a plain module on tensors, an example of every input by name, and the output's name."""
+    """A part of a policy as a plain module on tensors.
+
+    Args:
+        module (nn.Module): from the inputs, in their order, to a tuple of tensors; any batch size.
+        inputs (dict): an example of every input by name, batch 1.
+        outputs (tuple of str): names of what comes out.
+        facts (dict): what a caller has to know, as JSON: shapes, names and units of the columns, order of frames,
+            meaning of the noise, rate and steps per plan.
+    """
 
     module: nn.Module
     inputs: dict[str, Tensor]
-    output: str
+    outputs: tuple[str, ...]
+    facts: dict[str, Any]
+
+    def batch(self, size: int) -> tuple[Tensor, ...]:
+        """Inputs of several robots, no two alike."""
+        return tuple(torch.cat([value + 0.1 * index for index in range(size)]) for value in self.inputs.values())
 
 
-def exportable(policy: PlanningPolicy, part: str = "policy", *, observation_dim: int) -> Exportable:
+def exportable(policy: PlanningPolicy, part: str = "policy", *, columns: Mapping[str, Mapping[str, str]]) -> Exportable:
     """A part of a policy as a plain module.
 
     Args:
@@ -71,68 +113,114 @@ def exportable(policy: PlanningPolicy, part: str = "policy", *, observation_dim:
         part (str): ``"policy"``, its ``"controller"``, or the planner's ``"denoiser"``.
 
     Keyword Args:
-        observation_dim (int): number of observation columns.
+        columns (mapping): name to unit of every column of ``"observations"``, ``"states"`` and ``"actions"``.
 
     Raises:
         ValueError: for another part, or the controller of a policy that decodes by no inverse dynamics.
     """
     lookup(PARTS, part, "part of a policy")
-    planner = policy.planner
+    planner, follower = policy.planner, policy.follower
     like = next(planner.parameters())
     generator = torch.Generator().manual_seed(0)
+    columns = {name: dict(entries) for name, entries in columns.items()}
+    outputs: tuple[str, ...]
 
     def example(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator).to(like)
 
     if part == "policy":
-        inputs = {
-            "observations": 0.1 * example(1, policy.history, observation_dim),
-            "noise": example(1, *planner.noise_shape),
-        }
-        return Exportable(_WholePolicy(policy), inputs, "actions")
-    if part == "controller":
-        follower = policy.follower
+        module: nn.Module = _WholePolicy(policy)
+        seen = 0.1 * example(1, policy.history, len(columns["observations"]))
+        inputs, outputs = {"observations": seen, "noise": example(1, *planner.noise_shape)}, ("actions", "limited")
+    elif part == "controller":
         if not isinstance(follower, InverseDynamicsFollower):
             raise ValueError("this policy has no inverse dynamics to export: its actions come from another model")
-        width = planner.state_dim if follower.columns is None else len(follower.columns)
-        inputs = {"states": example(1, policy.history + planner.horizon, width)}
-        return Exportable(_Controller(follower.controller), inputs, "actions")
-    condition = planner.encode_history(example(1, planner.history, planner.state_dim))
-    inputs = {"sequence": example(1, *planner.noise_shape), "time": example(1).abs(), "condition": condition}
-    return Exportable(planner.denoiser, inputs, "prediction")
+        if follower.columns is not None:
+            entries = list(columns["states"].items())
+            columns["states"] = dict(entries[column] for column in follower.columns.tolist())
+        module = _Controller(follower.controller)
+        inputs = {"states": example(1, policy.history + planner.horizon, len(columns["states"]))}
+        outputs = ("actions",)
+    else:
+        module = _Denoiser(planner.denoiser)
+        condition = planner.encode_history(example(1, planner.history, planner.state_dim))
+        inputs = {"sequence": example(1, *planner.noise_shape), "time": example(1).abs(), "condition": condition}
+        outputs = ("prediction",)
+    module.eval()
+    with torch.no_grad():
+        found = dict(zip(outputs, module(*inputs.values()), strict=True))
+    facts = {
+        "part": part,
+        "inputs": _tensors(inputs, columns),
+        "outputs": _tensors(found, columns),
+        "control_hz": policy.control_hz,
+        "steps_per_plan": policy.execution.replan_interval,
+        "note": _OPEN_LOOP,
+    }
+    return Exportable(module, inputs, outputs, facts)
 
 
-def export_part(what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5) -> Callable:
+def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+    """Shape, type, meaning, names and units of tensors by name."""
+    found: dict[str, Any] = {}
+    for name, value in tensors.items():
+        found[name] = {"shape": ["batch", *value.shape[1:]], "type": str(value.dtype).removeprefix("torch.")}
+        if name in _MEANINGS:
+            found[name]["meaning"] = _MEANINGS[name]
+        if name in columns:
+            found[name] |= {"columns": list(columns[name]), "units": list(columns[name].values())}
+    return found
+
+
+def export_part(
+    what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5
+) -> Callable[..., Outputs]:
     """Writes a part of a policy, of :func:`exportable`, and compares what is read back with the original.
+
+    The batch of the file is dynamic: it is tried with one robot and with three. The facts are in the file:
+    ``torch.export.load(file, extra_files={"facts.json": ""})``, the metadata of an ONNX model, entry by entry as JSON,
+    ``get_metadata()`` of an AOTInductor package.
 
     Keyword Args:
         kind (str): ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) or ``"aoti"``
             (AOTInductor; needs a C++ compiler).
-        tolerance (float): largest difference to the original, relative to the size of its output (at least 1).
+        tolerance (float): largest difference to the original, relative to the largest number of its output.
 
     Returns:
-        callable: what was read back; takes the inputs as tensors and returns the output.
+        callable: what was read back; takes the inputs as tensors and returns a tuple of outputs.
 
     Raises:
         ValueError: for another kind.
         ExportError: if a package or compiler is missing, or the numbers differ.
     """
     write, read = lookup(_KINDS, kind, "export format")
-    file, inputs = Path(file), tuple(what.inputs.values())
-    what.module.eval()
+    file = Path(file)
     with torch.no_grad():
-        expected = what.module(*inputs)
         write(what, file)
         loaded = read(what, file)
-        found = loaded(*inputs)
-    gap = float((found - expected).abs().max() / expected.abs().max().clamp_min(1))
+        gap = max(relative_gap(loaded(*batch), what.module(*batch)) for batch in map(what.batch, _BATCHES))
     if not gap <= tolerance:
         raise ExportError(f"{file} differs from the policy by {gap:.1e}, at most {tolerance:.0e} is allowed")
     return loaded
 
 
+def relative_gap(found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+    """Largest difference of the first outputs, relative to the largest number of what was expected."""
+    gap, size = (found[0] - expected[0]).abs().max(), expected[0].abs().max()
+    return float(gap / size) if size > 0 else float(gap)
+
+
+def _program(what: Exportable) -> torch.export.ExportedProgram:
+    return torch.export.export(what.module, what.batch(2), dynamic_shapes=_shapes(what, torch.export.Dim("batch")))
+
+
+def _shapes(what: Exportable, batch: Any) -> tuple[dict[int, Any], ...]:
+    """The name of the first axis of every input."""
+    return tuple({0: batch} for _ in what.inputs)
+
+
 def _write_torch(what: Exportable, file: Path) -> None:
-    torch.export.save(torch.export.export(what.module, tuple(what.inputs.values())), file)
+    torch.export.save(_program(what), file, extra_files={FACTS: json.dumps(what.facts)})
 
 
 def _write_onnx(what: Exportable, file: Path) -> None:
@@ -140,17 +228,23 @@ def _write_onnx(what: Exportable, file: Path) -> None:
         if importlib.util.find_spec(name) is None:
             raise ExportError(f"{name} is not installed: pip install 'torchrl_koap[onnx]'")
     program = torch.onnx.export(
-        what.module,
-        tuple(what.inputs.values()),
-        dynamo=True,
+        _program(what),
         input_names=list(what.inputs),
-        output_names=[what.output],
+        output_names=list(what.outputs),
+        dynamic_shapes=_shapes(what, "batch"),
+        dynamo=True,
         verbose=False,
     )
+    program.model.metadata_props.update(_texts(what.facts))
     program.save(str(file))
 
 
-def _read_onnx(what: Exportable, file: Path) -> Callable:
+def _texts(facts: Mapping[str, Any]) -> dict[str, str]:
+    """Facts for a format that knows texts alone: texts as they are, all else as JSON."""
+    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}
+
+
+def _read_onnx(what: Exportable, file: Path) -> Callable[..., Outputs]:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -158,17 +252,17 @@ def _read_onnx(what: Exportable, file: Path) -> Callable:
     session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
     names = list(what.inputs)
 
-    def run(*inputs: Tensor) -> Tensor:
+    def run(*inputs: Tensor) -> Outputs:
         arrays = {name: np.ascontiguousarray(value.numpy()) for name, value in zip(names, inputs, strict=True)}
-        return torch.from_numpy(session.run(None, arrays)[0])
+        return tuple(map(torch.from_numpy, session.run(None, arrays)))
 
     return run
 
 
 def _write_aoti(what: Exportable, file: Path) -> None:
-    program = torch.export.export(what.module, tuple(what.inputs.values()))
+    options = {"aot_inductor.metadata": _texts(what.facts)}
     try:
-        torch._inductor.aoti_compile_and_package(program, package_path=str(file))
+        torch._inductor.aoti_compile_and_package(_program(what), package_path=str(file), inductor_configs=options)
     except Exception as error:  # the compiler is asked in many places
         if "compiler" in str(error).lower():
             raise ExportError(f"AOTInductor needs a C++ compiler such as g++: {str(error).splitlines()[0]}") from error

@@ -170,13 +170,12 @@ class PlanningPolicy(TensorDictModuleBase):
         action = left[..., 0, :]
         if self.limits is None:
             return action
-        held = self.limits.in_range(action)
-        outside = (held != action).any(-1)
+        action, outside = self.limits(observations, action)
         self.limited += torch.stack([outside.sum(), torch.ones_like(outside).sum()])
-        return self.limits.paced(observations, held)
+        return action
 
-    def decode_ahead(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Plans and decodes the actions ``[*B, replan_interval, act]`` of the next steps at once.
+    def decode_ahead(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Plans and decodes the actions of the next steps at once.
 
         This is what is exported, stateless and without branches on data: whoever calls it keeps the last observations
         and counts steps. Actions are as if the robot moved as it is commanded.
@@ -184,13 +183,19 @@ class PlanningPolicy(TensorDictModuleBase):
         Args:
             observations (Tensor): ``[*B, history, obs]``, raw units.
             noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
+
+        Returns:
+            tuple: the actions ``[*B, replan_interval, act]``, and which of them were held in their range, bool
+            ``[*B, replan_interval]``.
         """
         states, steps = self.state_of(observations), self.execution.replan_interval
         actions = self.planner.sample(states[..., -self.planner.history :, :], noise)
         if self.follower is not None:
             actions = self.follower(observations, states, actions, steps)
         actions = actions[..., :steps, :]
-        return actions if self.limits is None else self.limits(observations.unsqueeze(-3), actions)
+        if self.limits is None:
+            return actions, torch.zeros_like(actions[..., 0], dtype=torch.bool)
+        return self.limits(observations.unsqueeze(-3), actions)
 
     def attach(self, env: EnvBase) -> None:
         """Tells the follower the batch of environments whose episodes are about to begin."""
