@@ -15,6 +15,7 @@ BUDGET = 14_000  # words in the navigation, tables included, code not
 LONGEST_MEAN = 18  # words a sentence
 OUTSIDE = {"appendix", "generated", "outputs", "extensions", "_static"}
 PAGES = sorted(page for page in DOCS.rglob("*.md") if not OUTSIDE & set(page.relative_to(DOCS).parts))
+NAMES = {"oracle"}  # values of options
 # looked up, not read
 REFERENCE = {"d3il.md", "tasks.md", "methods.md", "glossary.md", "changelog.md", "conduct.md"}
 BANNED = re.compile(
@@ -104,33 +105,28 @@ def test_every_picture_has_a_description():
             assert len(description.split()) >= 3, f"{page}: {description!r}"
 
 
-def spoken(tree: ast.Module):
-    """First sentences of public docstrings, and texts of errors."""
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
-            yield (ast.get_docstring(node) or "").split("\n\n")[0]
-        if isinstance(node, ast.Raise) and node.exc is not None:
-            yield from (
-                each.value
-                for each in ast.walk(node.exc)
-                if isinstance(each, ast.Constant) and isinstance(each.value, str)
-            )
+def texts_of(tree: ast.Module) -> list[str]:
+    """Docstrings, messages, help and what is printed, without names in quotes."""
+    found = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return [re.sub(r"[\"']\w+[\"']", "", prose(text)) for text in found if text not in NAMES]
 
 
-@pytest.mark.parametrize("folder", ["README.md", "torchrl_koap"])
-def test_words_of_docstrings_messages_and_the_readme_are_plain(folder):
-    if folder.endswith(".md"):
-        texts = [prose((ROOT / folder).read_text())]
-    else:
-        texts = [each for file in sorted((ROOT / folder).rglob("*.py")) for each in spoken(ast.parse(file.read_text()))]
-    found = [
-        (match[0], text) for text in texts for match in BANNED.finditer(re.sub(r"`[^`]*`|[\"']\w+[\"']", "", text))
-    ]
-    assert not found
+def test_words_of_the_readme_are_plain():
+    assert not (found := [match[0] for match in BANNED.finditer(prose((ROOT / "README.md").read_text()))]), found
+
+
+@pytest.mark.parametrize("folder", ["torchrl_koap", "examples"])
+def test_words_of_docstrings_and_messages_are_plain(folder):
+    texts = {file: texts_of(ast.parse(file.read_text())) for file in sorted((ROOT / folder).rglob("*.py"))}
+    found = [(file.name, match[0]) for file, each in texts.items() for text in each for match in BANNED.finditer(text)]
+    assert texts and not found
 
 
 def test_what_is_counted():
     text = "# Head\n\n![a b c](x.png)\n\nOne two `three four`. It [is](http://a.b) five.\n\n"
     assert mean_length(text + "| a | b |\n") == 3.5
     assert "koap" not in without_code("```bash\nkoap\n```\n") and "a | b" in without_code("| a | b |\n")
+    assert any(map(BANNED.search, texts_of(ast.parse('raise ValueError(f"{x} is told apart")'))))
+    assert any(map(BANNED.search, texts_of(ast.parse('print({"verdict": 1})'))))
+    assert not any(map(BANNED.search, texts_of(ast.parse("strategy = 'oracle'"))))
     assert BANNED.search("that pays") and not BANNED.search("payload") and not BANNED.search(prose("`pays`"))

@@ -89,7 +89,7 @@ def check_run(folder: Path) -> dict[str, str]:
     if problems:
         said = "; ".join(dict.fromkeys(problems))
         raise RunDirectoryError(f"{folder}: {len(dict.fromkeys(problems))} problem(s): {said}")
-    return found | {"verdict": "no problem found"}
+    return found | {"result": "no problem found"}
 
 
 def _problem(look: Callable[[], Any]) -> list[str]:

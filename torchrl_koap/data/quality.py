@@ -121,7 +121,7 @@ def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
 
 
 def _leaps(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Columns whose largest step is above a third of their range and twenty times the usual one, and why."""
+    """Columns whose largest step is above 1/3 of their range and twenty times the usual one, and why."""
     if all(len(frames) < 2 for frames in trajectories):
         return []
     bound, usual = leap_bounds(trajectories)

@@ -34,7 +34,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
     A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
     there. The augmentation shows it such states together with the way back.
 
-    Frames that all move alike show the moment of a push, and the velocity of before. Where motions are so smooth that
+    Frames that all move alike show the moment of a push, and the earlier velocity. Where motions are so smooth that
     velocity follows from position, the difference of the two betrays the shift, and a planner learns to answer small
     errors of velocity with large ones. With ``under_way`` the robot is on its way back already, as in the next steps of
     the loop: :math:`x'_{t-j} = x_{t-j} + \rho^{-j} \delta`.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a trained run is worth: rollouts, scores, diagnosis, and which demonstrations to label next."""
+"""How well a trained run does: rollouts, scores, diagnosis, and which demonstrations to label next."""
 
 from torchrl_koap.lookup import exports
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a run is worth without an environment: plans and actions judged on recorded data, where rollouts would stand."""
+"""How well a run does without an environment: plans and actions judged on recorded data, where rollouts would stand."""
 
 from __future__ import annotations
 

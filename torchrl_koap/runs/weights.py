@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Weights as safetensors with a JSON header, and in a quarter of their size for publishing."""
+"""Weights as safetensors with a JSON header, and in 25 % of their size for publishing."""
 
 from __future__ import annotations
 

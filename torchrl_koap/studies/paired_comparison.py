@@ -61,7 +61,7 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
 
     The interval resamples contexts *and* training seeds. Contexts alone would say how sure the figure is for these very
     networks; a reader wants to know what the next training would give, and three seeds say little about that. The
-    interval is then wider, and honest. Of S seeds S - 1 are drawn: a resample of all S would understate the variance of
+    interval is then wider. Of S seeds S - 1 are drawn: a resample of all S would understate the variance of
     their mean by a factor (S - 1) / S, two thirds for three of them. With one seed it holds for that one training only.
 
     The p-value flips signs of :math:`\bar d_c`: for these trained networks, could the advantage be chance of the

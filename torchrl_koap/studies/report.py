@@ -56,7 +56,7 @@ _CAPTIONS = {
     ),
     "demonstrations": (
         "Success against the demonstrations used",
-        "How much the demonstrations without labels are worth: the same share of labels, but only part of all"
+        "How much demonstrations without labels improve success: the same share of labels, but only part of all"
         " demonstrations known at all.",
     ),
 }

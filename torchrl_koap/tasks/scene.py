@@ -92,7 +92,7 @@ class Scene:
     Args:
         shapes (tuple of Shape): what stands still, in the order in which it is drawn.
         bodies (tuple of Body): what starts elsewhere in every episode.
-        shared_starts (tuple): regions that are dealt out to the bodies at random, each to one at most, instead of
+        shared_starts (tuple): regions that the bodies get at random, each to one at most, instead of
             ``Body.starts``; there may be more of them than bodies.
         start_yaw (tuple of float): least and greatest yaw of a body (deg).
         x (tuple of float): least and greatest x of a picture (m); None shows what is drawn.

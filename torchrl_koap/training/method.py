@@ -26,7 +26,7 @@ class Phase:
     Args:
         name (str): its name in the log.
         loss (callable): the loss of a network, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
-        windows (str): ``"all"`` (labelled or not), ``"mixed"`` (a quarter of every batch has labels) or ``"labelled"``.
+        windows (str): ``"all"`` (labelled or not), ``"mixed"`` (25 % of every batch have labels) or ``"labelled"``.
         share (float): of the updates that a controller may have.
 
     Raises:

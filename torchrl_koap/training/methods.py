@@ -14,7 +14,7 @@ teacher besides.
 Two controllers are no inverse dynamics and have nothing of KOAP: ``mpc`` follows plans by an identified model of how
 the robot answers commands, ``command_regression`` by the commands that belong to states.
 
-Four controls say what the Koopman model itself is worth: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
+Four controls say what the Koopman model itself adds: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
 none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
 ``koap_untrained``, KOAP with random features, of which nothing but the decoder is fitted;
 ``pca``, a ridge on principal components of all windows, labelled or not.

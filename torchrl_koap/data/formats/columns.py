@@ -204,7 +204,7 @@ def _find_rate(
 
 
 def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
-    """The episodes of a piece; the piece itself if it is one, or they cannot be told apart."""
+    """The episodes of a piece; the piece itself if it is one, or if nothing separates them."""
     try:
         order, begins = _order(piece)
     except ValueError as error:

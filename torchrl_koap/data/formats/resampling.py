@@ -32,7 +32,7 @@ def resampled(
 
     States are interpolated linearly. Where a column leaps (a wrapped angle, a quaternion that changes its sign), and in
     columns of at most ten integers (a switch), the nearest frame counts. Changes over one frame are summed over the new
-    step; any other action is the one in force at its beginning. A step with an unlabelled part has no label. A gap of
+    step; any other action is the current one at its beginning. A step with an unlabelled part has no label. A gap of
     more than two steps, recorded or new, ends a trajectory; ``skipped`` counts these.
 
     Args:
@@ -139,7 +139,7 @@ def _states(frames: np.ndarray, times: np.ndarray, new: np.ndarray, bounds: np.n
 
 
 def _actions(steps: np.ndarray, times: np.ndarray, new: np.ndarray, adding: np.ndarray, room: float) -> np.ndarray:
-    """Actions ``[T - 1, a]`` of the steps between new times: summed, or those in force."""
+    """Actions ``[T - 1, a]`` of the steps between new times: summed, or the current ones."""
     held = steps[np.searchsorted(times[:-1], new[:-1] + room, side="right") - 1]
     if not adding.any():
         return held

@@ -87,7 +87,7 @@ class CommandLimits(nn.Module):
     def forward(self, observations: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """What is left of an action ``[*B, act]``, by observations ``[*B, history, obs]``, the present one last.
 
-        What is within the limits keeps its bits, for episodes with contacts turn out otherwise for a rounding error.
+        What is within the limits stays the same bit for bit: a rounding error changes episodes with contacts.
 
         Returns:
             tuple: the action ``[*B, act]``, and whether a column left its range, bool ``[*B]``.

@@ -54,7 +54,7 @@ def make_policy(
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
-        follower (Follower, optional): follows plans in place of the controller, such as the oracle.
+        follower (Follower, optional): follows plans in place of the controller, such as the simulator's inverse.
 
     Returns:
         PlanningPolicy: the policy.

@@ -142,7 +142,7 @@ class PlanningPolicy(TensorDictModuleBase):
         Args:
             observations (Tensor): ``[*B, history, obs]``, raw units.
             noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
-            previous (Tensor, optional): the plan of before, which several candidates are compared with.
+            previous (Tensor, optional): the earlier plan, which several candidates are compared with.
             started (Tensor, optional): where an episode begins, bool ``[*B]``.
         """
         states = self.state_of(observations)
@@ -240,7 +240,7 @@ class PlanningPolicy(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.act(observed, plan, age))
 
     def _distance_from(self, previous: Tensor) -> Callable[[Tensor], Tensor] | None:
-        """How far candidates ``[*B, N, H, w]`` are from the plan of before, every column in units of its spread."""
+        """How far candidates ``[*B, N, H, w]`` are from the earlier plan, every column in units of its spread."""
         if self.follower is not None:
             scale = self.planner.scale_columns
             return lambda plans: paths_apart(scale(plans), scale(previous))

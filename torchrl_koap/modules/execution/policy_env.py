@@ -46,7 +46,7 @@ class PolicyEnv(TransformedEnv):
 
     ``set_seed`` fixes the whole rollout. With the same seed an :class:`~torchrl_koap.modules.Agent` gives the same
     actions in the first episode. It may stand inside of :class:`torchrl.envs.SerialEnv`,
-    :class:`torchrl.envs.ParallelEnv` and collectors, or around the former.
+    :class:`torchrl.envs.ParallelEnv` and collectors, or around a :class:`torchrl.envs.SerialEnv`.
 
     Args:
         env (EnvBase): the environment.

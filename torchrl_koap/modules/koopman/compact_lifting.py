@@ -33,7 +33,7 @@ class NoiseAdjustedComponents(nn.Module):
     with the covariance ``C`` of the states and ``R`` of the white noise in them
     (:func:`~torchrl_koap.modules.koopman.smoothing.noise_covariance`): the minimum noise fraction transform (Green et
     al. 1988), at unit spread. Where columns differ in their noise, principal components follow the loudest; these
-    follow the best measured. No column counts as measured to more than a hundredth of its spread, and components that
+    follow the best measured. No column counts as measured to more than 1 % of its spread, and components that
     stand out by less than a factor of two are 0, but for the first.
 
     Args:
@@ -72,7 +72,7 @@ class NoiseAdjustedComponents(nn.Module):
         states = windows.flatten(0, -2).double()
         states = states - states.mean(0)
         total = states.mT @ states / len(states)
-        # nothing is measured to more than a hundredth of its spread
+        # nothing is measured to more than 1 % of its spread
         values, vectors = torch.linalg.eigh(noise.to(total) + torch.diag(1e-4 * total.diagonal() + 1e-12))
         spread = values.sqrt()
         whiten, colour = vectors / spread, vectors * spread  # inverse transposes of each other

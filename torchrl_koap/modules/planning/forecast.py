@@ -19,7 +19,7 @@ class LinearForecast(nn.Module):
 
     .. math:: y = (x - W c - b - \text{offset}) / \text{scale}
 
-    A network that has seen the motions to fifty goals knows these fifty by heart; what lies between them it guesses. A
+    A network that has seen the motions to fifty goals may overfit to these fifty and be wrong between them. A
     linear map of as many numbers as the condition has carries over to new goals wherever the motion is nearly linear in
     what was observed, and elsewhere its penalty, chosen on trajectories left out, makes it vanish. What it takes off
     depends on the condition alone, so no distribution of plans is ruled out by it.
