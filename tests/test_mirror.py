@@ -44,7 +44,6 @@ COVERED_BY = {
     "reports/html.py": "reports/test_run_report.py",
     "reports/run_facts.py": "reports/test_run_report.py",
     "reports/style.py": "reports/test_run_report.py",
-    "reports/tiles.py": "reports/test_run_report.py",
     "reports/offline_plots.py": "reports/test_pictures.py",
     "studies/plots.py": "studies/test_report.py",
     "tasks/aligning.py": "tasks/test_registry.py",

@@ -115,7 +115,6 @@ def write_run(folder: Path) -> Path:
     true = np.random.default_rng(0).normal(size=(20, 2)) * 0.005
     save_file(make_rollouts(), folder / "rollouts.safetensors")
     save_file(make_demonstrations(), folder / "demonstrations.safetensors")
-    save_file({"real": np.linspace(0, 1, 8), "imag": np.zeros(8)}, folder / "eigenvalues.safetensors")
     save_file({"predicted": true + 0.001, "true": true}, folder / "actions.safetensors")
     return folder
 

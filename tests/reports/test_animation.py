@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Moving pictures from above: what is in them, how many frames, and how they are written."""
+"""Moving pictures: what is in them, how many frames, where films start, and how they are written."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import pytest
 from PIL import Image
 from run_files import make_object_rollouts, make_rollouts, run_of
 
+from torchrl_koap.reports import animation
 from torchrl_koap.reports.animation import animate_rollouts
-from torchrl_koap.reports.pictures import NothingToDraw, save_film
+from torchrl_koap.reports.pictures import NotFilmed, NothingToDraw, save_film
+from torchrl_koap.tasks import get_task
 
 RUN = run_of("avoiding")
 
@@ -44,3 +46,68 @@ def test_no_rollouts():
     none = {"position": np.zeros((0, 5, 2)), "length": [], "mode": [], "outcome": []}
     with pytest.raises(NothingToDraw, match="no rollouts"):
         animate_rollouts(none, RUN)
+
+
+def film_of(rollouts, task):
+    return animation.film_rollout(rollouts, run_of(task))
+
+
+def frames_of(actions, task, monkeypatch, size, **more):
+    monkeypatch.setattr(animation, "SIZE", size)
+    try:
+        return film_of({"action": actions[None], "outcome": [1], **more}, task).frames
+    except NotFilmed as error:
+        pytest.skip(f"no picture can be drawn on this machine: {error}")
+
+
+def test_film_of_recorded_actions(monkeypatch):
+    actions = np.full((6, 2), 0.008)
+    actions[5] = np.nan
+    frames = frames_of(actions, "avoiding", monkeypatch, (96, 72))
+    assert len(frames) == 4 and frames[0].shape == (72, 96, 3)  # the start, and after 2, 4, 5 steps
+
+
+@pytest.mark.parametrize("task", ["aligning", "po_sorting", "stacking_1"])
+def test_film_starts_from_the_context(task, monkeypatch):
+    contexts = pytest.importorskip("torchrl_koap.envs.contexts")
+    table, actions = contexts.evaluation_contexts(task), np.zeros((1, get_task(task).action_dim))
+    first, again, other = (
+        frames_of(actions, task, monkeypatch, (96, 72), context=table[row, None])[0].astype(int) for row in (0, 0, 1)
+    )
+    assert (first == again).all() and (np.abs(first - other) > 50).any()
+
+
+def test_film_of_a_long_rollout_has_few_frames(monkeypatch):
+    assert len(frames_of(np.zeros((60, 2)), "avoiding", monkeypatch, (32, 24))) == 21  # every third step
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({}, "a film needs the 'context'"),
+        ({"context": np.zeros((1, 2, 3))}, r"'context' must have shape \[any, 4, 3\]"),
+        ({"action": np.zeros((1, 3, 5))}, r"'action' must have shape \[any, any, 2\]"),
+    ],
+)
+def test_bad_rollouts_are_explained(more, message):
+    with pytest.raises(ValueError, match=message):
+        film_of({"action": np.zeros((1, 3, 2)), "outcome": [1]} | more, "sorting")
+
+
+@pytest.mark.parametrize("task", ["avoiding", "stacking_1"])
+def test_the_first_success_is_filmed(task, monkeypatch):
+    made = []
+    monkeypatch.setattr(animation, "_film_frames", lambda *what: made.append(what) or [])
+    rollouts = make_rollouts() | {"action": np.random.rand(4, 20, 2)}
+    if task != "avoiding":
+        rollouts = make_object_rollouts(task)
+    rollouts["outcome"] = np.array([0, 0, 1, 1])
+    film_of(rollouts, task)
+    ((actions, of, context, stride),) = made
+    np.testing.assert_array_equal(actions, rollouts["action"][2])
+    assert of.name == task and stride == 2
+    if task == "avoiding":
+        assert context is None
+    else:
+        np.testing.assert_array_equal(context, rollouts["context"][2:3])
+        assert context.dtype == np.float64

@@ -128,7 +128,7 @@ def test_damaged_json_is_named_and_the_rest_is_shown(name, content, tmp_path):
 
 @pytest.mark.parametrize("name", ["rollouts.safetensors", "actions.safetensors", "metrics.csv"])
 def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path, monkeypatch):
-    few = {p.name: p for p in PICTURES if p.source == name or p.name == "eigenvalues.png"}
+    few = {p.name: p for p in PICTURES if p.source == name or p.name == "demonstrations.png"}
     monkeypatch.setattr(pictures, "_PICTURES", few)
     write_run(tmp_path)
     draw_pictures(tmp_path, animation=False)
@@ -140,7 +140,7 @@ def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path, monke
     page = Page(write_report(tmp_path, animation=False))
     assert page.source.count('class="warning"') == len(wanted)
     assert not {f"plots/{picture}" for picture in wanted} & set(page.links)
-    assert "plots/eigenvalues.png" in page.links
+    assert "plots/demonstrations.png" in page.links
 
 
 def test_odd_values_do_not_stop_the_report(tmp_path):

@@ -61,21 +61,18 @@ def test_actions_tell_the_error_and_what_they_are_read_for():
     predicted = np.tile([0.003, 0.004], (50, 1))
     predicted[0] = np.nan  # left out
     figure = draw_actions({"predicted": predicted, "true": true}, run_of("avoiding"))
-    assert titles(figure) == ["x: RMSE 3 mm", "y: RMSE 4 mm", "all: RMSE 3.54 mm, median 3.5"]
+    assert titles(figure) == ["x: RMSE 3 mm", "y: RMSE 4 mm"]
     assert figure.get_suptitle() == "49 steps of demonstrations outside the label budget, for evaluation only"
 
 
 def test_actions_in_two_units():
-    """Stacking: seven joints in mrad per step, and a width in mm that the error of all leaves out."""
+    """Stacking: seven joints in mrad per step, and a width in mm."""
     predicted = np.tile([0.002] * 7 + [0.08], (50, 1))
     figure = draw_actions({"predicted": predicted, "true": np.zeros((50, 8))}, run_of("stacking"))
     said, panels = titles(figure), figure.axes
     assert said[0] == "joint 1: RMSE 2 mrad" and said[7] == "gripper: RMSE 80 mm"
-    assert said[8] == "all but gripper: RMSE 2 mrad, median 2"
     assert panels[6].get_xlabel() == "recorded joint 7 (mrad per step)"
     assert panels[7].get_xlabel() == "recorded gripper (mm)"
-    legend = [text.get_text() for text in panels[8].get_legend().get_texts()]
-    assert legend == [f"joint {index}" for index in range(1, 8)]
 
 
 def test_actions_of_another_robot():
@@ -83,10 +80,7 @@ def test_actions_of_another_robot():
     true = np.random.rand(30, 7)
     data, torques = {"predicted": true + 0.5, "true": true}, {f"torque {index}": Action("N m") for index in range(7)}
     arm = Task(name="arm", observation_parts={"q": 7}, actions=torques, position="q")
-    assert titles(draw_actions(data, RunFacts(Path("run"), arm)))[6:] == [
-        "torque 6: RMSE 0.5 N m",
-        "all: RMSE 0.5 N m, median 0.5",
-    ]
+    assert titles(draw_actions(data, RunFacts(Path("run"), arm)))[6:] == ["torque 6: RMSE 0.5 N m"]
     figure = draw_actions(data, NOTHING)
     assert titles(figure)[0] == "action 1: RMSE 0.5" and figure.axes[0].get_xlabel().endswith("(per step)")
 

@@ -111,7 +111,7 @@ class Inspect(Command):
         """Inspects and draws."""
         result = inspect(self.run, self.config)
         folder = Path(self.run) if self.config.out is None else self.config.out
-        draw_pictures(folder, names=("inspect.png", "latent.png", "eigenvalues.png"))
+        draw_pictures(folder, names=("inspect.png", "latent.png"))
         if (folder / "index.html").exists():
             write_report(folder, draw=False)
         return result

@@ -32,7 +32,6 @@ from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.training.datasets import label_budget
 from torchrl_koap.training.trained import Trained
 
@@ -135,10 +134,6 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
     result["latent"] = _look_into(config, trained, data)
     result["findings"] = describe_inspection(result, task)
     directory.write_json("inspect.json", result)
-    if isinstance(trained.controller, KoopmanInverseDynamics):
-        values = trained.controller.operator.eigenvalues().detach()
-        parts = {"real": values.real.contiguous(), "imag": values.imag.contiguous()}
-        save_tensors(directory.path / "eigenvalues.safetensors", parts)
     return result
 
 

@@ -24,17 +24,20 @@ _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are rea
 
 
 def spectrum(eigenvalues: Tensor) -> dict[str, Any]:
-    r"""Tells where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
+    r"""Tells where the eigenvalues ``[m]`` of an operator lie, and in how many steps its slowest parts fade to 1/e.
 
     The decay times are :math:`-1 / \ln |\lambda|` of the five slowest of those inside the unit circle.
     """
-    size = eigenvalues.detach().abs().double().sort(descending=True).values
+    eigenvalues = eigenvalues.detach()
+    size = eigenvalues.abs().double().sort(descending=True).values
     sides = unit_circle_sides(size.tolist())
     inside = size[[side == "inside" for side in sides]]
     return {
         "spectral_radius": size[0].item(),
         **{side: sides.count(side) for side in ("inside", "on", "outside")},
         "slowest_decay_steps": (-1 / inside[:5].log()).tolist(),
+        "real": eigenvalues.real.tolist(),
+        "imag": eigenvalues.imag.tolist(),
     }
 
 

@@ -91,13 +91,6 @@ def one_way_only(run: RunFacts) -> Advice | None:
             f"{seen}: a policy of its own knows the labelled ways only",
             "a method that plans learns the ways from all demonstrations (--method koap)",
         )
-    candidates = number(run.execution.get("candidates")) or 1
-    if candidates > 1:
-        return Advice(
-            f"{seen}, with {candidates:.0f} candidates per plan",
-            "candidates prefer to go on as before: fewer of them leave more variety",
-            "koap eval {run} --candidates 1",
-        )
     return Advice(
         seen,
         "look at the modes of the demonstrations first; if the planner has lost some, train it longer (--steps)",
@@ -136,23 +129,6 @@ def few_labels(run: RunFacts) -> Advice | None:
     )
 
 
-def worse_than_a_guess(run: RunFacts) -> Advice | None:
-    """On recorded data plans or actions are no better than a trivial guess."""
-    plan, action = run.evaluated("relative_plan_error"), run.evaluated("relative_action_error")
-    if plan is not None and plan >= 1:
-        return Advice(
-            f"plans lie {plan:.2f} times as far from the recordings as standing still would",
-            "more updates (--steps), or displacements instead of positions (relative of the task)",
-        )
-    if action is not None and action >= 1:
-        return Advice(
-            f"actions err {action:.2f} times as much as their mean would",
-            "are labels and states of the same moment? If so: more labels",
-            "koap suggest {run} --count 5",
-        )
-    return None
-
-
 def too_slow(run: RunFacts) -> Advice | None:
     """A plan takes longer than the robot waits."""
     plan, control = run.evaluated("plan_ms"), run.control_hz
@@ -178,7 +154,6 @@ def few_rollouts(run: RunFacts) -> Advice | None:
 
 
 RULES: tuple[Callable[[RunFacts], Advice | None], ...] = (
-    worse_than_a_guess,
     planner_fails,
     plans_are_not_followed,
     which_part,

@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullLocator
-from safetensors.numpy import load_file
+from matplotlib.ticker import MaxNLocator
 
-from torchrl_koap.evaluation.findings import MODELS, ON_THE_CIRCLE, OUTSIDE_THE_BUDGET, error_unit, unit_circle_sides
+from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, error_unit, unit_circle_sides
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import (
@@ -25,7 +23,6 @@ from torchrl_koap.reports.style import (
     PALE,
     PALE_BLUE,
     WARNING,
-    entry,
     legend_below,
     tidy,
 )
@@ -37,7 +34,6 @@ EXPERIMENTS = {
     "controller_alone": "controller alone\n(recorded states)",
     "both": "both\n(closed loop)",
 }
-_TIMES = (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 20)
 _DIVERGED = 1e6  # in the unit shown; a prediction further off is left out of the picture
 _MODELS = {
     "koopman": ("latent dynamics", BLUE),
@@ -45,39 +41,14 @@ _MODELS = {
     "linear": ("linear model on raw states", ORANGE),
     "copy_last": ("standing still", MUTED),
 }
-_EIGENVALUES = "eigenvalues.safetensors"
-
-
-@picture(
-    "eigenvalues.png",
-    source=_EIGENVALUES,
-    title="Koopman eigenvalues",
-    caption="Left: eigenvalues of the latent operator in the complex plane; orange ones lie outside the unit circle,"
-    " where predictions grow, pale ones on it within a thousandth. Right: how far each lies from the circle, on an axis"
-    " that is linear within a thousandth of it and logarithmic beyond, with the time in which such a part of the state"
-    " fades.",
-    order=110,
-)
-def draw_eigenvalues(data: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws eigenvalues in the complex plane, and how far each lies from the unit circle.
-
-    Args:
-        data (mapping): ``real`` and ``imag`` parts ``[m]``.
-        run (RunFacts): the run; its control rate gives the time in which a part of the state fades.
-    """
-    values = _spectrum(data)
-    figure = Figure(figsize=(9.4, 4.2), layout="constrained")
-    plane, rank = figure.subplots(1, 2, width_ratios=(1, 1.15))
-    _draw_plane(plane, values)
-    _draw_distances(rank, values, run.control_hz)
-    return figure
 
 
 @picture(
     "latent.png",
     source="inspect.json",
     title="What the latent space holds",
-    caption="Left: eigenvalues of the operator. Middle: errors of predicted states, latent actions given; a test of the"
+    caption="Left: eigenvalues of the latent operator; orange ones lie outside the unit circle, where predictions grow,"
+    " pale ones on it within a thousandth. Middle: errors of predicted states, latent actions given; a test of the"
     " models, not a forecast. Right, for evaluation only: how much of the true actions a linear probe on labels"
     " outside the budget, and the run's own decoder, explain on held-out demonstrations.",
     order=60,
@@ -88,18 +59,17 @@ def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
     Args:
         result (mapping): ``inspect.json``, whose entry ``latent`` is of
             :func:`~torchrl_koap.evaluation.latent_space.analyse_latent`.
-        run (RunFacts): the run; the first panel is left out where its eigenvalues are absent.
     """
-    latent, eigenvalues = result.get("latent", {}), run.folder / _EIGENVALUES
+    latent = result.get("latent", {})
     if "multi_step" not in latent or run.task is None:
         raise NothingToDraw("no latent space was looked into")
     outside = latent[OUTSIDE_THE_BUDGET]
-    spectrum = "eigenvalues" in latent and eigenvalues.exists()
-    panels = ["spectrum"] * spectrum + ["errors"] + ["probe"] * ("note" not in outside)
+    panels = ["spectrum", "errors"] + ["probe"] * ("note" not in outside)
     figure = Figure(figsize=(4.6 * len(panels) + 0.8, 4.1), layout="constrained")
     axes = dict(zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True))
-    if spectrum:
-        _draw_plane(axes["spectrum"], _spectrum(load_file(eigenvalues)))
+    _draw_plane(
+        axes["spectrum"], np.array(latent["eigenvalues"]["real"]) + 1j * np.array(latent["eigenvalues"]["imag"])
+    )
     _draw_errors(axes["errors"], latent["multi_step"], run.task)
     if "probe" in axes:
         _draw_probe(axes["probe"], outside, list(run.task.actions))
@@ -157,15 +127,6 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     return figure
 
 
-def _spectrum(data: Mapping[str, Any]) -> np.ndarray:
-    """Complex eigenvalues of their parts."""
-    real = entry(data, "real", [None]).astype(float)
-    values = real + 1j * entry(data, "imag", [len(real)]).astype(float)
-    if not len(values) or not np.isfinite(values).all():
-        raise ValueError(f"eigenvalues must be finite and at least one, got {len(values)} with NaN or infinite ones")
-    return values
-
-
 def _draw_plane(axes: Axes, values: np.ndarray) -> None:
     """Eigenvalues in the complex plane; an inset magnifies them where they crowd."""
     angle = np.linspace(0, 2 * np.pi, 2000)
@@ -196,41 +157,6 @@ def _draw_plane(axes: Axes, values: np.ndarray) -> None:
     counts = [f"{int((side == name).sum())} {name}" for name in SIDES]
     radius = f"{len(values)} eigenvalues, radius {np.abs(values).max():.5g}"
     tidy(axes, f"{radius}\n{', '.join(counts)} the unit circle")
-
-
-def _draw_distances(axes: Axes, values: np.ndarray, control_hz: float | None) -> None:
-    """Magnitudes minus 1 in order: linear within a thousandth of the circle, logarithmic beyond."""
-    size = np.sort(np.abs(values))[::-1]
-    side, ranks = np.array(unit_circle_sides(size)), np.arange(1, len(size) + 1)
-    axes.set_yscale("symlog", linthresh=ON_THE_CIRCLE, linscale=0.6)
-    axes.axhspan(-ON_THE_CIRCLE, ON_THE_CIRCLE, color=PALE, zorder=0)
-    axes.axhline(0, color=MUTED, linewidth=1, zorder=1)
-    for name, color in SIDES.items():
-        here = side == name
-        label = f"{name} the circle: {int(here.sum())}"
-        axes.scatter(ranks[here], size[here] - 1, s=22, color=color, alpha=0.8, linewidths=0, zorder=2, label=label)
-    low, high = min(size.min() - 1, -2 * ON_THE_CIRCLE), max(size.max() - 1, 2 * ON_THE_CIRCLE)
-    axes.set_ylim(1.6 * low, 1.6 * high)
-    bottom, top = axes.get_ylim()
-    near = max(-low, high) < 20 * ON_THE_CIRCLE  # within two per cent: decades alone would be one tick
-    steps = (1, 2, 5) if near else (1,)
-    ticks = [sign * step * 10.0**power for sign in (-1, 1) for step in steps for power in range(-3, 4)]
-    ticks = sorted(tick for tick in [*ticks, 0.0] if bottom <= tick <= top)
-    axes.set_yticks(ticks, [f"{tick:+g}" if tick else "0" for tick in ticks])
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_xlabel("rank")
-    axes.set_ylabel("magnitude - 1")
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
-    tidy(axes, "distance from the unit circle\n(shaded: counted as on it)")
-    if control_hz is not None:
-        places = {math.exp(-1 / (time * control_hz)) - 1: f"{time:g} s" for time in _TIMES}
-        places = {place: text for place, text in places.items() if bottom < place < -ON_THE_CIRCLE}
-        fades = axes.secondary_yaxis("right")
-        fades.set_yticks(list(places), list(places.values()))
-        fades.yaxis.set_minor_locator(NullLocator())
-        fades.tick_params(labelsize=8, color=FAINT, labelcolor=MUTED)
-        fades.set_ylabel("fades to 1/e within", size=9, color=INK)
-        fades.spines["right"].set_visible(False)
 
 
 def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:

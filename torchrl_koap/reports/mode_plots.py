@@ -1,18 +1,15 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which modes occurred: a chart, a table for other pictures, and a colour for each mode."""
+"""Which modes occurred: a chart, and a colour for each mode."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from safetensors.numpy import load_file
 
@@ -20,19 +17,19 @@ from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy
 from torchrl_koap.lookup import resolve
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, FAINT, GREY, INK, MUTED, SUCCESS, entry, legend_beside, set_title, tidy
+from torchrl_koap.reports.style import BLUE, GREY, INK, SUCCESS, entry, legend_beside, tidy
 from torchrl_koap.tasks import Modes
 
-_LISTED = 10  # modes of a single choice: from here on names are short
+_LISTED = 10  # modes of a single choice that have wide bars with their names below
 
 
 @picture(
     "modes.png",
     source="rollouts.safetensors",
     title="Modes of the successful rollouts",
-    caption="One bar per mode. Black ticks: the share of each mode in the demonstrations, where they say which they"
-    " took. Entropy is 1 when all modes are equally frequent; a handful of rollouts cannot reach 1 even with a uniform"
-    " choice, the title says what to expect.",
+    caption="One bar per mode, in the colour of its rollouts. Black ticks: the share of each mode in the"
+    " demonstrations, where they say which they took. Entropy is 1 when all modes are equally frequent; a handful of"
+    " rollouts cannot reach 1 even with a uniform choice, the title says what to expect.",
     order=40,
 )
 def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
@@ -114,52 +111,6 @@ def mode_colors(modes: Modes) -> np.ndarray:
         lightness = np.where(np.arange(hues) % 2, 0.8 if hues <= 8 else 1.15, 0.8)
     pure = hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.8), np.minimum(lightness, 0.95)], 1))
     return 1 - (1 - pure) * np.clip(2 - lightness, 0, 1)[:, None]
-
-
-def draw_mode_table(axes: Axes, mode: np.ndarray, modes: Modes) -> None:
-    """Draws a cell per mode in its colour, with the number of rollouts.
-
-    Columns are the last of several choices. A single choice becomes a list with the names beside the cells (initials
-    from 11 on).
-
-    Of the modes to count ``[n]`` those out of range are left out.
-    """
-    *heads, (last, names) = modes.choices
-    number, listed = modes.number, not heads
-    if listed:
-        down, step = (number, 4.0) if number <= _LISTED else (math.ceil(number / 2), 4.6)
-        places = [(step * (index // down), index % down) for index in range(number)]
-    else:
-        across, step = len(names), 1.0
-        down = number // across
-        places = [(index % across, index // across) for index in range(number)]
-    counts = np.bincount(mode[(mode >= 0) & (mode < number)].astype(int), minlength=number)
-    top, label = 1.0, {"size": 8, "color": MUTED}
-    for index, (color, (column, row)) in enumerate(zip(mode_colors(modes), places, strict=True)):
-        used = counts[index] > 0
-        style = {"facecolor": color, "edgecolor": "white"} if used else {"facecolor": "none", "edgecolor": FAINT}
-        axes.add_patch(Rectangle((column, top - row - 1), 0.92, 0.9, linewidth=0.8, **style))
-        text = {"ha": "center", "va": "center", "size": 9, "color": "white" if used else FAINT}
-        axes.text(column + 0.46, top - row - 0.56, str(counts[index]), **text)
-        if listed:
-            name = names[index] if number <= _LISTED else " ".join(word[0] for word in names[index].split(", "))
-            axes.text(column + 1.1, top - row - 0.56, name, ha="left", va="center", **label)
-    if listed:
-        axes.text(0, top + 0.12, last, ha="left", va="bottom", **label)
-    else:
-        for column, name in enumerate(names):
-            axes.text(column + 0.46, top + 0.12, name.split()[-1], ha="center", va="bottom", **label)
-        axes.text(0, top + 0.62, last, ha="left", va="bottom", **label)
-        for row in range(down):
-            axes.text(-0.15, top - row - 0.56, _group_name(modes, row), ha="right", va="center", **label)
-        axes.text(-0.15, top + 0.12, " / ".join(name for name, _ in heads), ha="right", va="bottom", **label)
-    width = 1 + max(column for column, _ in places) + (step if listed else 0)
-    axes.set_xlim(-0.1 if listed else -2.1, width + 0.1)
-    axes.set_ylim(top - down - 4, top + 1.6)
-    axes.set_aspect("equal")
-    axes.set_anchor("NW")
-    axes.set_axis_off()
-    set_title(axes, "successes by mode")
 
 
 def color_of_mode(mode: int, colors: np.ndarray) -> Any:

@@ -39,7 +39,6 @@ _BUILT_IN = (
     "demonstrations",
     "offline_plots",
     "animation",
-    "film",
     "mode_plots",
     "training_plots",
     "inspection_plots",
@@ -51,7 +50,6 @@ _COMMANDS = {
     "eval.json": "koap eval {run}",
     "actions.safetensors": "koap eval {run}",
     "inspect.json": "koap inspect {run}",
-    "eigenvalues.safetensors": "koap inspect {run}",
 }
 
 

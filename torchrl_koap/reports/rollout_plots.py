@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from torchrl_koap.reports.mode_plots import color_of_mode, draw_mode_table, mode_colors
+from torchrl_koap.reports.mode_plots import color_of_mode, mode_colors
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.scenes import (
@@ -25,12 +25,12 @@ from torchrl_koap.reports.scenes import (
     keep_inside,
     read_episodes,
 )
-from torchrl_koap.reports.style import FAILURE_MARKS, INK, OUTCOMES, SUCCESS, entry, set_title
+from torchrl_koap.reports.style import FAILURE_MARKS, INK, OUTCOMES, SUCCESS, entry, legend_beside, set_title
 from torchrl_koap.tasks.units import thousandths
 
 
 def _rollouts_caption(run: RunFacts) -> str:
-    modes = "; a colour per mode, the table counts successes per mode" if run.modes.number > 1 else ""
+    modes = "; a colour per mode, as in their chart below" if run.modes.number > 1 else ""
     cross = "a cross (collision) or " if run.evaluation.get("collisions") else ""
     return (
         f"Path of the tool centre from above, to scale{modes}. Failures are black and end in {cross}a square (out of"
@@ -58,18 +58,9 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     paths, mode, outcome = read_episodes(rollouts)
     bodies, colors = body_paths(rollouts), mode_colors(run.modes)
     good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
-    figure = Figure(figsize=(8.4, 5.9), layout="constrained")
-    if bodies:
-        axes, beside, side = figure.subplots(1, 3)
-        share = abs(np.ptp(draw_scene(axes, run.task).get_xlim()) / np.ptp(axes.get_ylim()))
-        figure.set_size_inches(10 * share + 4.4, 5.6)
-        axes.get_gridspec().set_width_ratios((5 * share, 5 * share, 3.2))
-        draw_bodies(draw_scene(beside, run.task), bodies, run.task, good, rollouts.get("context"))
-        beside.label_outer()
-        set_title(beside, "objects: starts (pale), paths, ends")
-    else:
-        axes, side = figure.subplots(1, 2, width_ratios=(2.15, 1))
-        draw_scene(axes, run.task)
+    figure = Figure(figsize=(9.4 if bodies else 6.2, 5.9), layout="constrained")
+    axes, *beside = figure.subplots(1, 2 if bodies else 1, squeeze=False)[0]
+    draw_scene(axes, run.task)
     axes.add_collection(
         LineCollection(
             [paths[index] for index in np.flatnonzero(good)],
@@ -91,15 +82,13 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         Line2D([], [], color=INK, linewidth=1.2, marker=FAILURE_MARKS[kind], markersize=7, label=OUTCOMES[kind])
         for kind in ends
     ]
-    if bodies:
+    for panel in beside:
+        draw_bodies(draw_scene(panel, run.task), bodies, run.task, good, rollouts.get("context"))
+        panel.label_outer()
+        set_title(panel, "objects: starts (pale), paths, ends")
         marks += body_handles(bodies_of(run.task, bodies[0].shape[1]), good)
-    below: dict[str, Any] = {}
-    if run.modes.number > 1:
-        draw_mode_table(side, mode[good], run.modes)
-        below = {"bbox_to_anchor": (side.get_xlim()[0], side.dataLim.y0 - 0.2), "bbox_transform": side.transData}
-    side.set_axis_off()
     if marks:
-        side.legend(handles=marks, frameon=False, fontsize=8.5, loc="upper left", **below)
+        legend_beside([axes, *beside][-1], handles=marks)
     return figure
 
 

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.reports.pictures import picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, FAINT, MUTED, SERIES, WARNING, entry, legend_beside, set_title, tidy
+from torchrl_koap.reports.style import BLUE, FAINT, MUTED, WARNING, entry, set_title, tidy
 from torchrl_koap.tasks.units import thousandths
 
 _ROUND = (1, 2, 5, 10)
@@ -106,20 +106,18 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     source="actions.safetensors",
     title="Predicted against recorded actions",
     caption="Uses all actions, for evaluation only: those of demonstrations outside the label budget, which trained and"
-    " selected nothing. Points on the diagonal are exact; a slope below 1 means timid actions, an offset in the error"
-    " histogram means drift.",
+    " selected nothing. Points on the diagonal are exact; a slope below 1 means timid actions, points beside it drift.",
     order=90,
 )
 def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws predicted against recorded actions, a panel per dimension, and the distribution of the errors.
+    """Draws predicted against recorded actions, a panel per dimension.
 
     The recorded actions are those of demonstrations outside the budget, read for evaluation only; the title says so.
     Metres, radians, seconds and newtons are shown in thousandths.
 
     Args:
         data (mapping): ``predicted`` and ``true`` actions ``[N, d]``.
-        run (RunFacts): the run, whose task names the columns. Those that are no change per step, and those of another
-            unit than the first, are left out of the distribution of the errors.
+        run (RunFacts): the run, whose task names the columns.
     """
     true = entry(data, "true", [None, None])
     predicted, width = entry(data, "predicted", true.shape), true.shape[1]
@@ -134,8 +132,8 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     shown, factor = zip(*map(thousandths, units), strict=True)
     true, predicted = true[there] * factor, predicted[there] * factor
     error = predicted - true
-    across = width + 1 if width < 5 else -(-(width + 1) // 2)
-    down = -(-(width + 1) // across)
+    across = width if width < 5 else -(-width // 2)
+    down = -(-width // across)
     figure = Figure(figsize=(3.2 * across + 0.6, 3.4 * down + 0.35), layout="constrained")
     for index, name in enumerate(names):
         axes = figure.add_subplot(down, across, index + 1)
@@ -144,10 +142,6 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
         axes.set_xlabel(f"recorded {name} ({each})" if each else f"recorded {name}")
         axes.set_ylabel(f"predicted {name} ({each})" if each else f"predicted {name}")
         set_title(axes, f"{name}: RMSE {_rms(error[:, index]):.3g} {shown[index]}".rstrip())
-    same = [n for n in range(width) if names[n] not in absolute and units[n] == units[0]] or list(range(width))
-    left_out = [names[index] for index in range(width) if index not in same]
-    axes = figure.add_subplot(down, across, width + 1)
-    _histogram(axes, error[:, same], [names[index] for index in same], shown[same[0]], left_out)
     title = f"{len(true):,} steps of demonstrations outside the label budget, for evaluation only"
     figure.suptitle(title, fontsize=10, color=WARNING, x=0.01, ha="left")
     return figure
@@ -164,20 +158,6 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
     axes.yaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
     tidy(axes)
-
-
-def _histogram(axes: Axes, error: np.ndarray, names: Sequence[str], unit: str, left_out: Sequence[str]) -> None:
-    reach = max(float(np.quantile(abs(error), 0.995)), 1e-9)
-    for column, name in enumerate(names):
-        style = {"histtype": "step", "color": SERIES[column % len(SERIES)], "linewidth": 1.4, "label": name}
-        axes.hist(np.clip(error[:, column], -reach, reach), bins=41, range=(-reach, reach), **style)
-    which = f"all but {', '.join(left_out)}" if left_out else "all"
-    size = f"RMSE {_rms(error):.3g} {unit}".rstrip()
-    axes.set_box_aspect(1)
-    axes.set_xlabel(f"predicted - recorded ({unit})" if unit else "predicted - recorded")
-    axes.set_ylabel("steps")
-    legend_beside(axes)
-    tidy(axes, f"{which}: {size}, median {np.median(abs(error)):.2g}")
 
 
 def _rms(values: np.ndarray) -> float:
