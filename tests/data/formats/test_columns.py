@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchrl_koap.data import read_recordings
-from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.columns import Piece, assemble, kind_of
 from torchrl_koap.files import DataError
 
 X = np.random.default_rng(0).normal(size=6).cumsum()
@@ -32,7 +32,7 @@ def test_archives_say_where_episodes_end(ends, tmp_path):
     np.savez(tmp_path / "all.npz", observations=X[:, None], actions=X[:, None], episode_ends=ends, control_hz=20.0)
     assert [len(frames) for frames in read_recordings(tmp_path).states] == [3, 3]
     np.savez(tmp_path / "all.npz", observations=X[:, None], actions=X[:, None], which=[0, 0, 0, 1, 1, 1])
-    with pytest.raises(DataError, match="'which' has a number for every frame"):
+    with pytest.raises(DataError, match="'which' may say which episode a frame is of"):
         read_recordings(tmp_path, control_hz=20)
     assert read_recordings(tmp_path, control_hz=20, drop_columns=["which"]).skipped == ("which",)
 
@@ -118,3 +118,85 @@ def test_archives_of_truth_values_and_of_lists(tmp_path):
     np.savez(tmp_path / "a.npz", states=np.array([[1], [2, 3]], dtype=object))
     with pytest.raises(DataError, match="entry 'states' cannot be read: it holds objects"):
         read_recordings(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    {
+        "clock": "elapsed sim_time header.stamp wall_time stamp.nanosec timeStamp t_ms",
+        "episode": "episodeId run trial_no traj-idx demonstration ep",
+        "end": "is_last truncated episode_ends",
+        "start": "is_first trajectory_starts",
+        "length": "lengths episode_length",
+        "frame": "timestep stepIndex frame_number",
+        "other": "discount cumulative_reward return_to_go next.success __index_level_0__",
+        None: "q restart length return_spring left_arm_time_constant step_height q_s run_speed",
+    }.items(),
+)
+def test_names_say_what_is_no_state(kind, names):
+    assert {name: kind_of(name)[0] for name in names.split()} == dict.fromkeys(names.split(), kind)
+
+
+def test_units_of_clocks():
+    assert [kind_of(f"time_{unit}")[1] for unit in ("s", "msec", "us", "ns")] == [1, 1e-3, 1e-6, 1e-9]
+
+
+@pytest.mark.parametrize("named", ["csv", "npz", "parquet"])
+def test_episodes_may_have_names_instead_of_numbers(named, tmp_path):
+    which = np.array(["reach", "push"]).repeat(3)
+    if named == "csv":
+        rows = [f"{x},{name},{x}" for x, name in zip(X, which, strict=True)]
+        (tmp_path / "a.csv").write_text("\n".join(["x,episode,action", *rows]))
+    elif named == "npz":
+        np.savez(tmp_path / "a.npz", states=X[:, None], actions=X[:, None], episode=which)
+    else:
+        parquet = pytest.importorskip("pyarrow.parquet")
+        columns = {"x": X, "episode": which.tolist(), "action": X}
+        parquet.write_table(pytest.importorskip("pyarrow").table(columns), tmp_path / "a.parquet")
+    found = read_recordings(tmp_path, control_hz=20)
+    np.testing.assert_array_equal(np.stack(found.states)[..., 0], X.reshape(2, 3))
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("episode_ends", [2, 6]), ("episode_ends", [1, 5]), ("episode_lengths", [2, 4]), ("episode_starts", [0, 2])],
+)
+def test_archives_may_count_where_episodes_end(name, values, tmp_path):
+    np.savez(tmp_path / "a.npz", states=X[:, None], actions=X[:, None], control_hz=20.0, **{name: values})
+    found = read_recordings(tmp_path)
+    assert [frames[:, 0].tolist() for frames in found.states] == [X[:2].tolist(), X[2:].tolist()]
+    np.savez(tmp_path / "a.npz", states=X[:, None], actions=X[:, None], control_hz=20.0, other=values)
+    if name != "episode_starts":  # anything may count from 0
+        with pytest.raises(DataError, match="'other' may say which episode a frame is of"):
+            read_recordings(tmp_path)
+
+
+def test_a_clock_that_starts_again_and_flags_of_starts():
+    for column in ({"time": [0.0, 0.1, 0.2, 0, 0.1, 0.2]}, {"is_first": [1, 0, 0, 1, 0, 0]}):
+        assert [len(frames) for frames in read(**column).states] == [3, 3]
+
+
+def test_episodes_of_one_frame_are_left_out_and_listed():
+    found = read(episode=[0, 1, 1, 1, 2, 2])
+    assert [len(frames) for frames in found.states] == [3, 2] and found.skipped == ("run[0] (1 frame)", "episode")
+    with pytest.raises(DataError, match="run: all of its 6 episodes have one frame"):
+        read(episode=np.arange(6))
+
+
+def test_time_stamps_that_are_not_looked_at_are_told():
+    assert read(control_hz=50, time=np.arange(6) / 20).skipped == ("time (it says 20 frames per second)",)
+    assert read(control_hz=20, time=np.arange(6) / 20).skipped == ("time",)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"0.1,0.2\n0.3,0.4\n", "its first row holds numbers, wanted the names of the columns"),
+        ("x,y\n1,2\n3,4\n".encode("utf-16"), "it is no text in UTF-8: save it as CSV UTF-8"),
+        (b"x,done\n1,no\n2,yes\n", "column 'done' is the end of episodes and holds no numbers"),
+    ],
+)
+def test_tables_that_cannot_be_understood(content, message, tmp_path):
+    (tmp_path / "a.CSV").write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        read_recordings(tmp_path, control_hz=20)

@@ -24,7 +24,7 @@ def test_what_has_no_label():
     steps = np.ones((4, 2))
     steps[1, 0] = np.nan  # half an action is none
     recordings = make_recordings([FRAMES, FRAMES, FRAMES], [None, steps, np.full((5, 2), np.nan)])
-    assert recordings.num_labels == 3
+    assert recordings.num_labels == 3 and recordings.skipped == ("1 actions of which only some columns are known",)
     assert np.isnan(recordings.actions[1][1]).all() and np.isnan(recordings.actions[0]).all()
     assert recordings.actions[0].shape == (4, 2)
 

@@ -9,27 +9,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchrl_koap.data.formats.clocks import Clock, find_rate, rises_evenly, told_rate, usual_rate
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
-from torchrl_koap.data.formats.resampling import UNEVEN, resampled
-from torchrl_koap.files import DataError, some
+from torchrl_koap.data.formats.resampling import resampled
+from torchrl_koap.files import DataError
 from torchrl_koap.lookup import lookup
 
-# what columns are called that are no state, in lower case, without unit
-KINDS = {
-    "clock": "timestamp timestamps time times t stamp stamps clock",
-    "episode": "episode episodes episode_index episode_id episode_number trajectory trajectory_index trajectory_id"
-    " traj traj_id demo demo_id",
-    "end": "timeout timeouts terminal terminals termination terminations truncation truncations truncated terminated"
-    " done dones episode_end episode_ends is_last is_terminal",
-    "frame": "frame frames frame_index frame_id step",
-    "other": "index task_index row __index_level_0__ unnamed:_0 reward rewards return returns success is_success"
-    " is_first",
+_NUMBERED = "(_?(id|idx|index|number|num|nr|no))?"
+# what columns are called that are no state: words of a name joined by _, in lower case, without unit
+_KINDS = {
+    "clock": r"t|(.+_)?(time_?stamps?|stamps?)|((sim|wall|ros|unix|system|log|elapsed)_)?times?|elapsed|(date|up)_?time"
+    r"|clock",
+    "episode": rf"(episode|ep|traj|trajectory|demo|demonstration|run|rollout|trial)s?{_NUMBERED}",
+    "end": r"(is_)?(timeout|terminal|termination|terminated|truncation|truncated|done|last)s?|(episode|ep|traj)_ends?",
+    "start": r"(is_)?first|(episode|ep|traj|trajectory)_starts?",
+    "length": r"lengths|(episode|ep|traj|trajectory|demo)_len(gth)?s?",
+    "frame": rf"(frame|step|time_?step)s?{_NUMBERED}",
+    "other": r"index|task_index|row|_*index_level_0_*|unnamed:_0|(.+_)?(rewards?|success)|returns?(_to_go)?|discounts?",
 }
-_KIND = {name: kind for kind, names in KINDS.items() for name in names.split()}
-_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_KIND = {kind: re.compile(pattern) for kind, pattern in _KINDS.items()}
+_UNITS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6}
+_UNITS |= {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9}
 _UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(_UNITS)})[)\]]?")
-SLOWEST, FASTEST = 1.0, 2000.0  # Hz; beyond, stamps are in another unit
-_LONG = 20  # frames after which a column that rises evenly is taken for a clock
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,21 @@ def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 def kind_of(name: str) -> tuple[str | None, float]:
     """What a column is by its name, None for a state; and of a clock its unit in seconds, 0.001 of "Time [ms]"."""
-    plain = name.strip().lower().removeprefix("next.")
+    plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.strip()).lower().removeprefix("next.")
     unit = _UNIT.fullmatch(plain)
-    base, scale = (unit[1], _UNITS[unit[2]]) if unit else (plain, 1.0)
-    kind = _KIND.get(re.sub(r"[\s-]+", "_", base))
-    return (kind, scale if kind == "clock" else 1.0)
+    if unit and _KIND["clock"].fullmatch(_joined(unit[1])):
+        return "clock", _UNITS[unit[2]]
+    return next((kind for kind, pattern in _KIND.items() if pattern.fullmatch(_joined(plain))), None), 1.0
+
+
+def numbered(texts: Sequence[object]) -> np.ndarray:
+    """Names of episodes ``[T]`` as numbers, in the order in which they come."""
+    numbers: dict[object, int] = {}
+    return np.array([numbers.setdefault(text, len(numbers)) for text in texts], dtype=float)
+
+
+def _joined(name: str) -> str:
+    return re.sub(r"[\s./-]+", "_", name)
 
 
 def assemble(
@@ -102,29 +113,36 @@ def assemble(
     problems = [*_other_names(pieces), *_other_lengths(pieces)]
     if problems:
         raise DataError(source, problems)
-    pieces = [part for piece in pieces for part in _episodes(piece, problems)]
+    left_out = list(skipped)
+    pieces = [part for piece in pieces for part in _episodes(piece, problems, left_out)]
     names = list(pieces[0].states)
     acting = next((list(piece.actions) for piece in pieces if piece.actions is not None), [])
     problems += unknown(state_columns, names, "column in state_columns:")
     problems += unknown(drop_columns, [*names, *acting], "column in drop_columns:")
     problems += [
-        f"{name!r} has a number for every frame: does it say which episode a frame is of, or where episodes end? call"
-        " it episode_index or timeouts then; else name the state's columns in state_columns, or drop it in drop_columns"
+        f"{name!r} may say which episode a frame is of, or where episodes end: call it episode_index, timeouts or"
+        " episode_ends then; else name the state's columns in state_columns, or drop it in drop_columns"
         for name in dict.fromkeys(name for piece in pieces for name in piece.unclear)
         if name not in drop_columns and not state_columns
     ]
     even = set() if state_columns else _even(pieces)
     usable = [name for name in names if kind_of(name)[0] is None and name not in even]
     observed = [name for name in state_columns or usable if name not in drop_columns]
-    unused = [name for name in names if name not in observed]
-    left_out = [*skipped, *(f"{name} (it rises evenly: a clock)" if name in even else name for name in unused)]
+    about = dict.fromkeys(even, " (it rises evenly: a clock)")
+    clock, rate, times = _clock(pieces), control_hz, None
+    if control_hz is None and clock is not None:
+        times = clock.times
+        rate = find_rate(clock, declared_hz, problems) if resample is None else usual_rate(clock, problems)
+    elif control_hz is None:
+        rate = declared_hz
+        problems += [no_rate] if rate is None else []
+    elif clock is not None:
+        about[clock.name] = told_rate(clock, control_hz)
+    left_out += [name + about.get(name, "") for name in names if name not in observed]
     if not observed:
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
     left_out += [name for name in acting if name in drop_columns]
     acting = [name for name in acting if name not in drop_columns]
-    rate, times = control_hz, None
-    if control_hz is None:
-        rate, times = _find_rate(pieces, declared_hz, no_rate, resample is None, problems)
     if problems:
         raise DataError(source, problems)
     recordings = make_recordings(
@@ -156,54 +174,17 @@ def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarra
     return np.stack([columns[name] for name in names], 1).astype(np.float64)
 
 
-def _find_rate(
-    pieces: Sequence[Piece], declared: float | None, otherwise: str, fixed: bool, problems: list[str]
-) -> tuple[float | None, list[np.ndarray] | None]:
-    """Frames per second by the time stamps of all pieces, and these in seconds; what is declared where there are none.
-
-    Stamps that are to be ``fixed`` have even steps, and agree with what is declared.
-    """
-    clock = next((name for name in pieces[0].states if kind_of(name)[0] == "clock"), None)
-    if clock is None:
-        if declared is None:
-            problems.append(otherwise)
-        return declared, None
-    stamps = [piece.states[clock].astype(np.float64) for piece in pieces]
-    times = [(values - values[:1]) * kind_of(clock)[1] for values in stamps]
-    steps = [np.diff(values) for values in times]
-    back = [piece.name for piece, step in zip(pieces, steps, strict=True) if not (step > 0).all()]
-    if back or not sum(map(len, steps)):
-        where = f" in {len(back)} of {len(steps)} trajectories ({some(back)})" if back else ""
-        problems.append(f"time stamps do not increase: column {clock!r}{where}; pass control_hz if they mean nothing")
-        return None, None
-    usual = float(np.median(np.concatenate(steps)))
-    if not SLOWEST <= 1 / usual <= FASTEST:
-        problems.append(
-            f"column {clock!r} says {1 / usual:.3g} frames per second if it is in seconds: name it {clock}_ms,"
-            f" {clock}_us or {clock}_ns if it is in another unit, or pass control_hz"
-        )
-        return None, None
-    if not fixed:
-        return 1 / usual, times
-    uneven = [
-        f"{piece.name}: frames are {step.min():.4g} to {step.max():.4g} s apart (frame {np.abs(step - usual).argmax()})"
-        for piece, step in zip(pieces, steps, strict=True)
-        if np.abs(step - usual).max(initial=0) > UNEVEN * usual
-    ]
-    if uneven:
-        problems.append(
-            f"{some(uneven)}; the usual step is {usual:.4g} s: pass resample {1 / usual:.3g} (Hz) to bring them to a"
-            " fixed rate, or control_hz if the stamps are wrong"
-        )
-    if declared is not None and abs(declared * usual - 1) > UNEVEN:
-        problems.append(
-            f"column {clock!r} says {1 / usual:.4g} frames per second, the source declares {declared:g}:"
-            " pass control_hz"
-        )
-    return float(1 / usual) if declared is None else declared, times
+def _clock(pieces: Sequence[Piece]) -> Clock | None:
+    """The first column of time stamps, in seconds from the first frame of every piece."""
+    name = next((name for name in pieces[0].states if kind_of(name)[0] == "clock"), None)
+    if name is None:
+        return None
+    stamps = [piece.states[name].astype(np.float64) for piece in pieces]
+    times = [(values - values[:1]) * kind_of(name)[1] for values in stamps]
+    return Clock(name, times, [piece.name for piece in pieces])
 
 
-def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
+def _episodes(piece: Piece, problems: list[str], left_out: list[str]) -> list[Piece]:
     """The episodes of a piece; the piece itself if it is one, or if nothing separates them."""
     try:
         order, begins = _order(piece)
@@ -219,10 +200,15 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
         )
         return [piece]
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
+    if all(len(span) < 2 for span in spans):
+        problems.append(f"{piece.name}: all of its {len(spans)} episodes have one frame")
+        return [piece]
     names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
+    left_out += [f"{name} (1 frame)" for name, span in zip(names, spans, strict=True) if len(span) < 2]
     return [
         replace(piece, name=name, states=_cut(piece.states, span), actions=piece.actions and _cut(piece.actions, span))
         for name, span in zip(names, spans, strict=True)
+        if len(span) > 1
     ]
 
 
@@ -233,7 +219,7 @@ def _cut(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.nd
 def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     """The order of the rows of a piece, and which of them, so ordered, begin an episode.
 
-    Told by the number of the episode, by a frame counter that starts again, or by flags of the ends.
+    Told by the number of the episode, by a frame counter or a clock that starts again, or by flags of starts and ends.
     """
     rows = np.arange(len(next(iter(piece.states.values()), ())))
     called = {kind_of(name)[0]: name for name in reversed(piece.states)}
@@ -262,10 +248,20 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
             )
         return rows, starts
     starts = rows == 0
-    for flag in (values for name, values in piece.states.items() if kind_of(name)[0] == "end"):
-        if set(np.unique(flag)) - {0, 1}:
-            raise ValueError("columns of the ends of episodes must be 0 or 1")
-        starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # an episode ends where a flag falls
+    for name, flag in piece.states.items():
+        kind, switch = kind_of(name)[0], not set(np.unique(flag)) - {0, 1}
+        if kind in ("start", "end") and not switch:
+            raise ValueError(f"column {name!r} of the {kind}s of episodes must be 0 or 1")
+        if kind == "start":
+            starts = starts | (flag > 0)
+        elif kind == "end" or kind == "length" and switch:
+            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # an episode ends where a flag falls
+    clock = columns.get("clock")
+    if starts.sum() == 1 < len(rows) and clock is not None:
+        again = np.r_[True, np.diff(clock) < 0]
+        near = np.abs(clock[again] - clock[0]) < 0.5 * np.median(np.abs(np.diff(clock)))
+        if near.all() and (np.diff(np.flatnonzero(again)) > 1).all():
+            return rows, again
     return rows, starts
 
 
@@ -275,13 +271,8 @@ def _changes(numbers: np.ndarray) -> np.ndarray:
 
 def _even(pieces: Sequence[Piece]) -> set[str]:
     """State columns that rise by the same amount in every frame of all pieces; none if that would be all."""
-    found = set()
     states = [name for name in pieces[0].states if kind_of(name)[0] is None]
-    for name in states:
-        steps = np.concatenate([np.diff(piece.states[name].astype(np.float64)) for piece in pieces])
-        first = steps[0] if len(steps) >= _LONG else 0.0
-        if first > 0 and np.allclose(steps, first, rtol=1e-6, atol=0):
-            found.add(name)
+    found = {name for name in states if rises_evenly([piece.states[name] for piece in pieces])}
     return found if len(found) < len(states) else set()
 
 

@@ -136,6 +136,9 @@ def make_recordings(
         np.full((len(seen) - 1, wide), np.nan) if done is None else _whole(done[: len(seen) - 1])
         for seen, done in zip(frames, known, strict=True)
     ]
+    unknown = [np.isnan(array).sum(-1) for array in known if array is not None]
+    partly = sum(int(((0 < columns) & (columns < wide)).sum()) for columns in unknown)
+    skipped = [*skipped, *([f"{partly} actions of which only some columns are known"] if partly else [])]
     return Recordings(
         frames, steps, given_states, given_actions, tuple(labels), control_hz, tuple(dict.fromkeys(skipped))
     )

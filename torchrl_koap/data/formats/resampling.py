@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, some
 from torchrl_koap.lookup import lookup
@@ -17,7 +18,6 @@ ADDS_UP = {"delta": None, "change": True, "velocity": False, "absolute": False}
 LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
 MOST = 2.0  # new frames in one recorded step
 _LEVELS = 10  # a column of no more integers is a switch
-UNEVEN = 0.2  # share of the usual step by which a step in time may differ
 _SAME = 1e-3  # share of a step that is rounding
 
 

@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
-from torchrl_koap.data.formats.columns import UNEVEN, Piece, assemble, kind_of
+from torchrl_koap.data.formats.clocks import UNEVEN
+from torchrl_koap.data.formats.columns import Piece, assemble, kind_of, numbered
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, some
 from torchrl_koap.lookup import lookup
@@ -36,6 +37,7 @@ _UNREADABLE = (ValueError, OSError, KeyError, TypeError, EOFError, zipfile.BadZi
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
 _TRUTH = {"true": 1.0, "false": 0.0}
+_NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "frame": "a count of frames"}
 _Table = tuple[Piece, "float | None", list[str]]  # columns, declared rate, and what is not read
 
 
@@ -56,7 +58,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     files = _files(folder)
     if not files:
         raise FileNotFoundError(f"{folder} holds no *.npz, *.csv or *.parquet files")
-    archives = [file.name for file in files if file.suffix == ".npz"]
+    archives = [file.name for file in files if file.suffix.lower() == ".npz"]
     if action_columns is not None and archives:
         raise ValueError(
             f"action_columns: not an option for NumPy archives ({archives[0]}), whose actions are the entry"
@@ -66,7 +68,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     tables: list[_Table] = []
     for file in files:
         try:
-            tables.append(_READERS[file.suffix](file, action_columns))
+            tables.append(_READERS[file.suffix.lower()](file, action_columns))
         except _UNREADABLE as error:
             problems.setdefault(str(error) or type(error).__name__, []).append(str(file))
     if problems:
@@ -88,7 +90,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("*") if path.suffix in _READERS and path.is_file())
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in _READERS and path.is_file())
 
 
 def _stamped(piece: Piece, rate: float) -> Piece:
@@ -117,13 +119,17 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
     states, unclear, unread, steps = _named(frames, entries.get("state_names"), "state"), [], [], None
     for name, values in entries.items():
         kind = kind_of(name)[0]
+        counted = _counted(values, len(frames), kind)
         single = values.shape in ((len(frames),), (len(frames), 1)) and values.dtype.kind in "fiub"
         if name in read:
             continue
-        if kind == "other" or kind is None and not single:
+        if kind == "other" or kind is None and not single and counted is None:
             unread.append(name)
             continue
-        states[name] = _frame_entry(name, values, len(frames))
+        flags = None if single else counted
+        if flags is not None and kind == "start":
+            flags = np.roll(flags, 1)  # the first frame of an episode lies behind the last one of another
+        states[name] = _frame_entry(name, values, len(frames)) if flags is None else flags
         unclear += [name] if kind is None else []
     if acting is not None:
         if entries[acting].ndim != 2 or entries[acting].dtype.kind not in "fiub":
@@ -158,28 +164,49 @@ def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, 
     return {name: table[:, index] for index, name in enumerate(names)}
 
 
+def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:
+    """Flags ``[length]`` of the last frames of episodes, of the lengths, ends or starts that the kind of an entry says.
+
+    Of an entry of no kind they are there if its numbers could be lengths or ends.
+    """
+    if values.ndim != 1 or values.dtype.kind not in "iu" or not 0 < len(values) < length:
+        return None
+    rises = bool((np.diff(values.astype(np.int64)) > 0).all())
+    if kind in ("end", None) and rises and values[-1] in (length, length - 1):
+        last = values - (values[-1] == length)
+    elif kind in ("length", None) and values.sum() == length and values.all():
+        last = values.cumsum() - 1
+    elif kind == "start" and rises and values[0] == 0:
+        last = np.append(values[1:], length) - 1
+    else:
+        return None
+    return np.isin(np.arange(length), last).astype(np.float64)
+
+
 def _frame_entry(name: str, values: np.ndarray, length: int) -> np.ndarray:
-    """An entry about frames, one number each; of ends that are counted a flag at the last frame of every episode."""
-    if values.shape == (length, 1):
-        values = values[:, 0]
-    counted = values.ndim == 1 and values.dtype.kind in "iu" and len(values) and len(values) != length
-    if kind_of(name)[0] == "end" and counted and values[-1] == length and (np.diff(values) > 0).all():
-        flags = np.zeros(length)
-        flags[values - 1] = 1
-        return flags
-    if values.shape != (length,) or values.dtype.kind not in "fiub":
+    """An entry about frames, one number each, or the name of an episode."""
+    if values.shape not in ((length,), (length, 1)):
         raise ValueError(f"entry {name!r} must have one number for each of {length} frames, got {list(values.shape)}")
-    return values.astype(np.float64)
+    if kind_of(name)[0] == "episode" and values.dtype.kind in "US":
+        return numbered(values.ravel().tolist())
+    if values.dtype.kind not in "fiub":
+        raise ValueError(f"entry {name!r} must be numbers, got {values.dtype}")
+    return values.ravel().astype(np.float64)
 
 
 def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
-    text = file.read_text(encoding="utf-8-sig")
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError("it is no text in UTF-8: save it as CSV UTF-8") from error
     separator = max(",;\t", key=text.partition("\n")[0].count)
     rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(field.strip() for field in row)]
     if len(rows) < 2:
         raise ValueError("wanted a header and a row per frame")
     header = [name.strip() for name in rows[0]]
     header[0] = header[0] or "unnamed: 0"  # the index of the rows, as pandas writes and reads it
+    if all(_number(name, comma=separator != ",") is not None for name in header):
+        raise ValueError("its first row holds numbers, wanted the names of the columns")
     for number, name in enumerate(header):
         if not name:
             raise ValueError(f"column {number + 1} has no name")
@@ -192,6 +219,8 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
     for name, fields in zip(header, zip(*rows[1:], strict=True), strict=True):
         values = [_number(field.strip(), comma=separator != ",") for field in fields]
         odd = [row for row, value in enumerate(values) if value is None]
+        if odd and kind_of(name)[0] == "episode":
+            values, odd = numbered(fields), []
         if 0 < len(odd) < len(values):
             raise ValueError(f"row {odd[0] + 2}, column {name!r}: {fields[odd[0]]!r} is no number")
         columns[name] = None if odd else np.array(values)
@@ -220,7 +249,7 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
             values = values.cast(pyarrow.int8())
         kind = number_type(values.type)
         if kind is None:  # text, dates, pictures
-            columns[name] = None
+            columns[name] = numbered(values.to_pylist()) if kind_of(name)[0] == "episode" else None
             continue
         block = numbers(values.cast(kind), name)
         alone = not pyarrow.types.is_list(kind)
@@ -238,8 +267,9 @@ def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns:
         acting = [name for name in action_columns if lookup(columns, name, "action column") is not None]
     unread = [name for name, values in columns.items() if values is None]
     for name in unread:
-        if name in acting:
-            raise ValueError(f"column {name!r} is an action and holds no numbers")
+        what = "an action" if name in acting else _NEEDED.get(kind_of(name)[0])
+        if what is not None:
+            raise ValueError(f"column {name!r} is {what} and holds no numbers")
     known = {name: values for name, values in columns.items() if values is not None}
     if not known:
         raise ValueError(

@@ -1,0 +1,51 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Time stamps: the rate that they say, and columns that are clocks by what they do."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data.formats.clocks import Clock, find_rate, rises_evenly, told_rate
+
+TIME = np.arange(60) / 30
+
+
+def clock(*times):
+    return Clock("time", times, [f"{index}.csv" for index in range(len(times))])
+
+
+def test_the_usual_step_is_the_rate():
+    problems: list[str] = []
+    assert find_rate(clock(TIME, TIME[:5]), None, problems) == pytest.approx(30) and not problems
+    assert find_rate(clock(TIME), 29.97, problems) == 29.97 and not problems
+
+
+@pytest.mark.parametrize(
+    ("times", "declared", "message"),
+    [
+        (TIME * 1e3, None, "says 0.03 frames per second if it is in seconds: name it time_ms"),
+        (-TIME, None, r"do not increase: column 'time' in 1 of 2 trajectories \(1.csv\)"),
+        (np.r_[TIME, 9.0], None, r"1.csv: frames are 0.03333 to 7.033 s apart \(frame 59\); .* pass resample 30"),
+        (TIME, 20, "says 30 frames per second, the source declares 20: pass control_hz"),
+    ],
+)
+def test_stamps_that_cannot_be_are_told(times, declared, message):
+    problems: list[str] = []
+    scale = 1e3 if times[-1] > 99 else 1
+    find_rate(clock(TIME * scale, times), declared, problems)
+    assert re.search(message, problems[0])
+
+
+def test_what_is_not_looked_at():
+    assert told_rate(clock(TIME), 20) == " (it says 30 frames per second)"
+    assert told_rate(clock(TIME), 31) == told_rate(clock(0 * TIME), 20) == ""
+
+
+@pytest.mark.parametrize("clock", [TIME, TIME.astype(np.float32), TIME.round(3), np.arange(60, dtype=np.uint8)])
+def test_clocks_rise_evenly(clock):
+    assert rises_evenly([clock, clock[:9]])
+    assert not rises_evenly([clock, -1.0 * clock]) and not rises_evenly([np.sin(clock)])
+    assert not rises_evenly([clock[:9]])

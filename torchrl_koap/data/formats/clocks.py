@@ -1,0 +1,100 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Time stamps of recordings: the rate that they say, and whether frames lie evenly in time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from torchrl_koap.files import some
+
+UNEVEN = 0.2  # share of the usual step by which a step in time may differ
+SLOWEST, FASTEST = 1.0, 2000.0  # Hz; beyond, stamps are in another unit
+_ROUNDED = 0.03  # share of its mean step by which a rounded clock's steps may differ
+_LONG = 20  # frames after which a column that rises evenly is taken for a clock
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Time stamps of recordings.
+
+    Args:
+        name (str): of the column.
+        times (sequence of array): seconds of every trajectory ``[T_i]``.
+        sources (sequence of str): what messages call the trajectories.
+    """
+
+    name: str
+    times: Sequence[np.ndarray]
+    sources: Sequence[str]
+
+    @cached_property
+    def steps(self) -> list[np.ndarray]:
+        """Seconds between frames ``[T_i - 1]``."""
+        return [np.diff(times) for times in self.times]
+
+    @property
+    def usual(self) -> float:
+        """The median step in seconds."""
+        return float(np.median(np.concatenate(self.steps)))
+
+
+def usual_rate(clock: Clock, problems: list[str]) -> float | None:
+    """Frames per second by the usual step of time stamps; None, and a problem, where they cannot be seconds."""
+    back = [name for name, step in zip(clock.sources, clock.steps, strict=True) if not (step > 0).all()]
+    if back or not sum(map(len, clock.steps)):
+        where = f" in {len(back)} of {len(clock.steps)} trajectories ({some(back)})" if back else ""
+        said = f"time stamps do not increase: column {clock.name!r}{where}"
+        problems.append(f"{said}; pass control_hz if they mean nothing")
+        return None
+    rate, name = 1 / clock.usual, clock.name
+    if SLOWEST <= rate <= FASTEST:
+        return rate
+    problems.append(
+        f"column {name!r} says {rate:.3g} frames per second if it is in seconds: name it {name}_ms, {name}_us or"
+        f" {name}_ns if it is in another unit, or pass control_hz"
+    )
+    return None
+
+
+def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> float | None:
+    """The rate of frames that lie evenly in time, and agree with what the source declares; else there are problems."""
+    rate = usual_rate(clock, problems)
+    if rate is None:
+        return None
+    uneven = [
+        f"{name}: frames are {step.min():.4g} to {step.max():.4g} s apart (frame {np.abs(step - 1 / rate).argmax()})"
+        for name, step in zip(clock.sources, clock.steps, strict=True)
+        if np.abs(step * rate - 1).max(initial=0) > UNEVEN
+    ]
+    if uneven:
+        problems.append(
+            f"{some(uneven)}; the usual step is {1 / rate:.4g} s: pass resample {rate:.3g} (Hz) to bring them to a"
+            " fixed rate, or control_hz if the stamps are wrong"
+        )
+    if declared is not None and abs(declared / rate - 1) > UNEVEN:
+        problems.append(
+            f"column {clock.name!r} says {rate:.4g} frames per second, the source declares {declared:g}:"
+            " pass control_hz"
+        )
+    return rate if declared is None else declared
+
+
+def told_rate(clock: Clock, control_hz: float) -> str:
+    """What time stamps say that are not looked at, where it is another rate; else nothing."""
+    wrong: list[str] = []
+    rate = usual_rate(clock, wrong)
+    if rate is None or abs(control_hz / rate - 1) <= UNEVEN:
+        return ""
+    return f" (it says {rate:.4g} frames per second)"
+
+
+def rises_evenly(trajectories: Sequence[np.ndarray]) -> bool:
+    """Says whether a column, given by trajectory ``[T_i]``, rises by the same amount in every frame, as clocks do."""
+    steps = np.concatenate([np.diff(values.astype(np.float64)) for values in trajectories])
+    if len(steps) < _LONG or steps.min() <= 0:
+        return False
+    return bool(np.abs(steps / steps.mean() - 1).max() <= _ROUNDED)
