@@ -80,6 +80,26 @@ def test_actions_that_never_change_are_named():
     assert constant_columns(np.array([[1.0, np.nan], [2.0, 5.0], [2.0, 5.0]])) == [2.0, 5.0]
 
 
+def test_clocks_and_rates_are_told():
+    wave = torch.sin(PATH[:, :1])
+    (warning,) = warnings([torch.cat([wave + i, PATH[:, :1]], 1) for i in range(2)], columns=["q", "ticks"], units=())
+    assert warning.startswith("column 'ticks' rises by the same amount in every frame")
+    data = flatten_trajectories([wave], None, action_dim=1)
+    task = Task(name="arm", observation_parts={"q": 1}, actions={"v": Action()}, position="q", control_hz=0.03)
+    assert "control_hz is 0.03: frames per second" in find_warnings(data.set("state", data["observation"]), task)[0]
+
+
+def test_labels_that_leap_or_stand_alone():
+    steps = 0.01 * torch.sin(PATH[1:, :1] / 9)
+    steps[7] -= 2 * torch.pi
+    (warning,) = warnings([PATH], [steps])
+    assert warning.startswith("action 'v' is -6.27 in label 7 of trajectory 0 and far from that before")
+    assert warnings([PATH], [(torch.arange(19) == 7).float()[:, None]]) == []  # a switch
+    alone = torch.where(torch.arange(19)[:, None] % 4 == 1, STEPS, torch.nan)
+    (warning,) = warnings([PATH, PATH + 1], [alone, STEPS])
+    assert warning.startswith("labels stand alone in 1 trajectories: trajectory 0 (5 of 19 steps)")
+
+
 def test_a_plan_that_is_short_against_the_motion():
     data = flatten_trajectories([torch.zeros(1001, 2)] * 3, None, action_dim=1)
     covers, short = plan_coverage(data, 500.0)

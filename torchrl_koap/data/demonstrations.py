@@ -174,9 +174,17 @@ def make_demonstrations(
     units = _each(action_units, len(acting), "action_units", problems)
     own_units = _each(state_units, len(names), "state_units", problems)
     problems += _coarse(np.concatenate(recordings.states), names)
-    if recordings.num_labels and not any(np.ptp(frames[:, own], axis=0).any() for frames in recordings.states):
+    labelled = [
+        frames[:, own]
+        for frames, steps in zip(recordings.states, recordings.actions, strict=True)
+        if np.isfinite(steps).all(-1).any()
+    ]
+    if labelled and not any(np.ptp(frames, axis=0).any() for frames in labelled):
         which = ", ".join(names[column] for column in own)
-        problems.append(f"robot: {which} never move, so nothing tells what an action does: name others in robot")
+        problems.append(
+            f"robot: {which} never move where there are labels, so nothing tells what an action does: name others in"
+            " robot"
+        )
     if problems:
         raise DataError(f"task {name!r}", problems)
     constants = constant_columns(np.concatenate(recordings.actions))

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap import keys
+from torchrl_koap.data.formats.clocks import FASTEST, SLOWEST, rises_evenly
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds
 from torchrl_koap.data.trajectories import trajectory_lengths
@@ -28,8 +29,9 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     """Finds what is unlikely in demonstrations, a sentence each.
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, or reach a
-    place beyond 100 m or rad; state columns that never change, equal another one, or leap; frames at both ends in which
-    nothing moves; actions that never change; plans that are short against the motion.
+    place beyond 100 m or rad; state columns that never change, equal another one, leap, or are clocks; frames at both
+    ends in which nothing moves; actions that never change or leap for one frame; labels that stand alone; an unlikely
+    rate; plans that are short against the motion.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout, with ``state``.
@@ -51,12 +53,21 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     frames = [part.double().numpy() for part in state.split(lengths)]
     constants = zip(task.action_names, constant_columns(data.get(keys.ACTION).cpu().numpy()), strict=True)
     _, short_plans = plan_coverage(data, task.control_hz)
+    labels = [
+        steps[known].double().cpu().numpy()
+        for steps, known in zip(
+            data.get(keys.ACTION).split(lengths), data.get(keys.HAS_ACTION).squeeze(-1).split(lengths), strict=True
+        )
+    ]
     return [
         *_trajectory_warnings(data, task, lengths, called),
         *_short(lengths, called),
         *_column_warnings(state, task.state_names),
         *_leaps(frames, called, task.state_names),
         *_stillness(frames, called),
+        *_clocks(frames, task),
+        *_spikes(labels, called, task.action_names),
+        *_single_labels(data.get(keys.HAS_ACTION).squeeze(-1).split(lengths), called),
         *(
             f"action {name!r} is {value:g} in all labels: controllers command that, method dp something near it"
             for name, value in constants
@@ -144,6 +155,52 @@ def _leaps(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Seq
             f" {called[trajectory]}{more})"
         )
     return [f"columns leap: {', '.join(which)}: {why}" for why, which in found.items()]
+
+
+def _clocks(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
+    moving = np.flatnonzero(np.ptp(np.concatenate(trajectories), axis=0))
+    even = [column for column in moving if rises_evenly([frames[:, column] for frames in trajectories])]
+    if len(even) < len(moving):  # else it is how all move
+        for column in even:
+            said = "rises by the same amount in every frame: a clock is no state, leave it out"
+            yield f"column {task.state_names[column]!r} {said}"
+    if not SLOWEST <= task.control_hz <= FASTEST:
+        yield f"control_hz is {task.control_hz:g}: frames per second, not seconds per frame?"
+
+
+def _spikes(actions: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> Iterator[str]:
+    """Labels ``[T_i, a]`` that leap for one frame."""
+    known = [(name, steps) for name, steps in zip(called, actions, strict=True) if len(steps) > 2]
+    if not known:
+        return
+    bound, _ = leap_bounds([steps for _, steps in known])
+    for column, name in enumerate(names):
+        found = []
+        for source, steps in known:
+            change = np.diff(steps[:, column])
+            out = (np.abs(change) > bound[column])[:-1] & (np.abs(change) > bound[column])[1:]
+            at = np.flatnonzero(out & (change[:-1] * change[1:] < 0)) + 1
+            found += [f"{steps[step, column]:.3g} in label {step} of {source}" for step in at]
+        if found:
+            more = f" and {len(found) - 1} times more" if len(found) > 1 else ""
+            yield (
+                f"action {name!r} is {found[0]}{more} and far from that before and behind: the difference of wrapped"
+                " angles, or a command that was not logged? mend it, or make it NaN"
+            )
+
+
+def _single_labels(known: Sequence[Tensor], called: Sequence[str]) -> Iterator[str]:
+    """Trajectories in which most labels stand alone."""
+    few = []
+    for name, labelled in zip(called, known, strict=True):
+        alone = labelled[1:-1] & ~labelled[:-2] & ~labelled[2:]
+        if 2 * int(alone.sum()) > int(labelled.sum()) > 1:
+            few.append(f"{name} ({int(labelled.sum())} of {len(labelled)} steps)")
+    if few:
+        yield (
+            f"labels stand alone in {len(few)} trajectories: {some(few)}; if actions are logged only where they change,"
+            " repeat the last one"
+        )
 
 
 def _cause(values: np.ndarray, near: float, flipped: bool, most: bool) -> str:

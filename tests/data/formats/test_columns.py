@@ -178,8 +178,8 @@ def test_a_clock_that_starts_again_and_flags_of_starts():
 
 def test_episodes_of_one_frame_are_left_out_and_listed():
     found = read(episode=[0, 1, 1, 1, 2, 2])
-    assert [len(frames) for frames in found.states] == [3, 2] and found.skipped == ("run[0] (1 frame)", "episode")
-    with pytest.raises(DataError, match="run: all of its 6 episodes have one frame"):
+    assert [len(frames) for frames in found.states] == [3, 2] and found.skipped[0] == "run[0] (fewer than two frames)"
+    with pytest.raises(DataError, match="none of its 6 trajectories has two frames"):
         read(episode=np.arange(6))
 
 

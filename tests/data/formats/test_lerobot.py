@@ -196,7 +196,7 @@ def test_missing_episodes_are_told(tmp_path):
 
 
 def test_one_row_is_too_short(tmp_path):
-    with pytest.raises(DataError, match="trajectory episode 0: 1 frame; a transition needs two"):
+    with pytest.raises(DataError, match="none of its 2 trajectories has two frames"):
         read_lerobot(write(tmp_path, rows=1))
 
 

@@ -49,10 +49,16 @@ class Piece:
     actions: dict[str, np.ndarray] | None = None
     unclear: tuple[str, ...] = ()
 
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(next(iter(self.states.values()), ()))
+
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     """Columns of a table ``[T]`` or ``[T, d]``, numbered if there are several."""
-    table = np.asarray(values).reshape(len(values), -1)
+    table = np.asarray(values)
+    table = table.reshape(len(table), int(np.prod(table.shape[1:])))
     alone = table.shape[1] == 1
     return {name if alone else f"{name}_{index}": table[:, index] for index in range(table.shape[1])}
 
@@ -114,7 +120,11 @@ def assemble(
     if problems:
         raise DataError(source, problems)
     left_out = list(skipped)
-    pieces = [part for piece in pieces for part in _episodes(piece, problems, left_out)]
+    parts = [part for piece in pieces for part in _episodes(piece, problems)]
+    left_out += [f"{part.name} (fewer than two frames)" for part in parts if part.frames < 2]
+    pieces = [part for part in parts if part.frames > 1]
+    if not pieces:
+        raise DataError(source, problems or [f"none of its {len(parts)} trajectories has two frames"])
     names = list(pieces[0].states)
     acting = next((list(piece.actions) for piece in pieces if piece.actions is not None), [])
     problems += unknown(state_columns, names, "column in state_columns:")
@@ -184,7 +194,7 @@ def _clock(pieces: Sequence[Piece]) -> Clock | None:
     return Clock(name, times, [piece.name for piece in pieces])
 
 
-def _episodes(piece: Piece, problems: list[str], left_out: list[str]) -> list[Piece]:
+def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
     """The episodes of a piece; the piece itself if it is one, or if nothing separates them."""
     try:
         order, begins = _order(piece)
@@ -200,15 +210,10 @@ def _episodes(piece: Piece, problems: list[str], left_out: list[str]) -> list[Pi
         )
         return [piece]
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
-    if all(len(span) < 2 for span in spans):
-        problems.append(f"{piece.name}: all of its {len(spans)} episodes have one frame")
-        return [piece]
     names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
-    left_out += [f"{name} (1 frame)" for name, span in zip(names, spans, strict=True) if len(span) < 2]
     return [
         replace(piece, name=name, states=_cut(piece.states, span), actions=piece.actions and _cut(piece.actions, span))
         for name, span in zip(names, spans, strict=True)
-        if len(span) > 1
     ]
 
 

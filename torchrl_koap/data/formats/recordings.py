@@ -8,8 +8,10 @@ action is NaN, has no label.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 
 import numpy as np
 import torch
@@ -128,7 +130,7 @@ def make_recordings(
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
     problems += _sparse([array for array in known if array is not None and array.shape[1] == wide], given_actions)
-    if control_hz is not None and not (np.isfinite(control_hz) and control_hz > 0):
+    if control_hz is not None and not (isinstance(control_hz, Real) and 0 < control_hz < math.inf):
         problems.append(f"control_hz must be a positive number of frames per second, got {control_hz!r}")
     if problems:
         raise DataError(source, problems)
@@ -213,6 +215,8 @@ def _names(given: Sequence[str] | None, width: int, kind: str, problems: list[st
     if given is None:
         return tuple(f"{kind}_{index}" for index in range(width))
     names = tuple(str(name) for name in given)
+    if not all(name.strip() for name in names):
+        problems.append(f"{kind}_names holds an empty name")
     if len(names) != width:
         problems.append(f"{kind}_names names {len(names)} columns, there are {width}")
     repeated = sorted({name for name in names if names.count(name) > 1})

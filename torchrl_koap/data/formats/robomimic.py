@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.columns import Piece, assemble, spread
+from torchrl_koap.data.formats.columns import Piece, assemble, kind_of, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError
 
@@ -54,18 +54,25 @@ def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = Non
         if "data" not in stream or not isinstance(stream["data"], h5py.Group):
             raise DataError(file, f"no group 'data'; the file holds {', '.join(stream) or 'nothing'}")
         demos = sorted(stream["data"], key=_number)
-        problems = [f"data/{name} has no group 'obs'" for name in demos if "obs" not in stream[f"data/{name}"]]
+        problems = [
+            f"data/{name} has no group 'obs'"
+            for name in demos
+            if not isinstance(stream["data"][name].get("obs"), h5py.Group)
+        ]
         if problems or not demos:
             raise DataError(file, problems or "'data' holds no trajectories")
         first = stream[f"data/{demos[0]}"]
-        usable = [name for name in sorted(first["obs"]) if _is_table(first["obs"][name])]
+        entries = {name: part for demo in demos for name, part in stream[f"data/{demo}/obs"].items()}
+        usable = sorted(name for name, part in entries.items() if _is_table(part))
         chosen = usable if observations is None else list(observations)
         if not chosen:
             problems.append(f"no entry of obs is a table of numbers; there are {', '.join(first['obs'])}")
         declared = _control_frequency(stream["data"].attrs.get("env_args"))
         pieces = [_piece(stream[f"data/{name}"], name, chosen, problems) for name in demos]
-        skipped = [f"obs/{name}" for name in sorted(first["obs"]) if name not in chosen]
-        skipped += [name for name in sorted(first) if name not in ("obs", "next_obs", "actions")]
+        skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen]
+        read = ("obs", "next_obs", "actions")
+        skipped += [name for name in sorted(first) if name not in read and kind_of(name)[0] != "clock"]
+        skipped += [name for name in stream if name != "data"]
     if problems:
         raise DataError(file, problems)
     return assemble(
@@ -96,13 +103,16 @@ def _piece(group: Any, name: str, chosen: Sequence[str], problems: list[str]) ->
                 problems.append(f"data/{name}/next_obs/{entry} is {_shape(last)}, obs/{entry} is {_shape(part)}")
                 continue
             states |= spread(entry, np.concatenate([part, last[-1:]]))
+    if not behind:  # time stamps may lie beside obs
+        stamps = [entry for entry in group if kind_of(entry)[0] == "clock" and _is_table(group[entry])]
+        states = {entry: group[entry][()].ravel() for entry in stamps} | states
     if "actions" not in group:
         return Piece(name, states)
     actions = group["actions"]
     if not _is_table(actions):
         problems.append(f"data/{name}/actions must be numbers [T, a], got {_shape(actions)}")
         return Piece(name, states)
-    columns = np.asarray(actions).reshape(len(actions), -1).T
+    columns = spread("action", actions).values()
     return Piece(name, states, {f"action_{index}": values for index, values in enumerate(columns)})
 
 
