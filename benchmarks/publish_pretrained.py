@@ -11,21 +11,25 @@ from __future__ import annotations
 import json
 import statistics
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 import tyro
+from torch import Tensor
 from tyro.conf import Positional
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.runs.pretrained import copy_run
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import compact, load_tensors, save_tensors
+from torchrl_koap.runs.weights import ROW_SCALE, load_tensors, save_tensors
 from torchrl_koap.tasks import get_task
 
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
 PLACES = ("out", "dataset")
+LEAST = 4096  # entries of a matrix that is worth it
 ROOT = Path(__file__).resolve().parents[1] / "pretrained"
 CARD = """# {name}
 
@@ -53,6 +57,23 @@ Made by
     {command}
     python benchmarks/publish_pretrained.py RUN {name} --candidates {candidates}
 """
+
+
+def compact(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Stores weight matrices as ``int8`` and a scale per row, as :func:`~torchrl_koap.runs.weights.expand` reads them.
+
+    Args:
+        tensors (mapping): a state dict; entries with two or more axes and at least 4,096 floats are matrices.
+    """
+    small = {}
+    for name, tensor in tensors.items():
+        if tensor.ndim < 2 or tensor.numel() < LEAST or not tensor.is_floating_point():
+            small[name] = tensor
+            continue
+        scale = tensor.flatten(1).abs().amax(1).clamp_min(1e-12).div(127).reshape(-1, *[1] * (tensor.ndim - 1))
+        small[name] = (tensor / scale).round().to(torch.int8)
+        small[name + ROW_SCALE] = scale.float()
+    return small
 
 
 def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int | None = None) -> Path:

@@ -7,14 +7,14 @@ import json
 
 import pytest
 import torch
-from publish_pretrained import publish
+from publish_pretrained import compact, publish
 from tiny_runs import koap
 
 from torchrl_koap.commands import run_commands
 from torchrl_koap.runs import pretrained
 from torchrl_koap.runs.pretrained import copy_run, find_run
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.runs.weights import CheckpointError, load_tensors
+from torchrl_koap.runs.weights import CheckpointError, expand, load_tensors
 from torchrl_koap.training import Trained
 
 
@@ -128,3 +128,29 @@ def test_another_run_is_not_overwritten(run, tmp_path):
     with pytest.raises(RunDirectoryError, match="holds another run than"):
         copy_run(run, tmp_path / "mine")
     assert json.loads((tmp_path / "mine" / "config.json").read_text())["run"]["seed"] == 9
+
+
+def test_matrices_become_bytes_and_the_rest_stays():
+    torch.manual_seed(0)
+    tensors = {
+        "a.weight": torch.randn(64, 128) * torch.logspace(-3, 3, 64)[:, None],
+        "conv.weight": torch.randn(32, 16, 9),
+        "plan_normalizer.scale": torch.rand(5000),
+        "small.weight": torch.rand(8, 8),
+        "steps": torch.arange(8192).reshape(2, -1),
+    }
+    small = compact(tensors)
+    assert {name for name, tensor in small.items() if tensor.dtype == torch.int8} == {"a.weight", "conv.weight"}
+    assert all(small[name] is tensors[name] for name in ("plan_normalizer.scale", "small.weight", "steps"))
+    restored = expand(small)
+    assert list(restored) == list(tensors)
+    for name in ("a.weight", "conv.weight"):
+        largest = tensors[name].flatten(1).abs().amax(1)
+        worst = (restored[name] - tensors[name]).flatten(1).abs().amax(1)
+        assert (worst <= 0.5001 * largest / 127).all() and restored[name].dtype == torch.float32
+
+
+def test_rows_of_zeros_and_plain_state_dicts():
+    assert (expand(compact({"w": torch.zeros(64, 64)}))["w"] == 0).all()
+    plain = {"w": torch.randn(3, 3), "scale": torch.ones(3)}
+    assert all(expand(plain)[name] is plain[name] for name in plain)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Weights: complete, refused when they do not fit, never damaged by a failed save, small when published."""
+"""Weights: complete, refused when they do not fit, never damaged by a failed save."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from torchrl_koap.modules import Normalizer
 from torchrl_koap.runs import weights
 from torchrl_koap.runs.weights import (
     CheckpointError,
-    compact,
-    expand,
     load_tensors,
     load_weights,
     save_tensors,
@@ -116,29 +114,3 @@ def test_no_bit_of_the_header_can_change_unseen(tmp_path):
         path.write_bytes(broken)
         with pytest.raises(CheckpointError, match="a.safetensors"):
             load_tensors(path)
-
-
-def test_matrices_become_bytes_and_the_rest_stays():
-    torch.manual_seed(0)
-    tensors = {
-        "a.weight": torch.randn(64, 128) * torch.logspace(-3, 3, 64)[:, None],
-        "conv.weight": torch.randn(32, 16, 9),
-        "plan_normalizer.scale": torch.rand(5000),
-        "small.weight": torch.rand(8, 8),
-        "steps": torch.arange(8192).reshape(2, -1),
-    }
-    small = compact(tensors)
-    assert {name for name, tensor in small.items() if tensor.dtype == torch.int8} == {"a.weight", "conv.weight"}
-    assert all(small[name] is tensors[name] for name in ("plan_normalizer.scale", "small.weight", "steps"))
-    restored = expand(small)
-    assert list(restored) == list(tensors)
-    for name in ("a.weight", "conv.weight"):
-        largest = tensors[name].flatten(1).abs().amax(1)
-        worst = (restored[name] - tensors[name]).flatten(1).abs().amax(1)
-        assert (worst <= 0.5001 * largest / 127).all() and restored[name].dtype == torch.float32
-
-
-def test_rows_of_zeros_and_plain_state_dicts():
-    assert (expand(compact({"w": torch.zeros(64, 64)}))["w"] == 0).all()
-    plain = {"w": torch.randn(3, 3), "scale": torch.ones(3)}
-    assert all(expand(plain)[name] is plain[name] for name in plain)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
 from torchrl_koap.data.windows import spread_evenly
-from torchrl_koap.evaluation.plan_errors import SAMPLES, SITUATIONS, score_sequences
+from torchrl_koap.evaluation.plan_errors import SAMPLES, SITUATIONS
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics
 from torchrl_koap.modules.planning.energy_score import sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
@@ -43,9 +43,7 @@ def first_actions(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Decodes actions on the labelled steps of some trajectories: the same steps for every controller.
 
-    The first action is taken of a window of recorded states, ``BEFORE`` frames of history (the first frame of a
-    trajectory repeated where there is none) and ``AFTER`` frames of future. Trajectories that are too short are left
-    out.
+    The windows have ``BEFORE`` frames of history, of which a trajectory's first is repeated, and ``AFTER`` of future.
 
     Returns:
         tuple of Tensor: predicted and true actions ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
@@ -76,8 +74,7 @@ def errors_outside_budget(
         task (Task): names and units of the actions.
 
     Returns:
-        tuple: of :func:`summarise_errors`, or a ``note`` why there is none; ``predicted`` and ``true`` ``[N, act]``,
-        raw units, or nothing.
+        tuple: of :func:`summarise_errors`, or a ``note`` why there is none; ``predicted`` and ``true`` ``[N, act]``.
     """
     outside = episodes_outside(data, labelled)
     predicted, true, episode = first_actions(controller, data, outside)
@@ -111,14 +108,9 @@ def errors_left_out(
 ) -> dict[str, Any]:
     """Measures errors on labels inside the budget: each trajectory in turn is hidden and the decoder fitted again.
 
-    What lies before the decoder stays as it was trained; it has seen the states of the trajectory left out, and none of
-    its labels where it is trained without any.
-
-    Args: as :func:`errors_outside_budget`; the controller, whose decoder is fitted in closed form, is not changed, and
-    ``columns`` are the state columns that it reads.
-
-    Returns:
-        dict: as of :func:`errors_outside_budget`.
+    What lies before the decoder stays as it was trained: it has seen the states of the trajectory left out. The
+    controller, which reads the state ``columns``, is not changed. Arguments and result as of
+    :func:`errors_outside_budget`.
     """
     has_action = labelled["has_action"].squeeze(-1)
     episodes = labelled["episode"][has_action].unique()
@@ -153,56 +145,41 @@ def errors_of_chunks(
 ) -> dict[str, Any]:
     """Errors of sampled actions on the trajectories that have labels of which none was in the budget.
 
-    Of the policy ``samples`` chunks are drawn in each situation, of which there are as many as for
-    :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`. Args: as :func:`errors_outside_budget`, all columns of the
-    state included.
-
-    Returns:
-        dict: of :func:`summarise_errors` for the mean of the sampled first actions, where ``"ridge"`` is a linear
-        policy of the same frames; and ``chunk``: a row per unit with energy score and best of all sampled chunks
-        (:func:`~torchrl_koap.evaluation.plan_errors.score_sequences`), where every step of them has a label. Or a
-        ``note`` why there is none.
+    Judged is the mean of the first actions of ``samples`` chunks, in as many situations as plans are judged in; the
+    ridge is a linear policy of the same frames. Arguments, all columns of the state included, and result as of
+    :func:`errors_outside_budget`.
     """
     history, targets = policy.history, list(task.targets)
     episodes = episodes_outside(data, labelled)
     keys = ["state", "action", "has_action", "episode"]
-    windows = cut_windows(data, history - 1 + policy.horizon, select=keys, pad_before=history - 1).cpu()
     now = history - 1
+    windows = cut_windows(data, now + policy.horizon, select=keys, pad_before=now).cpu()
     windows = windows[windows["has_action"][:, now, 0]]
-    known = cut_windows(labelled, history + 1, select=keys, pad_before=history - 1).cpu()
+    known = cut_windows(labelled, history + 1, select=keys, pad_before=now).cpu()
     known = known[known["has_action"][:, now, 0]]
     windows = windows[torch.isin(windows["episode"][:, -1], episodes.cpu())]
     if not len(windows):
         return {"note": "no trajectory outside the budget has labels"}
     windows = spread_evenly(windows, SITUATIONS)
 
-    def moved(part: TensorDictBase) -> Tensor:
+    def moved(action: Tensor, states: Tensor) -> Tensor:
         """Absolute actions as distances from where their columns are in the present frame."""
-        action = part["action"][:, now:]
-        return action - part["state"][:, now : now + 1, targets] if targets else action
+        return action - states[:, now, targets] if targets else action
 
-    past, true = windows["state"][:, :history].float(), moved(windows)
+    past = windows["state"][:, :history].float()
+    true, seen = (moved(part["action"][:, now], part["state"]) for part in (windows, known))
     device = next(iter(policy.state_dict().values())).device
-    sampled = sample_sequences(policy, past.to(device), samples=samples, seed=seed).cpu()
-    sampled = sampled - past[:, now : now + 1, targets] if targets else sampled
-    seen = moved(known)[:, 0]
-    mean = seen.mean(0)
+    sampled = sample_sequences(policy, past.to(device), samples=samples, seed=seed)[:, :, 0].mean(0).cpu()
     condition, asked = (
         policy.encode_history(frames.float().to(device)).cpu() for frames in (known["state"][:, :history], past)
     )
     linear = ridge(condition, seen, groups=known["episode"][:, -1], default_penalty=DEFAULT_PENALTY)
     models = {
-        "controller": sampled[:, :, 0].mean(0),
+        "controller": moved(sampled, past),
         "ridge": linear.predict(asked),
-        "mean_action": mean.expand(len(true), -1),
+        "mean_action": seen.mean(0).expand(len(true), -1),
     }
-    errors = summarise_errors(models, true[:, 0], windows["episode"][:, -1], task)
-    whole = windows["has_action"][:, now:].all(1).squeeze(-1)
-    if not whole.any():
-        return errors
-    sequences = {"policy": sampled[:, whole], "mean_action": mean.expand_as(true[whole])[None]}
-    rows, _ = score_sequences(sequences, true[whole], task.action_names, list(task.action_units))
-    return errors | {"chunk": {"situations": int(whole.sum()), "samples": samples, "unit": rows}}
+    return summarise_errors(models, true, windows["episode"][:, -1], task)
 
 
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:

@@ -47,14 +47,14 @@ class InspectConfig:
         seed: seed of the planner's noise.
         execution: how plans become actions (default: as `koap eval` has it).
         latent_only: look into the latent space alone: seconds, without the experiments in the simulator.
-        latent_steps: control steps that the latent dynamics predict (fewer where demonstrations are short).
         threads: torch and simulator threads (default: as many as torch has).
         device: "cpu" or "cuda".
         plugins: modules that register tasks or methods, besides those that the run was trained with.
 
     Examples:
-        >>> from torchrl_koap.evaluation.inspection import InspectConfig, inspect
-        >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
+        >>> from torchrl_koap.evaluation import InspectConfig
+        >>> InspectConfig(latent_only=True).episodes
+        30
     """
 
     episodes: int = 30
@@ -63,7 +63,6 @@ class InspectConfig:
     seed: int = 500
     execution: Annotated[ExecutionConfig, tyro.conf.arg(name="")] = ExecutionConfig()
     latent_only: bool = False
-    latent_steps: int = 10
     threads: int | None = None
     device: str = "cpu"
     plugins: Plugins = ()
@@ -85,30 +84,16 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         dict: what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, and ``findings``.
 
     Raises:
-        ValueError: for fewer than one episode or step, or a run without a planner.
+        ValueError: for fewer than one episode, or a run without a planner.
         RunDirectoryError: if the folder is no finished run.
 
     Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> import numpy as np
-        >>> from torchrl_koap import ControllerConfig, PlannerConfig, TrainConfig, train
-        >>> from torchrl_koap.data import save_demonstrations
         >>> from torchrl_koap.evaluation import InspectConfig, inspect
-        >>> states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(6)]
-        >>> actions = [np.diff(frames[:, :2], axis=0) if i < 2 else None for i, frames in enumerate(states)]
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     arm = save_demonstrations(root + "/arm", states, actions, control_hz=30, robot=[0, 1])
-        ...     few = {"planner": PlannerConfig(steps=2), "controller": ControllerConfig(steps=2)}
-        ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", **few))
-        ...     found = inspect(root + "/run", InspectConfig(latent_only=True, threads=1))
-        >>> sorted(found)
-        ['findings', 'latent']
+        >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
     """
     config = InspectConfig() if config is None else config
-    for name in ("episodes", "latent_steps"):
-        if getattr(config, name) < 1:
-            raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
+    if config.episodes < 1:
+        raise ValueError(f"episodes must be >= 1, got {config.episodes}")
     if config.seed < 0:
         raise ValueError(f"seed must be >= 0, got {config.seed}")
     set_up_torch(config.threads, config.device)
@@ -187,4 +172,4 @@ def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) ->
     }
     parts = {name: places for name, places in parts.items() if places}
     view = controller_view(data, columns, targets=task.targets)
-    return analyse_latent(controller, view, labelled, parts, horizon=config.latent_steps)
+    return analyse_latent(controller, view, labelled, parts)

@@ -93,10 +93,9 @@ def prediction_errors(
 
     Beside them ``reconstruction``: :math:`g_\psi(g_\theta(x_{t+h}))`, what the first one cannot do better than.
 
-    Both ``u`` and ``v`` read recorded states around and *ahead* of every step (``x_{t+k}``), so this tests the models;
-    it is no forecast. The linear model is fitted on the trajectories ``fit_on``, and all three are tested on the
-    others. The Koopman model was trained on the states of all of them (that takes no label). Where ``v_t`` holds
-    ``x_{t+2}``, as by default, the linear model interpolates and owes little to what it predicted before.
+    Both ``u`` and ``v`` read recorded states *ahead* of every step, so this tests the models; it is no forecast. The
+    linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others. The Koopman model was
+    trained on the states of all of them.
 
     Returns:
         dict: by model and part the root mean square distance after ``1 .. horizon`` steps, in raw units.

@@ -26,19 +26,15 @@ KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
 _PLANS = ("planner", "standing_still", "constant_velocity")
 _ACTIONS = ("controller", "ridge", "mean_action")
-_CHUNKS = ("policy", "mean_action")
 _COMMANDS = "the controller decodes no recorded states: it follows plans by the command that it gave"
 
 
 def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Judges a run on recorded data.
 
-    Plans are scored on the validation trajectories, which the planner has not seen
-    (:func:`~torchrl_koap.evaluation.plan_errors.plan_errors`). Actions are decoded from recorded states and compared
-    with labels outside the budget, if there are any, and with those inside it, a trajectory left out at a time
-    (:mod:`~torchrl_koap.evaluation.action_errors`). A policy of its own samples chunks of actions outside the budget.
-    The whole policy acts in a linear model of how states follow actions
-    (:func:`~torchrl_koap.evaluation.loop_on_labels.check_loop`).
+    Plans are scored on trajectories that the planner has not seen, actions on labels outside the budget, if there are
+    any, and on those inside it, a trajectory left out at a time. The whole policy acts in a linear model of how states
+    follow actions.
 
     Returns:
         tuple: ``kind`` ``"offline"``, ``plan_errors``, ``action_errors`` and ``loop``, ``relative_plan_error`` (1: no
@@ -147,20 +143,14 @@ def describe_offline(result: Mapping[str, Any]) -> str:
     lines = ["judged on recorded data: the task has no environment"]
     plan, action = result["plan_errors"], result["action_errors"]
     lines += [f"plans: {plan['note']}"] if "note" in plan else []
-    lines += [_line("plans, energy score", row, _energies(row, *_PLANS)) for row in plan.get("unit", ())]
+    for row in plan.get("unit", ()):
+        lines.append(_line("plans, energy score", row, {name: row[name]["energy_score"]["overall"] for name in _PLANS}))
     for split in SPLITS:
         head, part = f"actions, {split.replace('_', ' ')}", action[split]
         lines += [f"{head}: {part['note']}"] if "note" in part else []
         lines += [_line(f"{head}, RMSE", row, {name: row[name] for name in _ACTIONS}) for row in part.get("unit", ())]
-        for row in part.get("chunk", {}).get("unit", ()):
-            best = {f"best of {part['chunk']['samples']}": row["policy"]["best_of"]["overall"]}
-            lines.append(_line("whole chunks of actions, energy score", row, _energies(row, *_CHUNKS) | best))
     lines.append(describe_loop(result["loop"]))
     return "\n".join([*lines, *(f"FAULT: {fault}" for fault in result["faults"])])
-
-
-def _energies(row: Mapping[str, Any], *names: str) -> dict[str, float]:
-    return {name: row[name]["energy_score"]["overall"] for name in names}
 
 
 def _line(head: str, row: Mapping[str, Any], values: Mapping[str, float]) -> str:

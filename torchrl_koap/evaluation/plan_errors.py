@@ -59,7 +59,7 @@ def plan_errors(
     device = next(iter(planner.state_dict().values())).device
     models = {"planner": sample_sequences(planner, past.to(device), samples=samples, seed=seed).cpu()}
     models |= {name: plan[None] for name, plan in baseline_plans(states[:, :history], horizon).items()}
-    rows, scores = score_sequences(models, future, task.state_names, task.state_units)
+    rows, scores = _score(models, future, task.state_names, task.state_units)
     return {
         "situations": len(past),
         "horizon": horizon,
@@ -74,14 +74,10 @@ def plan_errors(
     }
 
 
-def score_sequences(
+def _score(
     models: Mapping[str, Tensor], true: Tensor, names: Sequence[str], units: Sequence[str]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Tensor]]]:
-    """Rates sampled sequences ``[S, N, H, d]`` by energy score and best sample, a row per unit of the columns.
-
-    Returns:
-        tuple: rows as in :func:`plan_errors`, and per unit the energy score of every model in every situation ``[N]``.
-    """
+    """Rates plans ``[S, N, H, d]`` by energy score and best sample, and every model in every situation ``[N]``."""
     rows, scores = [], []
     for unit, columns in unit_groups(units).items():
         row: dict[str, Any] = {"unit": unit, "columns": [names[column] for column in columns]}

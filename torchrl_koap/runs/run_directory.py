@@ -27,15 +27,6 @@ class RunDirectory:
     Args:
         path (str or Path): the folder; it need not exist yet.
 
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.runs.run_directory import RunDirectory
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     run = RunDirectory(folder)
-        ...     run.write_json("config.json", {"task": "avoiding"})
-        ...     run.log("planner", 1, {"loss_planner": 0.5})
-        ...     run.read_json("config.json")["task"], run.read_metrics()[0]["loss_planner"]
-        ('avoiding', '0.5')
     """
 
     def __init__(self, path: str | Path):

@@ -6,7 +6,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,7 @@ from torchrl_koap.files import replacing_file
 from torchrl_koap.modules import Normalizer
 
 _SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors and of the other facts
-ROW_SCALE = ".row_scale"
-_LEAST = 4096  # entries of a tensor that is worth it
+ROW_SCALE = ".row_scale"  # ending of the scales of a matrix that is stored as int8
 
 
 class CheckpointError(ValueError):
@@ -137,30 +136,8 @@ def _digest(tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def compact(tensors: Mapping[str, Tensor], *, only: Sequence[str] = ()) -> dict[str, Tensor]:
-    """Stores weight matrices as ``int8`` and a scale per row; biases, statistics and whatever else stay as they are.
-
-    Args:
-        tensors (mapping): a state dict; entries with two or more axes and at least 4,096 floats are matrices.
-        only (sequence of str): ends of the names that are compacted. Default: all matrices.
-
-    Returns:
-        dict: for a matrix ``name`` the entries ``name`` (int8) and ``name.row_scale`` (float32 ``[rows, 1, ...]``).
-    """
-    small = {}
-    for name, tensor in tensors.items():
-        spared = only and not name.endswith(tuple(only))
-        if spared or tensor.ndim < 2 or tensor.numel() < _LEAST or not tensor.is_floating_point():
-            small[name] = tensor
-            continue
-        scale = tensor.flatten(1).abs().amax(1).clamp_min(1e-12).div(127).reshape(-1, *[1] * (tensor.ndim - 1))
-        small[name] = (tensor / scale).round().to(torch.int8)
-        small[name + ROW_SCALE] = scale.float()
-    return small
-
-
 def expand(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Inverse of :func:`compact`, up to rounding; a state dict without scales comes back as it is."""
+    """Multiplies matrices ``NAME`` (int8) by ``NAME.row_scale``, ``[rows, 1, ...]``; whatever else stays as it is."""
     return {
         name: tensor.float() * tensors[name + ROW_SCALE] if name + ROW_SCALE in tensors else tensor
         for name, tensor in tensors.items()
