@@ -156,7 +156,7 @@ def speed_table() -> str:
 def planner_minutes(task: str, method: str) -> str:
     """Formats how long each planner of a task was trained."""
     seconds = [float(row["train_seconds"]) for row in planner_rows(task, method) if row["train_seconds"]]
-    return f"{max(seconds) / 60:.0f} minutes of training" if seconds else "not recorded"
+    return f"{max(seconds) / 60:.0f} minutes of training"
 
 
 def observation_rate(name: str, method: str, part: float) -> str:

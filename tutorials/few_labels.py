@@ -128,5 +128,5 @@ print("latent actions of a window:", tuple(latent.shape))
 # Two labelled trajectories out of 48 were enough to act on plans made from states alone. ``result`` holds the success
 # rate with its Wilson interval, ``report`` every label that was touched, ``fit`` the penalty of the decoder.
 #
-# Further reading: ``koap train --help`` for the same in one command, ``docs/results.md`` for what each choice is
-# worth.
+# Further reading: ``koap train --help`` for the same in one command, ``docs/results.md`` for what each choice
+# brings.

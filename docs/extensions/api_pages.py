@@ -39,17 +39,22 @@ def write_api_pages(quick: bool = False) -> None:
             heading(f"torchrl_koap.{room}"),
             (ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text())) or "").split("\n\n")[0],
             table(("module", "what it offers"), rows),
-            "" if quick else toctree((name_of(path) for path in modules), hidden=True),
+            "" if quick else toctree((entry(name_of(path), f"torchrl_koap.{room}.") for path in modules), hidden=True),
         )
     for name in BASE:
         write_module(PACKAGE / f"{name}.py")
     write_page(
         "api/index",
-        heading("Reference"),
+        heading("Python API"),
         "Every public class and function, by the file it lives in. What is used most is also at the top, as "
         "``torchrl_koap.train`` or ``torchrl_koap.Agent``.",
         toctree((*ROOMS, *(f"torchrl_koap.{name}" for name in BASE if not quick))),
     )
+
+
+def entry(page: str, prefix: str) -> str:
+    """A page in the navigation, by the part of its name that its room does not say."""
+    return f"{page.removeprefix(prefix)} <{page}>"
 
 
 def name_of(path: Path) -> str:

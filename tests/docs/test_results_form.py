@@ -19,7 +19,7 @@ COMMANDS = re.compile(r"```bash\n(.*?)```|block commands %\}(.*?)\{% endblock", 
 FORM = re.compile(
     r"# (?P<title>[^\n]+)\n\n\*(?P<question>[^\n]+\?)\*\n\n!\[(?P<alt>[^\]]+)\]\((?P<picture>[^)]+)\)\n\n"
     r"(?P<caption>[^\n]+)\n\n(?P<table>(?:\|[^\n]+\n)+)\n+## Conclusions\n\n(?P<conclusions>(?:\d\. [^\n]+\n)+)\n+"
-    r"## Reproduce\n\n```bash\n(?P<commands>[^`]+)\n```\n\nTime: (?P<time>[^\n]+?)\. Figures: (?P<files>[^\n]+)\n"
+    r"## Reproduce\n\n```bash\n(?P<commands>[^`]+)\n```\n\n(?:Time: (?P<time>[^\n]+?)\. )?Figures: (?P<files>[^\n]+)\n"
 )
 
 
