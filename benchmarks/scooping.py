@@ -14,6 +14,7 @@ both, or none. Labelled ones are the robot's first: they begin at the three star
 
 from __future__ import annotations
 
+import shutil
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -22,17 +23,17 @@ import tyro
 from tables import open_table
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, train
+from torchrl_koap.data import read_recordings
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ExecutionConfig
-from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
+from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.scooping import CAMERA, EMBODIMENTS
 from torchrl_koap.training.methods import METHODS as KNOWN
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.vision.backbones import load_backbone
-from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
-from torchrl_koap.vision.encoder import FrozenImageEncoder
-from torchrl_koap.vision.projection import SCOOPING, load_encoder, projection_of, save_encoder
+from torchrl_koap.vision.embedding import embed_recordings, join_recordings, read_sources
+from torchrl_koap.vision.projection import SCOOPING, Projection, projection_of
 
 RESULTS = Path(__file__).parent / "results"
 Task = Literal["scooping", "scooping_moving_bowl"]
@@ -47,11 +48,12 @@ def data_set(folder: Path, unlabelled: str, labels: int, task: str = "scooping")
     """The data set of a cell, embedded where it is not there."""
     out = folder / f"data_{_name(unlabelled, labels)}"
     if not (out / "ted").is_dir():
-        robot, hand = Source(folder / "robot", embodiment="robot"), Source(folder / "hand", embodiment="hand")
-        robots = [Source(folder / "robot", labels) if unlabelled in FEW_ROBOTS else robot]
-        sources = robots if unlabelled in ("robot", "none") else [*robots, hand]
-        encoder = load_encoder(projection_of(task))
-        embed_demonstrations(out, sources, encoder, mixed=len(sources) > 1, task=task)
+        few = range(labels) if unlabelled in FEW_ROBOTS else ()
+        sources = [read_recordings(folder / "robot", episodes=few)]
+        if unlabelled not in ("robot", "none"):
+            sources.append(read_recordings(folder / "hand", action_dim=get_task(task).action_dim))
+        projection = Projection.load(projection_of(task))
+        embed_recordings(join_recordings(sources), get_task(task), out, projection=projection)
     return out
 
 
@@ -144,10 +146,9 @@ def main(
         if not (folder / who / "meta" / "info.json").exists():
             record_videos(folder / who, who, demonstrations, task=task)
     if fit:
-        encoder = FrozenImageEncoder(load_backbone())
-        encoder.projection = fit_projection(encoder, [Source(folder / who) for who in EMBODIMENTS], EMBEDDING_DIM)
-        fitted_on = "unlabelled frames of robot and hand, koap demos, seed 0"
-        save_encoder(encoder, SCOOPING.with_stem(task), stride=8, fitted_on=fitted_on)
+        recordings, _ = read_sources([folder / who for who in EMBODIMENTS], get_task(task))
+        print(embed_recordings(recordings, get_task(task), folder / "fit"))
+        shutil.copy(folder / "fit" / "cameras" / f"{CAMERA}.safetensors", SCOOPING.with_stem(task))
         return
     evaluation = EvalConfig(episodes=episodes, threads=1, execution=ExecutionConfig(replan_interval=8))
     done, write = open_table(results / f"{task}.csv", COLUMNS, KEYS)

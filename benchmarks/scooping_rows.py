@@ -19,7 +19,7 @@ from tables import percent, read_rows, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, set_title, tidy
-from torchrl_koap.tasks.scooping import FRAME_HZ
+from torchrl_koap.tasks.scooping import CAMERA, FRAME_HZ
 
 STARTS = ("left", "near", "right")
 _CELL = ("labels", "unlabelled", "method")
@@ -126,10 +126,13 @@ def main(*, folder: Path) -> None:
     Args:
         folder: of benchmarks/scooping.py.
     """
-    from torchrl_koap.data.formats.lerobot_frames import read_image_episodes  # needs an extra
+    from torchrl_koap.data import read_recordings  # needs an extra
 
     captions = {"hand": "a hand: no actions", "robot": "robot: few labels"}
-    films = {words: read_image_episodes(folder / who, episodes=1)[0].frames for who, words in captions.items()}
+    films = {
+        words: np.stack(list(read_recordings(folder / who, episodes=[0], action_dim=7).cameras[CAMERA][0].read()))
+        for who, words in captions.items()
+    }
     print(draw(films, scooping_cells(), PICTURE), PICTURE.stat().st_size)
 
 

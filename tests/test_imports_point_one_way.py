@@ -13,7 +13,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "torchrl_koap"
 BASE = {"keys", "lookup", "files"}
-TRAINING = {*BASE, "tasks", "data", "modules", "objectives", "runs", "training"}
+TRAINING = {*BASE, "tasks", "data", "vision", "modules", "objectives", "runs", "training"}
 MAY_IMPORT = {
     "keys": {"files"},
     "lookup": set(),
@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "evaluation": {*TRAINING, "envs", "evaluation"},
     "reports": {*TRAINING, "envs", "evaluation", "reports"},
     "studies": {*TRAINING, "envs", "evaluation", "reports", "studies"},
-    "commands": {*TRAINING, "envs", "evaluation", "reports", "studies", "vision", "commands", "__version__"},
+    "commands": {*TRAINING, "envs", "evaluation", "reports", "studies", "commands", "__version__"},
 }
 IN_FUNCTIONS = {"training": {"envs"}}  # a simulator is loaded when it is asked for
 

@@ -6,7 +6,10 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib
+import importlib.util
 from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 
@@ -40,7 +43,8 @@ def resolve(reference: Any, what: str) -> Any:
     """Imports the object that an import string names; anything that is no string is returned as it is.
 
     Args:
-        reference (str or object): ``"package.module:name"``, dots in ``name`` reach into a class.
+        reference (str or object): ``"package.module:name"`` or ``"path/to/file.py:name"``, dots in ``name`` reach
+            into a class.
         what (str): what the object is for; the error begins with it.
 
     Returns:
@@ -58,17 +62,28 @@ def resolve(reference: Any, what: str) -> Any:
     """
     if not isinstance(reference, str):
         return reference
-    module, colon, name = reference.partition(":")
+    module, colon, name = reference.rpartition(":")
     if not (module and colon and name):
         raise ValueError(f"{what}: wanted an import string 'package.module:name', got {reference!r}")
     try:
-        found = importlib.import_module(module)
-    except ImportError as error:
+        found = _run_file(module) if module.endswith(".py") else importlib.import_module(module)
+    except (ImportError, OSError) as error:
         raise ValueError(f"{what}: module {module!r} cannot be imported: {error}") from error
     try:
         return functools.reduce(getattr, name.split("."), found)
     except AttributeError:
         raise ValueError(f"{what}: module {module!r} has no {name!r} (asked for as {reference!r})") from None
+
+
+@functools.cache
+def _run_file(path: str) -> ModuleType:
+    """The module in a file that no import finds."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, Path(path).expanduser().resolve())
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is no Python file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:

@@ -35,12 +35,12 @@ from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.scooping import EMBEDDING_DIM, RIM_HEIGHT
-from torchrl_koap.vision import FrozenImageEncoder, load_backbone
-from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
+from torchrl_koap.tasks.scooping import CAMERA, EMBEDDING_DIM, RIM_HEIGHT
+from torchrl_koap.vision import load_backbone, load_encoder
+from torchrl_koap.vision.embedding import embed_recordings, read_sources
 
 torch.set_num_threads(1)
-backbone = load_backbone()  # says at once what to install where its weights are missing
+load_backbone()  # says at once what to install where its weights are missing
 folder, task = Path(tempfile.mkdtemp()), get_task("scooping")
 EACH, LABELLED, TRIALS = 24, 5, 15
 for embodiment in ("robot", "hand"):
@@ -55,10 +55,10 @@ for embodiment in ("robot", "hand"):
 # position tells what they keep of it. It is fitted on three quarters of the robot's videos and tested on the others.
 # The policy never sees the position.
 
-sources = [Source(folder / embodiment) for embodiment in ("robot", "hand")]
-components = fit_projection(FrozenImageEncoder(backbone), sources, EMBEDDING_DIM)
-encoder = FrozenImageEncoder(backbone, projection=components)
-stored, _ = load_ted(embed_demonstrations(folder / "data", sources, encoder, mixed=True) / "ted")
+sources, _ = read_sources([folder / embodiment for embodiment in ("robot", "hand")], task)
+report = embed_recordings(sources, task, folder / "data")[CAMERA]
+encoder = load_encoder(folder / "data" / "cameras" / f"{CAMERA}.safetensors")
+stored, _ = load_ted(folder / "data" / "ted")
 
 robots = stored["episode"] < EACH
 seen = stored["observation"][robots, :EMBEDDING_DIM].double()
@@ -66,7 +66,7 @@ seen, spoon = torch.cat([seen, torch.ones(len(seen), 1)], 1), stored["observatio
 fitted = stored["episode"][robots] < 0.75 * EACH
 probe = torch.linalg.lstsq(seen[fitted], spoon[fitted]).solution
 off = 1000 * (seen[~fitted] @ probe - spoon[~fitted]).norm(dim=1).mean()
-print(f"{len(components.mean)} features, {EMBEDDING_DIM} components: the spoon's place within {off:.0f} mm")
+print(f"{EMBEDDING_DIM} components keep {report.kept:.0%} of the variance: the spoon's place within {off:.0f} mm")
 
 # %%
 # A planner of all videos, controllers of five demonstrations
@@ -115,7 +115,8 @@ for name, each in trained.items():
 # 95 % intervals, and how high KOAP's spoon was.
 
 tried = sorted(episodes["koap"], key=lambda episode: not episode["next", "success"].any())
-films = {"a hand's video": sources[1].read()[0].frames, "a robot's video": sources[0].read()[0].frames}
+videos = sources.cameras[CAMERA]
+films = {"a hand's video": list(videos[EACH].read()), "a robot's video": list(videos[0].read())}
 films["a trial of koap"] = tried[0]["pixels"].numpy()
 figure = Figure(figsize=(8, 6.6), layout="constrained")
 above, below = figure.subfigures(2, 1, height_ratios=(3, 1.7))
@@ -147,5 +148,5 @@ figure.savefig("scooping.png", dpi=90)
 # ``docs/results/scooping.md``.
 #
 # From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``. Then ``koap
-# embed robot hand --mixed --out data``, ``koap train --task scooping --dataset data --labels.episodes 0 1 2 3 4`` and
-# ``koap eval``.
+# embed robot hand --task scooping --out data``, ``koap train --dataset data --labels.episodes 0 1 2 3 4`` and ``koap
+# eval``.

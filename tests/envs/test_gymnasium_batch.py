@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import functools
+
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -12,6 +15,8 @@ from toy_gym import NAMES, Reach
 
 from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
 from torchrl_koap.tasks import Action, Task
+from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, load_backbone
+from torchrl_koap.vision.backbones import MEAN, STD
 
 TASK = Task(
     name="arm", observation_parts={"arm": NAMES}, actions={"a": Action("rad"), "b": Action("rad")}, position="arm"
@@ -79,6 +84,60 @@ def test_who_is_done_waits():
     assert again["done"].flatten().tolist() == [False, True]
     assert torch.equal(again["observation"][1], rollout["observation"][1, 5])
     assert not torch.equal(again["observation"][0], rollout["observation"][0, 5])
+
+
+class Seen(gymnasium.Env):
+    """Gives numbers of two kinds and pictures by their names."""
+
+    def __init__(self, cameras=("top",)):
+        box, picture = gymnasium.spaces.Box(-9, 9, (2,)), gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+        pixels = dict.fromkeys(cameras, picture) if len(cameras) > 1 else picture
+        pixels = gymnasium.spaces.Dict(pixels) if len(cameras) > 1 else pixels
+        self.observation_space = gymnasium.spaces.Dict({"agent_pos": box, "pixels": pixels})
+        self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def _give(self):
+        pixels = self.observation_space["pixels"]
+        several = isinstance(pixels, gymnasium.spaces.Dict)
+        frames = {name: np.full((8, 8, 3), len(name), np.uint8) for name in (pixels if several else ["top"])}
+        return {"agent_pos": np.array([1.0, 2.0]), "pixels": frames if several else frames["top"]}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._give(), {}
+
+    def step(self, action):
+        return self._give(), 0.0, False, False, {}
+
+
+gymnasium.register("ToySeen-v0", Seen, max_episode_steps=5)
+
+
+def observer(*cameras):
+    """Embeds a frame as the number of its first pixel."""
+    parts = {"arm": ("x", "y")} | dict.fromkeys(cameras, 1)
+    task = Task(name="arm", observation_parts=parts, actions={"a": Action(), "b": Action()}, position="arm")
+    backbone = load_backbone("torch.nn:Flatten")
+    about = FrozenImageEncoder(backbone, size=8).identity
+    mean, std = (torch.tensor(values) for values in (MEAN, STD))
+    offset, scale = -(mean / std).repeat_interleave(64), torch.zeros(192, 1)
+    scale[0] = 255 * std[0]
+    return task, Observer(task, {name: Projection(offset, scale, about) for name in cameras})
+
+
+@pytest.mark.parametrize("cameras", [("front",), ("top", "wrist")])
+def test_pictures_go_through_the_policy_s_own_transform(cameras):
+    task, observe = observer(*cameras)
+    make = functools.partial(gymnasium.make, "ToySeen-v0", **({} if len(cameras) == 1 else {"cameras": cameras}))
+    gymnasium.register("ToySeenHere-v0", make, disable_env_checker=True)
+    rollout = run(GymnasiumBatch("ToySeenHere-v0", task, 2, observe=observe), 2)
+    wanted = [1.0, 2.0, 3.0] if len(cameras) == 1 else [1.0, 2.0, 3.0, 5.0]
+    torch.testing.assert_close(rollout["observation"][0, 1], torch.tensor(wanted), rtol=1e-3, atol=1e-3)
+    other, lacks = observer("left", "right")
+    with pytest.raises(ValueError, match="camera 'left' has no picture; wanted uint8 pictures left, right and 2"):
+        GymnasiumBatch("ToySeenHere-v0", other, observe=lacks)
+    with pytest.raises(ValueError, match="wanted a flat Box"):
+        GymnasiumBatch("ToySeenHere-v0", TASK)
 
 
 def test_refusals():

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_koap.data.formats.lerobot_frames import ImageEpisode
 from torchrl_koap.data.formats.writers import LeRobotWriter
+from torchrl_koap.envs.scooping.recording import FilmedEpisode
 from torchrl_koap.tasks import get_task
 
 CAMERA = "observation.images.third_person"
@@ -16,7 +16,7 @@ def episode(embodiment, length=6, seed=0):
     generator = np.random.default_rng(seed)
     frames = generator.integers(0, 256, (length + 1, 8, 8, 3), dtype=np.uint8)
     action = generator.normal(size=(length, 7)) if embodiment == "robot" else None
-    return ImageEpisode(frames, generator.normal(size=(length + 1, 3)), action, embodiment)
+    return FilmedEpisode(frames, generator.normal(size=(length + 1, 3)), action)
 
 
 def write_camera_set(folder, embodiment, count=2, first=0):

@@ -35,7 +35,7 @@ WORK = (
 )
 # a call of `koap embed` that would do, without the weights of an extra
 EMBED = (
-    *("{frames}", "--out", "{out}", "--network", "tiny_network:random_layer"),
+    *("{frames}", "--task", "scooping", "--out", "{out}", "--network", "tiny_network:random_layer"),
     *("--projection", "{network}/projection.safetensors"),
 )
 
@@ -189,7 +189,7 @@ def make_camera_template(root: Path) -> None:
 
     from torchrl_koap.data.formats.writers import LeRobotWriter
     from torchrl_koap.tasks import get_task
-    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone, save_encoder
+    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
 
     task, (network, width) = get_task("scooping"), (root / "network", 32)
     network.mkdir()
@@ -204,9 +204,9 @@ def make_camera_template(root: Path) -> None:
         writer.add(generator.normal(size=(length + 1, 3)), action, frames=frames)
     writer.close()
     fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
-    encoder = FrozenImageEncoder(backbone, projection=fitted, size=width)
+    fitted.about = FrozenImageEncoder(backbone, size=width).identity
     torch.save({"conv.weight": torch.zeros(3)}, network / "weights.pth")
-    save_encoder(encoder, network / "projection.safetensors", stride=8, fitted_on="noise")
+    fitted.save(network / "projection.safetensors")
 
 
 @contextlib.contextmanager

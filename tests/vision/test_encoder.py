@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 
 import pytest
 import torch
@@ -17,7 +18,6 @@ from torchrl_koap.vision import (
     backbones,
     load_backbone,
     load_encoder,
-    save_encoder,
 )
 
 OWN, OTHER = "tiny_network:random_layer", "tiny_network:another_layer"
@@ -33,6 +33,12 @@ def frames(count=3, size=32, seed=0):
 
 def encoder(**options):
     return FrozenImageEncoder(load_backbone(OWN), size=32, **options)
+
+
+def fitted():
+    projection = Projection.fit(torch.randn(300, FEATURES), 4)
+    projection.about = encoder().identity
+    return projection
 
 
 def test_a_network_of_ones_own_embeds_and_stays_as_it_is():
@@ -68,18 +74,62 @@ def test_a_projection_keeps_what_varies_most_and_survives_its_file(tmp_path):
         projection(torch.zeros(2, 5))
     with pytest.raises(ValueError, match="8 components need more"):
         Projection.fit(features, 8)
-    embed = encoder(projection=Projection.fit(torch.randn(300, FEATURES), 4))
-    file = save_encoder(embed, tmp_path / "own.safetensors", stride=8, fitted_on="noise")
-    again = load_encoder(file, OWN)
+    with pytest.raises(ValueError, match="all 9 frames look the same"):
+        Projection.fit(torch.ones(9, 4), 2)
+    kept, error = projection.kept(features)
+    spread = features.var(0)
+    assert kept == pytest.approx(float(spread[:2].sum() / spread.sum()), abs=0.01) and error == pytest.approx(
+        (1 - kept) ** 0.5
+    )
+    embed = encoder(projection=fitted())
+    again = load_encoder(embed.projection.save(tmp_path / "own.safetensors"))
     torch.testing.assert_close(again.embed(frames()), embed.embed(frames()), rtol=0, atol=2e-2)
 
 
-def test_frames_of_another_size_or_dtype_are_refused():
+def test_frames_of_another_size_are_resized_and_said_once():
+    embed, large = encoder(), frames(2, 64)
+    with pytest.warns(UserWarning, match="frames are 64 x 64, recorded were 32 x 32: they are resized"):
+        first = embed.embed(large)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(embed.embed(large), first)
+    flat = torch.full((1, 64, 64, 3), 77, dtype=torch.uint8)  # of one colour at any size
+    torch.testing.assert_close(embed.embed(flat), embed.embed(flat[:, :32, :32]))
+
+
+def test_large_frames_are_shown_small_and_keep_their_shape():
+    shown = []
+    network = backbones.Backbone(torch.nn.AvgPool2d(8), "none", "mean")
+    network.register_forward_pre_hook(lambda _, given: shown.append(tuple(given[0].shape)))
+    FrozenImageEncoder(network, size=(480, 640)).embed(torch.zeros(1, 480, 640, 3, dtype=torch.uint8))
+    assert shown == [(1, 3, 96, 128)]
+
+
+def test_frames_of_another_dtype_or_without_colours_are_refused():
     embed = encoder()
-    with pytest.raises(ValueError, match=r"\[\*B, 32, 32, 3\], got shape \[1, 48, 48, 3\]"):
-        embed.embed(frames(1, 48))
+    with pytest.raises(ValueError, match=r"\[\*B, 32, 32, 3\], got shape \[1, 32, 32, 1\]"):
+        embed.embed(frames(1)[..., :1])
     with pytest.raises(ValueError, match="uint8 in 0 to 255, got torch.float32"):
         embed.embed(frames().float())
+
+
+class Tokens(torch.nn.Module):
+    """Returns tokens [B, N, C], as some transformers do."""
+
+    def forward(self, pictures):
+        return pictures.flatten(2)
+
+
+def test_networks_may_be_modules_files_and_without_maps(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "import torch\nnetwork = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(2), torch.nn.Flatten())\n"
+    )
+    backbone = load_backbone(f"{tmp_path}/own.py:network")
+    assert FrozenImageEncoder(backbone, size=32).embed(frames()).shape == (3, 12)
+    with pytest.raises(ValueError, match=r"must return \[B, C, h, w\] or \[B, F\], got \[1, 3, 1024\]"):
+        FrozenImageEncoder(backbones.Backbone(Tokens(), "none", "tokens"), size=32).embed(frames(1))
+    with pytest.raises(ValueError, match="is no nn.Module and makes none, it makes int"):
+        load_backbone("builtins:int")
 
 
 def test_weights_that_are_missing_or_damaged(tmp_path, monkeypatch):
@@ -99,8 +149,7 @@ def test_weights_that_are_missing_or_damaged(tmp_path, monkeypatch):
 
 
 def test_a_projection_of_other_weights_is_refused(tmp_path):
-    embed = encoder(projection=Projection.fit(torch.randn(300, FEATURES), 4))
-    file = save_encoder(embed, tmp_path / "own.safetensors", stride=8, fitted_on="noise")
+    file = fitted().save(tmp_path / "own.safetensors")
     with pytest.raises(WeightsError, match="fitted behind the weights"):
         load_encoder(file, OTHER)
 

@@ -196,7 +196,7 @@ class Convert(Command):
             "skipped": ", ".join(recordings.skipped) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],
             **_warnings(data, task, recordings.sources),
-            "next": f"koap train --dataset {shlex.quote(str(folder))} --out runs/{task.name}",
+            "next": _next(folder, task, recordings),
         }
 
     def _take_out(self, kind: str) -> dict[str, Any]:
@@ -267,6 +267,14 @@ class Validate(Command):
         }
 
 
+def _next(folder: Path, task: Task, recordings: Recordings) -> str:
+    where = shlex.quote(str(folder))
+    if not recordings.cameras:
+        return f"koap train --dataset {where} --out runs/{task.name}"
+    cameras = " ".join(f"--camera {shlex.quote(name)}" for name in recordings.cameras)
+    return f"koap embed {where} {cameras} --out {where}_seen"
+
+
 def _contents(recordings: Recordings) -> dict[str, Any]:
     return {
         "trajectories": len(recordings.states),
@@ -274,6 +282,7 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
         "states": ", ".join(recordings.state_names),
         "actions": ", ".join(recordings.action_names),
         "frames per second": recordings.control_hz,
+        "cameras": ", ".join(recordings.cameras) or "none",
     }
 
 

@@ -61,7 +61,7 @@ def machine_facts() -> dict[str, str]:
     facts["bfloat16 (--run.precision)"] = "quick" if quick else "emulated, many times slower than float32"
     facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     facts["rendering (3-D pictures)"] = _rendering()
-    for extra, module in {"wandb": "wandb", "video": "imageio", "lerobot": "pyarrow"}.items():
+    for extra, module in {"wandb": "wandb", "video": "av", "lerobot": "pyarrow"}.items():
         found = importlib.util.find_spec(module) is not None
         facts[f"extra {extra}"] = "installed" if found else f"not installed (pip install 'torchrl_koap[{extra}]')"
     return facts

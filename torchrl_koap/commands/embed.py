@@ -1,82 +1,97 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap embed``: camera demonstrations as a data set of embeddings."""
+"""``koap embed``: data with camera frames as a data set of embeddings."""
 
 from __future__ import annotations
 
+import contextlib
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
 from torchrl_koap.commands.options import Command
 from torchrl_koap.data import read_about
-from torchrl_koap.files import check_file
+from torchrl_koap.lookup import lookup
+from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import get_task
-from torchrl_koap.vision.backbones import WeightsError
-from torchrl_koap.vision.demonstrations import Source, embed_demonstrations
-from torchrl_koap.vision.projection import load_encoder, projection_of
+from torchrl_koap.vision.embedding import embed_recordings, read_sources
+from torchrl_koap.vision.projection import Projection, projection_of
 
 
 @dataclass(kw_only=True)
 class Embed(Command):
     """Embed camera frames with a frozen network.
 
-    Frames are those of `koap demos --embodiment`. Nothing is downloaded.
+    The result is for `koap train`. Nothing is downloaded. The same command goes on with an interrupted embedding.
 
-    Example: `koap embed videos --out embedded`
+    Example: `koap embed arm --camera top --camera wrist --out arm_seen`
 
     Attributes:
-        sources: folders of demonstrations, in the order in which the data set has them.
-        out: folder to write: OUT/ted.
-        task: the task that was recorded.
-        episodes: how many of each source, from the first (default: all).
-        mixed: the sources may be of several embodiments.
-        network: file of EfficientNet-Lite0's weights, or "module:function" of a network of your own (default: the
-            weights of the extra "vision").
-        projection: file of the principal components (default: those of the task that come with the package).
+        sources: folders that `koap convert` wrote (with --task any recordings), in the order in which the data set has
+            them.
+        out: folder to write: OUT/ted, and OUT/cameras with what policies embed frames by.
+        camera: which cameras (default: all).
+        components: principal components per camera, fitted to the frames (a task with embeddings has its own number).
+        network: "package.module:name" or "file.py:name" of a network of your own, or a file of EfficientNet-Lite0's
+            weights (default: the weights of the extra "vision").
+        task: a task with embeddings among its columns, such as "scooping" (default: that of the first source).
+        projection: file of principal components to take instead (default: those of the task that come with the
+            package, else they are fitted).
+        plugins: modules that register tasks; imported before anything else.
     """
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
     out: Path
-    task: str = "scooping"
-    episodes: tuple[int, ...] = ()
-    mixed: bool = False
+    camera: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    components: int = 64
     network: str | None = None
+    task: str | None = None
     projection: Path | None = None
+    plugins: Plugins = ()
 
     def __call__(self) -> dict[str, Any]:
         """Reads, embeds and writes.
 
         Raises:
             WeightsError: if weights are missing or of another network.
-            DataError: if a source is none, embodiments are mixed without saying so.
-            ValueError: if the projection is damaged.
+            DataError: if a source is none, or frames are missing, damaged or unlike the others.
+            ValueError: if the projection is damaged, or there is no such camera.
         """
-        if self.episodes and len(self.episodes) != len(self.sources):
-            raise ValueError(f"--episodes names {len(self.episodes)} numbers for {len(self.sources)} sources")
-        task = get_task(self.task)
+        load_plugins(self.plugins)
+        if self.components < 1:
+            raise ValueError(f"--components must be at least 1, got {self.components}")
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
-        projection = projection_of(task.name) if self.projection is None else self.projection
-        try:
-            if projection.exists() and not projection.is_dir():
-                check_file(projection)
-            encoder = load_encoder(projection, self.network)
-        except (WeightsError, FileNotFoundError):  # they name the file themselves
-            raise
-        except Exception as error:
-            fault = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-            raise ValueError(f"the projection {projection} cannot be used: {fault}") from error
-        numbers = self.episodes or (None,) * len(self.sources)
-        sources = [Source(folder, number) for folder, number in zip(self.sources, numbers, strict=True)]
-        folder = embed_demonstrations(self.out, sources, encoder, mixed=self.mixed, task=task)
-        about = read_about(folder / "ted")
-        embodiments = about["notes"]["embodiments"]
+        asked = None if self.task is None else get_task(self.task)
+        file = self.projection
+        if file is None and asked is not None:
+            with contextlib.suppress(ValueError):  # most tasks have none: it is fitted
+                file = projection_of(asked.name)
+        projection = None if file is None else Projection.load(file)
+        recordings, task = read_sources(self.sources, asked)
+        for name in self.camera:
+            lookup(recordings.cameras, name, "camera")
+        frames = len(self.camera or recordings.cameras) * sum(map(len, recordings.states))
+        with progress_bar(frames, "embedding", unit="frame", delay=1) as bar:
+            reports = embed_recordings(
+                recordings,
+                task,
+                self.out,
+                cameras=self.camera,
+                network=self.network,
+                components=self.components,
+                projection=projection,
+                progress=count_up_to(bar),
+            )
+        about = read_about(self.out / "ted")
         return {
-            "data set": str(folder),
-            "trajectories": ", ".join(f"{embodiments.count(name)} {name}" for name in sorted(set(embodiments))),
+            "data set": str(self.out),
+            **{f"camera {name}": str(report) for name, report in reports.items()},
+            "trajectories": about["trajectories"],
             "steps": about["steps"],
             "labelled steps": about["labelled_steps"],
-            "next": f"koap train --task {task.name} --dataset {folder} --out runs/{task.name}",
+            "next": f"koap train --dataset {shlex.quote(str(self.out))} --out runs/{task.name}",
         }

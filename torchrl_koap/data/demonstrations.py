@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,9 @@ def save_demonstrations(
     folder = Path(folder)
     name = description.pop("name", None) or re.sub(r"\W+", "_", folder.resolve().name).strip("_") or "robot"
     data, task = make_demonstrations(states, actions, name=name, **description)
-    return save_ted(data, folder / "ted", task).parent
+    cameras = states.cameras if isinstance(states, Recordings) else {}
+    notes = {"cameras": {name: [asdict(clip) for clip in clips] for name, clips in cameras.items()}}
+    return save_ted(data, folder / "ted", task, notes if cameras else None).parent
 
 
 def make_demonstrations(

@@ -256,6 +256,10 @@ def trim_still(recordings: Recordings) -> Recordings:
         recordings,
         states=[frames[start:end] for frames, (start, end) in zip(recordings.states, spans, strict=True)],
         actions=[steps[start : end - 1] for steps, (start, end) in zip(recordings.actions, spans, strict=True)],
+        cameras={
+            name: [clip.take(range(*span)) for clip, span in zip(clips, spans, strict=True)]
+            for name, clips in recordings.cameras.items()
+        },
         skipped=(*recordings.skipped, f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"),
     )
 
@@ -279,6 +283,7 @@ def drop_short(recordings: Recordings) -> Recordings:
         states=[recordings.states[index] for index in kept],
         actions=[recordings.actions[index] for index in kept],
         sources=tuple(recordings.sources[index] for index in kept),
+        cameras={name: [clips[index] for index in kept] for name, clips in recordings.cameras.items()},
         skipped=(*recordings.skipped, *short),
     )
 

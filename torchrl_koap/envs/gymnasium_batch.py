@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_koap.keys import ACTION, MODE, OBSERVATION, SUCCESS
 from torchrl_koap.tasks import Task
+from torchrl_koap.vision.observer import STATE, Observer
 
 SUCCESS_KEYS = ("is_success", "success")
 
@@ -26,10 +27,14 @@ class GymnasiumBatch(EnvBase):
     ``info["is_success"]`` or ``info["success"]`` where the environment has one of them, else by an episode that
     terminates with a positive reward. Actions are handed over unchanged.
 
+    Where the policy was trained with cameras, the environment's observation is a dictionary: its uint8 pictures are the
+    frames of the cameras of their names (of the only one whatever their name), its numbers side by side the state.
+
     Args:
         env_id (str): id of the environment, such as ``"my_package:Reach-v0"``, which imports ``my_package`` first.
         task (Task): the task that the policy was trained on: its numbers of observation and action columns.
         num_envs (int): number of episodes.
+        observe (callable, optional): of a policy with cameras, see :class:`~torchrl_koap.vision.Observer`.
         success_key (str, optional): the entry of ``info`` that says whether the task is done.
         max_steps (int, optional): steps after which an episode is truncated. Default: the environment's own limit, or
             the task's where it has none.
@@ -53,17 +58,21 @@ class GymnasiumBatch(EnvBase):
         task: Task,
         num_envs: int = 1,
         *,
+        observe: Observer | None = None,
         success_key: str | None = None,
         max_steps: int | None = None,
     ):
         super().__init__(batch_size=[num_envs])
-        self.env_id, self.task, self.success_key = env_id, task, success_key
+        self.env_id, self.task, self.success_key, self._observe = env_id, task, success_key, observe
         try:
             self.envs = [gymnasium.make(env_id) for _ in range(num_envs)]
         except (gymnasium.error.Error, ImportError) as error:
             raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
         first = self.envs[0]
-        _check_box(env_id, "observation", first.observation_space, task.name, task.observation_dim)
+        if observe is None:
+            _check_box(env_id, "observation", first.observation_space, task.name, task.observation_dim)
+        else:
+            _check_entries(env_id, first.observation_space, observe)
         _check_box(env_id, "action", first.action_space, task.name, task.action_dim)
         limit = None if first.spec is None else first.spec.max_episode_steps
         self.max_steps = max_steps or limit or task.max_steps
@@ -99,7 +108,7 @@ class GymnasiumBatch(EnvBase):
             if chosen is None or chosen[index].any():
                 observation, _ = env.reset(seed=self._seeds[index])
                 self._seeds[index] = None  # further episodes go on from there
-                self._observation[index] = observation
+                self._observation[index] = self._seen(observation)
                 self._success[index], self._over[index], self._steps[index] = False, False, 0
         nothing = np.zeros(len(self.envs))
         return self._leaves({"terminated": nothing > 0, "truncated": nothing > 0})
@@ -113,13 +122,22 @@ class GymnasiumBatch(EnvBase):
             env = self.envs[index]
             action = actions[index].astype(env.action_space.dtype)
             observation, reward[index], terminated, truncated, info = env.step(action)
-            self._observation[index] = observation
+            self._observation[index] = self._seen(observation)
             self._steps[index] += 1
             over = bool(terminated or truncated or self._steps[index] >= self.max_steps)
             self._success[index] |= self._succeeded(info, float(reward[index]), bool(terminated), over)
             self._over[index] = over
             flags["terminated"][index], flags["truncated"][index] = terminated, over and not terminated
         return self._leaves(flags, reward)
+
+    def _seen(self, observation: Any) -> Any:
+        """What an environment gives as the task's observation ``[obs]``."""
+        if self._observe is None:
+            return observation
+        frames, numbers = _sorted(dict(_entries(observation)))
+        named = _named(frames, self._observe)
+        state = np.concatenate([np.ravel(value) for value in numbers.values()]) if numbers else None
+        return self._observe(named if state is None else {STATE: state.astype(np.float32), **named})
 
     def _succeeded(self, info: dict[str, Any], reward: float, terminated: bool, over: bool) -> bool:
         """Whether a step reports success."""
@@ -151,6 +169,41 @@ class GymnasiumBatch(EnvBase):
         for env in self.envs:
             env.close()
         super().close(**kwargs)
+
+
+def _entries(observation: Any, name: str = "pixels") -> Iterator[tuple[str, Any]]:
+    """Entries of a dictionary in dictionaries by the name of the innermost."""
+    if isinstance(observation, Mapping):
+        for inner, value in observation.items():
+            yield from _entries(value, inner)
+    else:
+        yield name, observation
+
+
+def _sorted(entries: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Pictures, and numbers, of an observation or of its space."""
+    frames = {name: value for name, value in entries.items() if value.dtype == np.uint8 and len(value.shape) == 3}
+    return frames, {name: value for name, value in entries.items() if name not in frames}
+
+
+def _named(frames: Mapping[str, Any], observe: Observer) -> dict[str, Any]:
+    cameras = list(observe.cameras)
+    if len(cameras) == len(frames) == 1:
+        return {cameras[0]: next(iter(frames.values()))}
+    return {name: frames[name] for name in cameras if name in frames}
+
+
+def _check_entries(env_id: str, space: gymnasium.Space, observe: Observer) -> None:
+    spaces = dict(_entries(space.spaces if isinstance(space, gymnasium.spaces.Dict) else space))
+    frames, numbers = _sorted(spaces)
+    missing = [name for name in observe.cameras if name not in _named(frames, observe)]
+    width = sum(int(np.prod(each.shape)) for each in numbers.values())
+    if missing or width not in (observe.state_dim, 0):
+        lacks = f"camera {missing[0]!r} has no picture" if missing else f"its numbers have {width} columns"
+        raise ValueError(
+            f"the observation of environment {env_id!r} is {space}: {lacks}; wanted uint8 pictures"
+            f" {', '.join(observe.cameras)} and {observe.state_dim} columns of numbers"
+        )
 
 
 def _check_box(env_id: str, what: str, space: gymnasium.Space, task: str, width: int) -> None:

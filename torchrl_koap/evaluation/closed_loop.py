@@ -29,6 +29,7 @@ from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.trained import Trained
+from torchrl_koap.vision import Observer
 
 
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
@@ -72,7 +73,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    where = place_of(task, config)
+    where = place_of(task, config, Observer.of(task, trained.cameras))
     errors, actions = evaluate_actions(trained, config.dataset)
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -175,8 +176,8 @@ class Place:
     contexts: np.ndarray | None = None
 
 
-def place_of(task: Task, config: EvalConfig) -> Place:
-    """Finds the task's own environment, or the one of Gymnasium that was asked for.
+def place_of(task: Task, config: EvalConfig, observe: Observer | None = None) -> Place:
+    """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures ``observe`` embeds.
 
     Raises:
         ValueError: if there is no such environment, it is not of the task's widths, or contexts do not suffice.
@@ -190,7 +191,7 @@ def place_of(task: Task, config: EvalConfig) -> Place:
     _refuse_contexts(config.rollouts_per_context, config.contexts_file, "an environment of Gymnasium")
     from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
 
-    make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
+    make_env = partial(GymnasiumBatch, config.env, task, observe=observe, success_key=config.success_key)
     probe = make_env(1)
     probe.close()
     return Place(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)

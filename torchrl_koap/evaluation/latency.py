@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from torchrl_koap.modules import Agent, AsynchronousAgent, PlanningPolicy
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.training.trained import Trained
+from torchrl_koap.vision import Observer
 
 
 @dataclass
@@ -85,8 +86,10 @@ def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, An
     load_plugins(config.plugins)
     trained = Trained.load(run)
     rate = trained.task.control_hz if config.control_hz is None else config.control_hz
-    observations = 0.01 * np.random.default_rng(0).standard_normal((config.steps, trained.task.observation_dim))
     policy = trained.policy()
+    observations = 0.01 * np.random.default_rng(0).standard_normal((config.steps, trained.task.observation_dim))
+    if trained.cameras:
+        observations = [Observer(trained.task, trained.cameras).example()] * config.steps
     if not config.async_replan:
         policy.check_rate(rate)
         return run_control_loop(Agent(policy), observations, control_hz=rate)
@@ -94,7 +97,7 @@ def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, An
         return run_control_loop(agent, observations, control_hz=rate)
 
 
-def run_control_loop(agent: Agent, observations: np.ndarray, *, control_hz: float) -> dict[str, Any]:
+def run_control_loop(agent: Agent, observations: Sequence[Any] | np.ndarray, *, control_hz: float) -> dict[str, Any]:
     """Hands an agent an observation per tick of a clock and counts the actions that come after the next tick.
 
     Returns:

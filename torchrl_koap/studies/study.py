@@ -24,6 +24,7 @@ from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.trained import build_networks
+from torchrl_koap.vision import Observer, cameras_of
 
 DEFAULT_TASK = "avoiding"
 PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
@@ -312,7 +313,8 @@ def check_study(study: Study) -> list[Cell]:
         raise ValueError(f"contexts_file: there is no file {contexts}")
     if study.evaluation.env is not None:
         for task in study.tasks:
-            place_of(study.task(task), study.evaluation)
+            observe = Observer.of(study.task(task), cameras_of(study.given_dataset(task)))
+            place_of(study.task(task), study.evaluation, observe)
     cells = study.cells()
     sampling = [name for name in study.methods if not get_method(name).plans]
     if study.execution.strategy == "open_loop" and sampling:

@@ -30,6 +30,7 @@ FRAME_HZ = 10.0  # frames, and actions, per second
 CONTROL_HZ = 30.0  # commands per second
 EMBEDDING_DIM = 96  # columns
 IMAGE_SIZE = 96  # pixels, both ways
+CAMERA = "third_person"
 
 
 def start_of(context: np.ndarray) -> int:
@@ -63,7 +64,7 @@ _START_REGIONS = tuple(((x - START_HALF, x + START_HALF), (y - START_HALF, y + S
 _SCOOPING = register_task(
     Task(
         name="scooping",
-        observation_parts={"embedding": EMBEDDING_DIM, "spoon": ("x", "y", "z")},
+        observation_parts={CAMERA: EMBEDDING_DIM, "spoon": ("x", "y", "z")},
         observation_units=("",) * EMBEDDING_DIM + ("m",) * 3,
         position="spoon",
         hidden=("spoon",),
@@ -81,7 +82,7 @@ _SCOOPING = register_task(
             x=(0.25, 0.7),
             y=(-0.3, 0.3),
             caption=" The spoon's path; the circle is the rim of the bowl.",
-            camera="third_person",
+            camera=CAMERA,
         ),
         defaults=Defaults(
             demonstrations=100,

@@ -40,6 +40,8 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_planner
 from torchrl_koap.training.planner import learn_planner
 from torchrl_koap.training.trained import Trained, build_networks, facts_of
+from torchrl_koap.vision import Projection, cameras_of
+from torchrl_koap.vision.projection import CAMERAS
 
 
 def train(config: TrainConfig, *, command: str | None = None, planner_only: bool = False) -> Trained:
@@ -112,6 +114,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         covers, short = plan_coverage(used, task.control_hz)
         if short is not None:
             warnings.warn(short, stacklevel=2)
+        cameras = _cameras(run, config)
         began = time.perf_counter()
         with open_logger(config.run.logger, config.out) as logger:
             torch.manual_seed(config.run.seed)
@@ -120,7 +123,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
                 planner, losses = _planner(run, task, config, for_planner, unseen, logger)
             planned = time.perf_counter()
             if planner_only:
-                return Trained(task, config, planner, None, {"planner": losses}, tuple(held_out), run.path)
+                found = {"planner": losses}
+                return Trained(task, config, planner, None, found, tuple(held_out), run.path, cameras)
             torch.manual_seed(config.run.seed)  # the controller does not depend on where the planner is from
             controller, results = learn_controller(task, config, data, run=run, logger=logger)
             save_weights(run.path / "controller.safetensors", controller, facts_of("controller", task, config))
@@ -136,7 +140,15 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         }
         save_tensors(run.path / "demonstrations.safetensors", _drawn(task, used.cpu()))
         run.write_json("summary.json", summary)
-    return Trained(task, config, planner, controller, summary, tuple(held_out), run.path)
+    return Trained(task, config, planner, controller, summary, tuple(held_out), run.path, cameras)
+
+
+def _cameras(run: RunDirectory, config: TrainConfig) -> dict[str, Projection]:
+    """Copies the projections that lie beside the data into the run."""
+    cameras = cameras_of(config.dataset)
+    for name, projection in cameras.items():
+        projection.save(run.path / CAMERAS / f"{name}.safetensors")
+    return cameras
 
 
 def _frames(task: Task, config: TrainConfig) -> tuple[int, int]:

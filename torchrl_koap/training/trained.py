@@ -29,6 +29,8 @@ from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
 from torchrl_koap.training.policy_facts import command_ranges, policy_facts
+from torchrl_koap.vision import Observer, Projection, load_cameras
+from torchrl_koap.vision.projection import CAMERAS
 
 FORMAT, VERSION = "torchrl_koap policy", 2
 
@@ -47,6 +49,7 @@ class Trained:
         results (mapping): last losses, labels spent and what a closed form found, as in ``summary.json``.
         held_out (tuple of int): trajectories that the planner has never seen.
         folder (Path, optional): the run directory or file that it was loaded from.
+        cameras (mapping): projection of every camera whose embeddings are columns of the task.
 
     Examples:
         >>> from torchrl_koap import Trained
@@ -62,6 +65,7 @@ class Trained:
     results: Mapping[str, Any] = field(default_factory=dict)
     held_out: tuple[int, ...] = ()
     folder: Path | None = None
+    cameras: Mapping[str, Projection] = field(default_factory=dict)
 
     @classmethod
     def load(cls, where: str | Path, *, plugins: Sequence[str] = ()) -> Trained:
@@ -98,7 +102,8 @@ class Trained:
             if module is not None:
                 load_weights(path / f"{name}.safetensors", module, facts_of(name, task, config))
         results = run.read_json("summary.json") if (path / "summary.json").exists() else {}
-        return cls(task, config, planner, controller, results, tuple(content.get("held_out_episodes") or ()), path)
+        held_out, cameras = tuple(content.get("held_out_episodes") or ()), load_cameras(path / CAMERAS)
+        return cls(task, config, planner, controller, results, held_out, path, cameras)
 
     @classmethod
     def _from_file(cls, path: Path, plugins: Sequence[str]) -> Trained:
@@ -119,7 +124,11 @@ class Trained:
             raise CheckpointError(f"{path} cannot be built: {problem}{hint}") from error
         load_parts(path, tensors, {"planner": planner, "controller": controller})
         results = {"command_ranges": about.get("command_ranges")}
-        return cls(task, config, planner, controller, results, folder=path)
+        cameras = {
+            name: Projection(*(tensors[f"{CAMERAS}.{name}.{part}"] for part in ("mean", "components")), facts)
+            for name, facts in about.get(CAMERAS, {}).items()
+        }
+        return cls(task, config, planner, controller, results, folder=path, cameras=cameras)
 
     def save(self, path: str | Path) -> Path:
         """Writes networks and options to one file, from which :meth:`load` makes the same without any data.
@@ -133,7 +142,8 @@ class Trained:
         path = Path(path)
         if path.is_dir():
             raise IsADirectoryError(f"{path} is a folder; a policy is one file, such as {path / 'policy.safetensors'}")
-        networks = {"planner": self.planner, "controller": self.controller}
+        networks: dict[str, nn.Module | None] = {"planner": self.planner, "controller": self.controller}
+        networks |= {f"{CAMERAS}.{name}": projection for name, projection in self.cameras.items()}
         tensors = {
             f"{name}.{key}": value
             for name, module in networks.items()
@@ -146,6 +156,7 @@ class Trained:
             "config": to_json(self.config),
             "task_definition": None if self.task.import_strings() else self.task.to_json(),
             "command_ranges": self.results.get("command_ranges"),
+            CAMERAS: {name: projection.about for name, projection in self.cameras.items()},
             "versions": versions(),
         }
         save_tensors(path, tensors, about)
@@ -204,6 +215,7 @@ class Trained:
                 stacklevel=2,
             )
         facts = policy_facts(self.task, columns=self.columns, gripper=gripper, ranges=ranges)
+        facts["observe"] = Observer.of(self.task, self.cameras)
         if self.method.plans:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
         if execution.strategy != "open_loop" or follower is not None:

@@ -3,16 +3,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from torchrl_koap.vision.backbones import WeightsError, load_backbone
+from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.files import check_file, replacing_file
+from torchrl_koap.vision.backbones import NETWORK, WeightsError, load_backbone
 from torchrl_koap.vision.encoder import FrozenImageEncoder
 
+CAMERAS = "cameras"  # folder of projections beside a data set, and in a run
 SCOOPING = Path(__file__).with_name("scooping.safetensors")
 
 
@@ -22,6 +27,7 @@ class Projection(nn.Module):
     Args:
         mean (Tensor): ``[F]``.
         components (Tensor): ``[F, d]``; scaled so that the first component has variance 1.
+        about (mapping, optional): what the features are of: :attr:`FrozenImageEncoder.identity`.
 
     Raises:
         ValueError: if mean and components have other shapes.
@@ -35,8 +41,9 @@ class Projection(nn.Module):
         (torch.Size([200, 3]), 1.0, True)
     """
 
-    def __init__(self, mean: Tensor, components: Tensor):
+    def __init__(self, mean: Tensor, components: Tensor, about: Mapping[str, str] | None = None):
         super().__init__()
+        self.about = dict(about or {})
         if mean.ndim != 1 or components.ndim != 2 or len(mean) != len(components):
             raise ValueError(
                 f"mean must be [F] and components [F, d], got {list(mean.shape)} and {list(components.shape)}"
@@ -49,11 +56,13 @@ class Projection(nn.Module):
         """Fits ``dim`` components to features ``[N, F]``.
 
         Raises:
-            ValueError: if there are fewer frames or features than components.
+            ValueError: if there are fewer frames or features than components, or all frames are alike.
         """
         if min(features.shape) <= dim:
             raise ValueError(f"{dim} components need more frames and features than that, got {list(features.shape)}")
         features = features.double()
+        if bool((features == features[:1]).all()):
+            raise ValueError(f"all {len(features)} frames look the same to the network: there is nothing to embed")
         mean = features.mean(0)
         centred = features - mean
         if len(centred) < centred.shape[1]:  # the small one of the two products
@@ -71,6 +80,45 @@ class Projection(nn.Module):
     def dim(self) -> int:
         """Number of components."""
         return self.components.shape[1]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Projection:
+        """Reads a file that :meth:`save` wrote; no network is needed.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is damaged.
+        """
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"no projection: there is no file {path}")
+        check_file(path)
+        try:
+            with safe_open(str(path), "pt") as file:
+                mean, components = (file.get_tensor(name).float() for name in ("mean", "components"))
+                about = dict(file.metadata() or {})
+            missing = [name for name in ("weights", "network", "stride", "size") if not about.get(name)]
+            if missing:
+                raise ValueError(f"its description has no {missing[0]!r}")
+            return cls(mean, components, about)
+        except Exception as error:  # what a damaged file makes of its reader
+            raise ValueError(f"the projection {path} cannot be used: {error}") from error
+
+    def save(self, path: str | Path) -> Path:
+        """Writes it and what it belongs to, its components in half precision; returns the file."""
+        tensors = {"mean": self.mean.contiguous(), "components": self.components.half().contiguous()}
+        with replacing_file(path) as aside:
+            save_file(tensors, aside, self.about)
+        return Path(path)
+
+    def kept(self, features: Tensor) -> tuple[float, float]:
+        """Computes the share of the variance of features ``[N, F]`` that is kept, and the relative error of what is.
+
+        The error is the root mean square of what reconstructed features are off, over that of the features' spread.
+        """
+        centred = (features - self.mean).double()
+        axes = torch.linalg.qr(self.components.double())[0]
+        left = (centred - centred @ axes @ axes.T).square().sum() / centred.square().sum().clamp_min(1e-12)
+        return 1 - float(left), float(left) ** 0.5
 
     def forward(self, features: Tensor) -> Tensor:
         """Computes components ``[*B, d]`` of features ``[*B, F]``.
@@ -107,39 +155,50 @@ def projection_of(task: str) -> Path:
     return path
 
 
-def save_encoder(encoder: FrozenImageEncoder, path: str | Path, *, stride: int, fitted_on: str) -> Path:
-    """Writes an encoder's projection and what it belongs to; the network's weights stay where they are.
-
-    Args:
-        encoder (FrozenImageEncoder): with a :class:`Projection`.
-        path (str or Path): file to write.
-        stride (int): of the network's stage.
-        fitted_on (str): which frames it was fitted on, in words.
+def load_cameras(folder: str | Path) -> dict[str, Projection]:
+    """Reads the projections in a folder, such as ``cameras`` of a run; no network is needed.
 
     Returns:
-        Path: the file.
+        dict: by the name of the camera.
 
     Raises:
-        ValueError: if the encoder has no projection.
+        ValueError: if one is damaged.
 
     Examples:
-        >>> from torchrl_koap.vision import load_encoder, save_encoder
-        >>> save_encoder(load_encoder(), "own.safetensors", stride=8, fitted_on="my frames")  # doctest: +SKIP
+        >>> from torchrl_koap.vision import load_cameras
+        >>> load_cameras("a run without cameras")
+        {}
     """
-    if encoder.projection is None:
-        raise ValueError("the encoder has no projection: there is nothing to save")
-    projection = encoder.projection
-    tensors = {"mean": projection.mean.contiguous(), "components": projection.components.half().contiguous()}
-    save_file(tensors, path, encoder.identity | {"stride": str(stride), "fitted_on": fitted_on})
-    return Path(path)
+    return {file.stem: Projection.load(file) for file in sorted(Path(folder).glob("*.safetensors"))}
 
 
-def load_encoder(projection: str | Path = SCOOPING, network: str | Path | None = None) -> FrozenImageEncoder:
-    """Loads an encoder from a file that :func:`save_encoder` wrote.
+def cameras_of(dataset: str | Path | None) -> dict[str, Projection]:
+    """Reads the projections that ``koap embed`` wrote beside a data set.
 
     Args:
-        projection (str or Path): the file. Default: the one of Scooping that comes with the package.
-        network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`.
+        dataset (str or Path, optional): the data set.
+
+    Returns:
+        dict: by the name of the camera; empty where the data are no embeddings.
+
+    Examples:
+        >>> from torchrl_koap.vision import cameras_of
+        >>> cameras_of(None)
+        {}
+    """
+    stored = None if dataset is None else stored_folder(Path(dataset).expanduser())
+    return {} if stored is None else load_cameras(stored.parent / CAMERAS)
+
+
+def load_encoder(
+    projection: Projection | str | Path = SCOOPING, network: str | Path | None = None, **options: Any
+) -> FrozenImageEncoder:
+    """Makes the encoder that a projection was fitted behind.
+
+    Args:
+        projection (Projection, str or Path): it, or its file. Default: the one of Scooping that comes with the package.
+        network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`. Default: as it was fitted.
+        **options: ``in_key`` and ``out_key`` of :class:`~torchrl_koap.vision.FrozenImageEncoder`.
 
     Returns:
         FrozenImageEncoder: frozen, in evaluation mode.
@@ -155,15 +214,18 @@ def load_encoder(projection: str | Path = SCOOPING, network: str | Path | None =
         ...
         FileNotFoundError: no projection: there is no file nowhere.safetensors
     """
-    if not Path(projection).is_file():
-        raise FileNotFoundError(f"no projection: there is no file {projection}")
-    with safe_open(str(projection), "pt") as file:
-        mean, components = (file.get_tensor(name).float() for name in ("mean", "components"))
-        about = dict(file.metadata() or {})
-    fitted, backbone = Projection(mean, components), load_backbone(network, stride=int(about["stride"]))
+    fitted = projection if isinstance(projection, Projection) else Projection.load(projection)
+    about = fitted.about
+    if network is None and about["network"] != NETWORK:
+        network = about["network"]
+    try:
+        stride, size = int(about["stride"]), [int(side) for side in about["size"].split("x")]
+    except ValueError as error:
+        raise ValueError(f"the description of the projection cannot be used, stride or size: {error}") from error
+    backbone = load_backbone(network, stride=stride)
     if backbone.digest != about["weights"]:
         raise WeightsError(
             f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"
             f" {backbone.digest[:12]} of {backbone.name}: fit one for them, or pass the network it belongs to"
         )
-    return FrozenImageEncoder(backbone, projection=fitted, size=int(about["size"]))
+    return FrozenImageEncoder(backbone, projection=fitted, size=(size * 2)[:2], **options)

@@ -93,12 +93,13 @@ def test_an_episode_whose_file_has_no_actions(tmp_path):
 
 
 @VERSIONS
-def test_pictures_inside_the_tables_are_listed_and_skipped(version, tmp_path):
+def test_pictures_inside_the_tables_are_referred_to(version, tmp_path):
     features = FEATURES | {"observation.images.wrist": {"dtype": "image", "shape": [4, 4, 3], "names": None}}
     pictures = pa.array([{"bytes": b"png", "path": None}] * 12)
     root = write(tmp_path, features=features, change={"observation.images.wrist": pictures}, version=version)
     recordings = read_lerobot(root)
-    assert recordings.skipped == ("observation.images.front", "observation.images.wrist")
+    assert recordings.skipped == ("observation.images.front",)  # a video that is not here
+    assert [len(clip) for clip in recordings.cameras["wrist"]] == [len(frames) for frames in recordings.states]
     assert recordings.state_names == (*JOINTS, "force")
 
 

@@ -34,7 +34,7 @@ def test_demonstrations_in_the_order_of_their_numbers(file):
     recordings = read_robomimic(file)
     assert recordings.sources == ("demo_2", "demo_10") and recordings.control_hz == 20
     assert recordings.state_names == ("eef_0", "eef_1", "eef_2", "width")
-    assert recordings.skipped == ("obs/camera",)
+    assert not recordings.skipped and [len(clip) for clip in recordings.cameras["camera"]] == [4, 5]
     assert recordings.num_labels == 3 and np.isnan(recordings.actions[1]).all()
     np.testing.assert_array_equal(recordings.states[0][:, 3], np.arange(4.0))
 
@@ -49,6 +49,7 @@ def test_the_frame_behind_the_last_action(file):
         demo["next_obs/eef"], demo["next_obs/width"] = np.full((4, 3), 7.0), np.arange(1.0, 5.0)
     recordings = read_robomimic(file)
     assert len(recordings.states[0]) == 5 and recordings.num_labels == 4
+    assert recordings.cameras["camera"][0].numbers == (0, 1, 2, 3, 3)
     assert recordings.states[0][-1].tolist() == [7, 7, 7, 4]
 
 
@@ -101,7 +102,7 @@ def test_truth_values_are_numbers_and_the_rest_is_listed(file):
             stream[f"data/{name}/obs/touch"] = stream[f"data/{name}/obs/width"][:] > 1
             stream[f"data/{name}/rewards"] = stream[f"data/{name}/obs/width"][:]
     recordings = read_robomimic(file)
-    assert recordings.state_names[-2:] == ("touch", "width") and recordings.skipped == ("obs/camera", "rewards")
+    assert recordings.state_names[-2:] == ("touch", "width") and recordings.skipped == ("rewards",)
     assert recordings.states[0][:, 3].tolist() == [0, 0, 1, 1]
 
 

@@ -21,7 +21,7 @@ def test_a_data_set_of_format_3(tmp_path):
         writer.add(np.ones((length, 2)), np.arange(length - 1.0)[:, None])
     writer.close()
     info = json.loads((tmp_path / "meta/info.json").read_text())
-    assert info["codebase_version"] == "v3.0" and info["fps"] == 12.5 and info["embodiment"] == "robot"
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 12.5 and info["robot_type"] == "robot"
     assert info["total_episodes"] == 2 and info["total_frames"] == 10 and info["splits"] == {"train": "0:2"}
     assert info["features"]["observation.state"] == {"dtype": "float32", "shape": [2], "names": ["x", "y"]}
     listed = pq.read_table(tmp_path / "meta/episodes/chunk-000/file-000.parquet").to_pydict()

@@ -11,7 +11,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.commands.data_commands import Demos
-from torchrl_koap.data.formats.lerobot_frames import read_image_episodes
+from torchrl_koap.data import read_recordings
 from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
@@ -20,7 +20,6 @@ from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints
 from torchrl_koap.envs.scooping.kinematics import SpoonKinematics, rotation_of
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, settled_layouts
-from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import (
     BOWL,
@@ -173,14 +172,14 @@ def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path
     assert seen == [1] and report.episodes == 1 and report.attempts >= 1
     with pytest.raises(KeyboardInterrupt):
         record(tmp_path / "parts", progress=interrupt)
-    with pytest.raises(DataError, match="no finished data set"):
-        read_image_episodes(tmp_path / "parts")
+    with pytest.raises(ValueError, match="holds no recordings that can be read"):
+        read_recordings(tmp_path / "parts")
     with pytest.raises(FileExistsError, match="is not empty; choose another folder"):
         record(tmp_path / "parts")
     record(tmp_path / "again")
-    for one, other in zip(*(read_image_episodes(tmp_path / name) for name in ("again", "whole")), strict=True):
-        np.testing.assert_array_equal(one.frames, other.frames)
-        np.testing.assert_array_equal(one.action, other.action)
+    one, other = (read_recordings(tmp_path / name) for name in ("again", "whole"))
+    np.testing.assert_array_equal(one.actions[0], other.actions[0])
+    np.testing.assert_array_equal(*(list(each.cameras["third_person"][0].read()) for each in (one, other)))
 
 
 def test_a_context_has_the_spoon_at_one_of_its_starts_and_the_bowl_anywhere_in_its_region():
@@ -242,9 +241,9 @@ def test_recordings_hold_the_bowl_s_place(tmp_path):
         record_videos(tmp_path / "set", "hand", 2, task=MOVING)
     except RuntimeError as error:
         pytest.skip(f"no OpenGL library: {error}")
-    episodes = read_image_episodes(tmp_path / "set")
-    places = [episode.state[:, 3:] for episode in episodes]
-    assert all(place.shape == (len(e.frames), 2) for place, e in zip(places, episodes, strict=True))
+    recordings = read_recordings(tmp_path / "set", action_dim=MOVING.action_dim)
+    places, clips = [states[:, 3:] for states in recordings.states], recordings.cameras["third_person"]
+    assert [place.shape for place in places] == [(len(list(clip.read())), 2) for clip in clips]
     assert all(np.ptp(place, axis=0).max() == 0 for place in places) and not np.allclose(places[0][0], places[1][0])
 
 

@@ -98,6 +98,23 @@ def test_numpy_or_torch_one_robot_or_several():
     assert not torch.allclose(several[0], several[1])  # a stream of noise per robot
 
 
+def test_what_a_robot_gives_is_observed_first():
+    policy = make_policy(
+        small_planner(),
+        make_koopman_inverse_dynamics(2, 2),
+        state_of=(0, 1),
+        observe=lambda given: torch.as_tensor(given["state"]) + given["top"].mean(),
+    )
+    one, other = Agent(policy, seed=3), Agent(policy, seed=3)
+    one.reset(), other.reset()
+    action = one.act({"state": np.zeros(2), "top": np.full((4, 4, 3), 2.0)})
+    assert isinstance(action, np.ndarray) and np.array_equal(action, other.act(np.full(2, 2.0)))
+    blind = Agent(policy_of())
+    blind.reset()
+    with pytest.raises(ValueError, match=r"trained without cameras: it takes one vector \[obs\], got state, top"):
+        blind.act({"state": np.zeros(2), "top": np.zeros((4, 4, 3))})
+
+
 def test_reset_forgets_the_episode_before():
     path, runs = np.random.default_rng(0).normal(size=(6, 2)), []
     for before in (path, -path):  # as much noise is drawn

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 
 from torchrl_koap import keys
+from torchrl_koap.data.formats.frames import stored_clips
 from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.robomimic import is_hdf5, read_robomimic
 from torchrl_koap.data.formats.tables import is_table_folder, read_tables
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
-from torchrl_koap.data.ted import load_ted, stored_folder
+from torchrl_koap.data.ted import load_ted, read_about, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.lookup import lookup
 
@@ -58,6 +59,7 @@ def _read_stored(source: str) -> Recordings:
         action_names=task.action_names,
         sources=np.arange(len(lengths)).astype(str),
         control_hz=task.control_hz,
+        cameras=stored_clips(read_about(stored_folder(source) or source)["notes"]),
         source=source,
     )
 

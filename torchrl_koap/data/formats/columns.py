@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import Clock, find_rate, rises_evenly, told_rate, usual_rate
+from torchrl_koap.data.formats.frames import Clip, check_cameras
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.files import DataError
@@ -42,12 +43,14 @@ class Piece:
         states (dict): columns ``[T]`` of everything that is no action, by name.
         actions (dict, optional): columns ``[T]`` or ``[T - 1]`` of actions, by name; None where there are none.
         unclear (tuple of str): columns among the states of which the user has to say what they are.
+        cameras (dict): where the frames of every camera lie, one per row.
     """
 
     name: str
     states: dict[str, np.ndarray]
     actions: dict[str, np.ndarray] | None = None
     unclear: tuple[str, ...] = ()
+    cameras: dict[str, Clip] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -116,9 +119,13 @@ def assemble(
     """
     if not pieces:
         raise DataError(source, "there are no trajectories")
+    seen = {name for piece in pieces for name in piece.cameras}
+    pieces = [replace(piece, cameras=_without(piece.cameras, drop_columns)) for piece in pieces]
+    drop_columns = [name for name in drop_columns if name not in seen]
     problems = [*_other_names(pieces), *_other_lengths(pieces)]
     if problems:
         raise DataError(source, problems)
+    check_cameras(pieces, source)
     left_out = list(skipped)
     parts = [part for piece in pieces for part in _episodes(piece, problems)]
     left_out += [f"{part.name} (fewer than two frames)" for part in parts if part.frames < 2]
@@ -164,9 +171,14 @@ def assemble(
         sources=[piece.name for piece in pieces],
         control_hz=rate,
         skipped=left_out,
+        cameras={name: [piece.cameras[name] for piece in pieces] for name in pieces[0].cameras},
         source=source,
     )
     return recordings if resample is None else resampled(recordings, resample, action_kind, times=times)
+
+
+def _without(cameras: Mapping[str, Clip], dropped: Sequence[str]) -> dict[str, Clip]:
+    return {name: clip for name, clip in cameras.items() if name not in dropped}
 
 
 def unknown(asked: Sequence[str], known: Sequence[str], what: str) -> list[str]:
@@ -212,7 +224,13 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
     names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
     return [
-        replace(piece, name=name, states=_cut(piece.states, span), actions=piece.actions and _cut(piece.actions, span))
+        replace(
+            piece,
+            name=name,
+            states=_cut(piece.states, span),
+            actions=piece.actions and _cut(piece.actions, span),
+            cameras={camera: clip.take(span) for camera, clip in piece.cameras.items()},
+        )
         for name, span in zip(names, spans, strict=True)
     ]
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.frames import lerobot_clips
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, check_file, read_bytes, some
 
@@ -41,7 +42,7 @@ def is_lerobot(folder: str | Path) -> bool:
 def read_lerobot(
     root: str | Path, *, observations: Sequence[str] | None = None, episodes: Sequence[int] = (), **options: Any
 ) -> Recordings:
-    """Reads a data set in format 2.x or 3.0; rows without actions have no label, images are skipped and listed.
+    """Reads a data set in format 2.x or 3.0; rows without actions have no label.
 
     Args:
         root (str or Path): its folder; it declares its rate by ``fps``.
@@ -70,7 +71,7 @@ def read_lerobot(
     rows = read_rows(root, chosen, episodes=episodes)
     if not rows:
         raise DataError(root, "there are no trajectories")
-    first, width = next(iter(rows.values())), _announced(info)
+    first, width = next(iter(rows.values())), _announced(info) or options.get("action_dim")
     if ACTION not in first and not width:
         raise DataError(root, "no file has actions, and info.json does not say how many columns an action has")
     names = [label for name in chosen for label in _names(known[name], name, first[name].shape[1])]
@@ -78,11 +79,14 @@ def read_lerobot(
         names = [label for name in chosen for label in _names({}, name, first[name].shape[1])]
     acting = _names(known.get(ACTION) or {}, ACTION, first[ACTION].shape[1] if ACTION in first else width)
     stamped = TIME in first and all(np.isfinite(columns[TIME]).all() for columns in rows.values())
-    pieces = []
+    cameras = [name for name in images if known[name].get("dtype") in IMAGES]
+    clips, pieces = lerobot_clips(root, info, cameras, rows), []
+    absent = [name for name in images if name.split(".")[-1] not in clips[min(rows)]]
     for number, columns in rows.items():
         states = dict(zip(names, np.concatenate([columns[name] for name in chosen], 1).T, strict=True))
         steps = dict(zip(acting, columns[ACTION].T, strict=True)) if ACTION in columns else None
-        pieces.append(Piece(f"episode {number}", states | ({TIME: columns[TIME][:, 0]} if stamped else {}), steps))
+        clock = {TIME: columns[TIME][:, 0]} if stamped else {}
+        pieces.append(Piece(f"episode {number}", states | clock, steps, cameras=clips[number]))
     if ACTION not in first:
         options = {"action_dim": width} | options
     unread = [
@@ -93,7 +97,7 @@ def read_lerobot(
         str(root),
         declared_hz=_rate(info),
         action_names=acting,
-        skipped=[*images, *unread],
+        skipped=[*absent, *unread],
         no_rate="info.json holds no fps: pass control_hz",
         **options,
     )
@@ -116,22 +120,20 @@ def read_info(root: str | Path) -> dict[str, Any]:
     return info | {"features": features}
 
 
-def read_rows(
-    root: str | Path, features: Sequence[str], *, pictures: Sequence[str] = (), episodes: Sequence[int] = ()
-) -> dict[int, dict[str, Any]]:
-    """Reads of every episode, by its number, columns of numbers and of pictures, and actions if there are any.
+def read_rows(root: str | Path, features: Sequence[str], *, episodes: Sequence[int] = ()) -> dict[int, dict[str, Any]]:
+    """Reads of every episode, by its number, columns of numbers, and actions if there are any.
 
-    Numbers are float64 ``[T, d]``, NaN where a row is empty; pictures are lists of ``T`` cells.
+    They are float64 ``[T, d]``, NaN where a row is empty; ``frame_index`` is ``[T]``. ``file`` is where the rows lie.
 
     Raises:
         DataError: with the problems of all files and episodes.
     """
     root = Path(root).expanduser()
-    table = _read_table(root, (*features, EPISODE, FRAME), pictures)
+    table = _read_table(root, (*features, EPISODE, FRAME))
     files, problems = table["__filename"].to_pylist(), []
-    columns: dict[str, Any] = {name: table[name].to_pylist() for name in pictures}
+    columns: dict[str, Any] = {}
     for name in table.column_names:
-        if name not in (*pictures, "__filename"):
+        if name != "__filename":
             announced = _announced(read_info(root)) if name == ACTION else 1
             try:
                 columns[name] = numbers(table[name], name, announced=announced, files=files)
@@ -156,12 +158,13 @@ def read_rows(
         elif not np.array_equal(frame[start:end], np.arange(end - start)):
             problems.append(f"{files[start]}: column {FRAME!r} of episode {number} must count 0, 1, 2, ...")
         rows[number] = {name: values[start:end] for name, values in columns.items()}
+        rows[number] |= {FRAME: frame[start:end], "file": files[start]}
     if problems:
         raise DataError(root, problems)
     return rows
 
 
-def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
+def _read_table(root: Path, needed: Sequence[str]):
     """The rows of all files, sorted: the columns that are asked for, the actions, and ``__filename``."""
     pyarrow = import_pyarrow()
     files, problems = sorted((root / "data").rglob("*.parquet")), []
@@ -175,15 +178,14 @@ def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
         except (pyarrow.ArrowException, OSError) as error:
             problems.append(f"{file}: cannot be read: {str(error).splitlines()[0]}")
             continue
-        missing = [name for name in (*needed, *pictures) if name not in schema.names]
+        missing = [name for name in needed if name not in schema.names]
         problems += [f"{file}: missing column {name!r}; the file has {', '.join(schema.names)}" for name in missing]
-        for name in {*needed, *pictures, ACTION, TIME}.intersection(schema.names):
+        for name in {*needed, ACTION, TIME}.intersection(schema.names):
             got = schema.field(name).type
-            kind = _picture(pyarrow, got) if name in pictures else number_type(got)
+            kind = number_type(got)
             kinds.setdefault(name, kind)
             if kind is None:
-                wanted = "pictures" if name in pictures else "numbers or lists of numbers"
-                problems.append(f"{file}: column {name!r} must hold {wanted}, got {got}")
+                problems.append(f"{file}: column {name!r} must hold numbers or lists of numbers, got {got}")
             elif kind != kinds[name]:
                 problems.append(f"{file}: column {name!r} holds {got}, that of another file {kinds[name]}")
     if problems:
@@ -194,12 +196,6 @@ def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(root, f"it cannot be read: {str(error).splitlines()[0]}") from error
     return table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")])
-
-
-def _picture(pyarrow, kind):
-    """The type that a column of pictures is read as, None of anything else."""
-    held = pyarrow.types.is_struct(kind) and kind.get_field_index("bytes") >= 0
-    return pyarrow.struct([("bytes", pyarrow.binary())]) if held else None
 
 
 def _expected_lengths(root: Path) -> dict[int, int | None]:

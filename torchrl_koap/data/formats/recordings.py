@@ -9,7 +9,7 @@ action is NaN, has no label.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
 
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.files import DataError
 
 
@@ -31,7 +32,8 @@ class Recordings:
         action_names (tuple of str): names of the ``a`` action columns.
         sources (tuple of str): where each trajectory is from, for messages.
         control_hz (float, optional): frames per second, if the source says so.
-        skipped (tuple of str): entries of the source that were left out, images for example.
+        skipped (tuple of str): entries of the source that were left out.
+        cameras (dict): by camera for every trajectory where its ``T_i`` frames lie.
 
     Examples:
         >>> import numpy as np
@@ -48,6 +50,7 @@ class Recordings:
     sources: tuple[str, ...]
     control_hz: float | None = None
     skipped: tuple[str, ...] = field(default=())
+    cameras: Mapping[str, Sequence[Clip]] = field(default_factory=dict)
 
     @property
     def num_labels(self) -> int:
@@ -65,6 +68,7 @@ def make_recordings(
     sources: Sequence[str] | None = None,
     control_hz: float | None = None,
     skipped: Sequence[str] = (),
+    cameras: Mapping[str, Sequence[Clip]] | None = None,
     source: str = "these recordings",
 ) -> Recordings:
     """Checks arrays and puts them into one form.
@@ -76,8 +80,8 @@ def make_recordings(
 
     Keyword Args:
         action_dim (int, optional): number of action columns, needed where no trajectory has actions.
-        state_names, action_names, sources, control_hz, skipped: as of :class:`Recordings`. Columns and trajectories
-            without a name are numbered.
+        state_names, action_names, sources, control_hz, skipped, cameras: as of :class:`Recordings`. Columns and
+            trajectories without a name are numbered.
         source (str): what messages call the whole.
 
     Returns:
@@ -142,7 +146,14 @@ def make_recordings(
     partly = sum(int(((0 < columns) & (columns < wide)).sum()) for columns in unknown)
     skipped = [*skipped, *([f"{partly} actions of which only some columns are known"] if partly else [])]
     return Recordings(
-        frames, steps, given_states, given_actions, tuple(labels), control_hz, tuple(dict.fromkeys(skipped))
+        frames,
+        steps,
+        given_states,
+        given_actions,
+        tuple(labels),
+        control_hz,
+        tuple(dict.fromkeys(skipped)),
+        dict(cameras or {}),
     )
 
 

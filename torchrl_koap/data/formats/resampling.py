@@ -31,9 +31,9 @@ def resampled(
     """Brings recordings to a fixed rate.
 
     States are interpolated linearly. Where a column leaps (a wrapped angle, a quaternion that changes its sign), and in
-    columns of at most ten integers (a switch), the nearest frame counts. Changes over one frame are summed over the new
-    step; any other action is the current one at its beginning. A step with an unlabelled part has no label. A gap of
-    more than two steps, recorded or new, ends a trajectory; ``skipped`` counts these.
+    columns of at most ten integers (a switch), the nearest frame counts, as of cameras. Changes over one frame are
+    summed over the new step; any other action is the current one at its beginning. A step with an unlabelled part has
+    no label. A gap of more than two steps, recorded or new, ends a trajectory; ``skipped`` counts these.
 
     Args:
         recordings (Recordings): what was read.
@@ -81,12 +81,11 @@ def resampled(
         raise DataError("resample", problems)
     adding = np.array(summing, dtype=bool)
     bounds = np.where(_switches(np.concatenate(recordings.states)), 0, leap_bounds(recordings.states)[0])
-    parts: list[tuple[str, np.ndarray, np.ndarray]] = []
+    parts: list[tuple[str, np.ndarray, np.ndarray, int, np.ndarray]] = []
     gaps: list[str] = []
     short: list[str] = []
-    for name, frames, steps, at, step in zip(
-        recordings.sources, recordings.states, recordings.actions, times, usual, strict=True
-    ):
+    each = zip(recordings.sources, recordings.states, recordings.actions, times, usual, strict=True)
+    for number, (name, frames, steps, at, step) in enumerate(each):
         breaks = np.flatnonzero(np.diff(at) > MOST * max(step, 1 / control_hz) * (1 + _SAME))
         gaps += [f"{name} ({at[before + 1] - at[before]:.3g} s)" for before in breaks]
         edges = [0, *(breaks + 1), len(at)]
@@ -97,18 +96,23 @@ def resampled(
                 short.append(called)
                 continue
             labels = _actions(steps[start : end - 1], at[span], new, adding, UNEVEN * step)
-            parts.append((called, _states(frames[span], at[span], new, bounds), labels))
+            rows = start + np.searchsorted((at[span][1:] + at[span][:-1]) / 2, new)
+            parts.append((called, _states(frames[span], at[span], new, bounds), labels, number, rows))
     if not parts:
         raise DataError("resample", f"no trajectory has two frames at {control_hz:g} Hz")
     notes = [f"{len(gaps)} gaps in time, where trajectories were split: {some(gaps)}"] if gaps else []
     notes += [f"{len(short)} trajectories without two frames at {control_hz:g} Hz: {some(short)}"] if short else []
-    names, states, actions = zip(*parts, strict=True)
+    names, states, actions, numbers, nearest = zip(*parts, strict=True)
     return replace(
         recordings,
         states=list(states),
         actions=list(actions),
         sources=names,
         control_hz=float(control_hz),
+        cameras={
+            name: [clips[number].take(rows) for number, rows in zip(numbers, nearest, strict=True)]
+            for name, clips in recordings.cameras.items()
+        },
         skipped=(*recordings.skipped, *notes),
     )
 

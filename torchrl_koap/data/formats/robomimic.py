@@ -4,7 +4,7 @@
 ::
 
     data                     attribute env_args (JSON; env_kwargs/control_freq is the rate)
-    data/demo_0/obs/<name>   [T, d] or [T] numbers, side by side the state; images [T, H, W, C] are skipped
+    data/demo_0/obs/<name>   [T, d] or [T] numbers, side by side the state; frames of a camera [T, H, W, 3]
     data/demo_0/actions      [T, a]; may be missing
     data/demo_0/next_obs     optional; its last row is the frame behind the last action
 """
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.columns import Piece, assemble, kind_of, spread
+from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError
 
@@ -69,7 +70,8 @@ def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = Non
             problems.append(f"no entry of obs is a table of numbers; there are {', '.join(first['obs'])}")
         declared = _control_frequency(stream["data"].attrs.get("env_args"))
         pieces = [_piece(stream[f"data/{name}"], name, chosen, problems) for name in demos]
-        skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen]
+        seen = {name for piece in pieces for name in piece.cameras}
+        skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
         read = ("obs", "next_obs", "actions")
         skipped += [name for name in sorted(first) if name not in read and kind_of(name)[0] != "clock"]
         skipped += [name for name in stream if name != "data"]
@@ -106,14 +108,19 @@ def _piece(group: Any, name: str, chosen: Sequence[str], problems: list[str]) ->
     if not behind:  # time stamps may lie beside obs
         stamps = [entry for entry in group if kind_of(entry)[0] == "clock" and _is_table(group[entry])]
         states = {entry: group[entry][()].ravel() for entry in stamps} | states
+    file, cameras = str(Path(group.file.filename).resolve()), {}
+    for film, part in group["obs"].items():
+        if len(_shape(part)) == 4:  # where nobody kept the frame behind the last one, that one is taken again
+            last = (len(part) - (film not in following),) if behind else ()
+            cameras[film] = Clip(file, (*range(len(part)), *last), f"data/{name}/obs/{film}")
     if "actions" not in group:
-        return Piece(name, states)
+        return Piece(name, states, cameras=cameras)
     actions = group["actions"]
     if not _is_table(actions):
         problems.append(f"data/{name}/actions must be numbers [T, a], got {_shape(actions)}")
         return Piece(name, states)
     columns = spread("action", actions).values()
-    return Piece(name, states, {f"action_{index}": values for index, values in enumerate(columns)})
+    return Piece(name, states, {f"action_{index}": values for index, values in enumerate(columns)}, cameras=cameras)
 
 
 def _shape(entry: Any) -> list[int]:

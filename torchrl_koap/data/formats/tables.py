@@ -10,6 +10,8 @@
                           all others are states; an empty field is NaN
     folder/run_002.parquet  the same; columns may also be lists of numbers
 
+Cameras lie beside a table (:mod:`torchrl_koap.data.formats.frames`).
+
 What is not read (further entries of an archive, parquet columns without numbers) is named in ``skipped``.
 """
 
@@ -28,6 +30,7 @@ import numpy as np
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.formats.columns import Piece, assemble, kind_of, numbered
+from torchrl_koap.data.formats.frames import clips_beside
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, some
 from torchrl_koap.lookup import lookup
@@ -68,7 +71,8 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     tables: list[_Table] = []
     for file in files:
         try:
-            tables.append(_READERS[file.suffix.lower()](file, action_columns))
+            piece, rate, unread = _READERS[file.suffix.lower()](file, action_columns)
+            tables.append((_with_cameras(piece, file), rate, unread))
         except _UNREADABLE as error:
             problems.setdefault(str(error) or type(error).__name__, []).append(str(file))
     if problems:
@@ -79,7 +83,9 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
             said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
             raise DataError(folder, f"{said}: pass resample (Hz) to bring them to one rate, or control_hz")
         tables = [(_stamped(piece, rate), None, names) for (piece, _, names), rate in zip(tables, rates, strict=True)]
-    unread = [f"{path.name} (no table)" for path in sorted(folder.iterdir()) if path not in files]
+    beside = {file.with_suffix("") for file in files}
+    others = [path for path in sorted(folder.iterdir()) if path not in files and path not in beside]
+    unread = [f"{path.name} (no table)" for path in others]
     return assemble(
         _named_alike([piece for piece, _, _ in tables]),
         str(folder),
@@ -87,6 +93,13 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
         skipped=[*(name for _, _, names in tables for name in names), *unread],
         **options,
     )
+
+
+def _with_cameras(piece: Piece, file: Path) -> Piece:
+    """A table and what cameras saw beside it, by its clock where it has one."""
+    clocks = [(name, kind_of(name)[1]) for name in piece.states if kind_of(name)[0] == "clock"]
+    clock = piece.states[clocks[0][0]] * clocks[0][1] if clocks else None
+    return replace(piece, cameras=clips_beside(file, clock))
 
 
 def _files(folder: Path) -> list[Path]:

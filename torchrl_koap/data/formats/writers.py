@@ -13,7 +13,6 @@ import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow
 from torchrl_koap.data.formats.lerobot import ACTION, EPISODE, FRAME, STATE
-from torchrl_koap.data.formats.lerobot_frames import EMBODIMENT
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, replacing_file
 
@@ -145,8 +144,6 @@ class LeRobotWriter:
             "video_path": None,
             "features": features | {"timestamp": {"dtype": "float32", **single}},
         }
-        if self._embodiment is not None:
-            info[EMBODIMENT] = self._embodiment
         with replacing_file(self._folder / "meta" / "info.json") as aside:
             aside.write_text(json.dumps(info, indent=2) + "\n")
         return self._folder

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.data.formats.lerobot_frames import ImageEpisode
 from torchrl_koap.data.formats.writers import LeRobotWriter
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
@@ -18,11 +17,19 @@ from torchrl_koap.envs.scooping.kinematics import SpoonKinematics
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE, STARTS, start_of
+from torchrl_koap.tasks.scooping import CAMERA, EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE, STARTS, start_of
 
 AFTERWARDS = 12  # frames that are recorded after a success: a controller's labels end before its look-ahead does
 MAX_ATTEMPTS = 10
-CAMERA = "third_person"
+
+
+@dataclass(frozen=True)
+class FilmedEpisode:
+    """A demonstration: frames uint8 ``[T + 1, H, W, 3]``, the rest ``[T + 1, d]``, actions ``[T, act]`` or None."""
+
+    frames: np.ndarray
+    state: np.ndarray
+    action: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,7 @@ class VideoReport:
         return f"{kept}; {self.attempts} were played to get them, {self.again} scoop more than once"
 
 
-def _play_episodes(embodiment: str, episodes: int, seed: int, task: str) -> Iterator[tuple[ImageEpisode, int, int]]:
+def _play_episodes(embodiment: str, episodes: int, seed: int, task: str) -> Iterator[tuple[FilmedEpisode, int, int]]:
     """Plays demonstrations in their order; one that does not succeed is played again, from another place.
 
     They begin at the start positions in turn, so that the first few of them have seen them all.
@@ -88,7 +95,7 @@ def _context_at(task: str, start: int, generator: np.random.Generator) -> np.nda
             return context
 
 
-def _play(sims: ScoopingSimulations, expert: ScoopingExpert, draw: Callable[[], np.ndarray]) -> ImageEpisode | None:
+def _play(sims: ScoopingSimulations, expert: ScoopingExpert, draw: Callable[[], np.ndarray]) -> FilmedEpisode | None:
     rows = np.zeros(1, dtype=np.int64)
     frames, spoons, actions, after = [draw()], [sims.spoon_position[0]], [], 0
     for _ in range(get_task("scooping").max_steps):
@@ -105,7 +112,7 @@ def _play(sims: ScoopingSimulations, expert: ScoopingExpert, draw: Callable[[], 
     if not sims.success[0]:
         return None
     labels = np.stack(actions) if sims.embodiment == "robot" else None
-    return ImageEpisode(np.stack(frames), np.stack(spoons), labels, sims.embodiment)
+    return FilmedEpisode(np.stack(frames), np.stack(spoons), labels)
 
 
 def record_videos(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -65,10 +65,11 @@ class Agent:
         self._ready = True
 
     @torch.no_grad()
-    def act(self, observation: np.ndarray | Tensor | Sequence[float]) -> np.ndarray | Tensor:
+    def act(self, observation: np.ndarray | Tensor | Sequence[float] | Mapping[str, Any]) -> np.ndarray | Tensor:
         """The action ``[act]`` for an observation ``[obs]`` in raw units, or ``[n, act]`` for those of several robots.
 
-        It is an array or a tensor, as the observation is.
+        It is a tensor where the observation is one, else an array. A policy that was trained with cameras takes
+        ``{"state": x, "top": frame}``: numbers ``[d]`` and a frame of every camera by its name, uint8 ``[H, W, 3]``.
         """
         began = time.perf_counter()
         newest = self._checked(observation).unsqueeze(-2)
@@ -122,6 +123,11 @@ class Agent:
         """The observation as ``[n, obs]`` of the policy's type."""
         if not self._ready:
             raise RuntimeError("reset() the agent before the first act(): it has to know where an episode begins")
+        if isinstance(observation, Mapping):
+            if self.policy.observe is None:
+                given = ", ".join(observation)
+                raise ValueError(f"this policy was trained without cameras: it takes one vector [obs], got {given}")
+            observation = self.policy.observe(observation)
         observed = torch.as_tensor(observation)
         shape = tuple(observed.shape)
         if len(shape) not in (1, 2):

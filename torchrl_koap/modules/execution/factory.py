@@ -31,6 +31,7 @@ def make_policy(
     ranges: Ranges | None = None,
     max_steps: int = 400,
     control_hz: float | None = None,
+    observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
     follower: Follower | None = None,
 ) -> PlanningPolicy:
     """Makes a policy of planner and controller: observations in, an action per control step out.
@@ -46,7 +47,7 @@ def make_policy(
 
     Keyword Args:
         state_of (callable, or sequence of int): as for :class:`~torchrl_koap.modules.PlanningPolicy`, like
-            ``execution``, ``max_steps`` and ``control_hz``.
+            ``execution``, ``max_steps``, ``control_hz`` and ``observe``.
         columns (sequence of int, optional): columns of the state that an inverse dynamics reads. Default: all.
         action_rule (callable, optional): as for :class:`~torchrl_koap.modules.Follower`.
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
@@ -95,6 +96,7 @@ def make_policy(
         limits=limits,
         max_steps=max_steps,
         control_hz=control_hz,
+        observe=observe,
     )
     return policy.eval()
 

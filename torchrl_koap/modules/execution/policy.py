@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -50,6 +50,8 @@ class PlanningPolicy(TensorDictModuleBase):
             ``limited``, int64 ``[2]``.
         max_steps (int): steps of an episode, whose start noise is drawn at once.
         control_hz (float, optional): frames per second of the data. Default: not known.
+        observe (callable, optional): from what a robot gives, a mapping with camera frames, to observations
+            ``[*B, obs]`` (:class:`~torchrl_koap.vision.Observer`). Default: the robot gives observations.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -80,6 +82,7 @@ class PlanningPolicy(TensorDictModuleBase):
         limits: CommandLimits | None = None,
         max_steps: int = 400,
         control_hz: float | None = None,
+        observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -100,6 +103,7 @@ class PlanningPolicy(TensorDictModuleBase):
             )
         self.planner, self.follower, self.limits = planner, follower, limits
         self.execution, self.max_steps, self.control_hz = execution, max_steps, control_hz
+        self.observe = observe
         self.register_buffer("limited", torch.zeros(2, dtype=torch.long), persistent=False)
         self.state_of = state_of if callable(state_of) else _Columns(state_of)
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)

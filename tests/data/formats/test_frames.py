@@ -1,0 +1,255 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Camera frames stay where they are: what a reference reads is what was recorded, and what is missing is named."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow")
+import pyarrow as pa
+import pyarrow.parquet as pq
+from camera_sets import episode, write_camera_set
+from PIL import Image
+
+from torchrl_koap.data import read_recordings
+from torchrl_koap.data.formats.frames import Clip, fault_of
+from torchrl_koap.data.formats.writers import LeRobotWriter
+from torchrl_koap.data.quality import drop_short, trim_still
+from torchrl_koap.files import DataError
+
+
+def film(length, seed=0, size=(8, 10)):
+    return np.random.default_rng(seed).integers(0, 256, (length, *size, 3), dtype=np.uint8)
+
+
+def read(recordings, camera, index=0):
+    return np.stack(list(recordings.cameras[camera][index].read()))
+
+
+def write_tables(folder, lengths=(6, 5), clock=False):
+    """Tables with two cameras beside them: a folder of pictures, and an array."""
+    for number, length in enumerate(lengths):
+        states = np.random.default_rng(number).normal(size=(length, 2))
+        further = {"timestamp": np.arange(length) / 10} if clock else {}
+        (folder / f"run_{number}" / "top").mkdir(parents=True)
+        np.savez(folder / f"run_{number}.npz", states=states, actions=states[:-1], control_hz=10.0, **further)
+        for index, frame in enumerate(film(length, number)):
+            Image.fromarray(frame).save(folder / f"run_{number}" / "top" / f"{index:06d}.png")
+        np.save(folder / f"run_{number}" / "wrist.npy", film(length, 7 + number))
+    return folder
+
+
+@pytest.mark.parametrize("clock", [False, True])
+def test_pictures_and_arrays_beside_tables(tmp_path, clock):
+    recordings = read_recordings(write_tables(tmp_path, clock=clock))
+    assert list(recordings.cameras) == ["top", "wrist"] and not set(recordings.skipped) - {"timestamp"}
+    for index, length in enumerate((6, 5)):
+        np.testing.assert_array_equal(read(recordings, "top", index), film(length, index))
+        np.testing.assert_array_equal(read(recordings, "wrist", index), film(length, 7 + index))
+    assert list(read_recordings(tmp_path, drop_columns=["wrist"]).cameras) == ["top"]
+
+
+def test_frames_on_a_clock_of_their_own_are_matched(tmp_path):
+    """A camera at 30 frames a second, a little late, beside rows at 10."""
+    write_tables(tmp_path, lengths=(6,), clock=True)
+    frames, times = film(18, 3), np.arange(18) / 30 + 0.004
+    np.save(tmp_path / "run_0" / "wrist.npy", frames)
+    np.save(tmp_path / "run_0" / "wrist_times.npy", times)
+    np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
+    np.save(tmp_path / "run_0" / "wrist_times.npy", times[:9])
+    with pytest.raises(DataError, match=r"wrist_times.npy is for 18 frames and a clock, it has \[9\] times"):
+        read_recordings(tmp_path)
+    np.save(tmp_path / "run_0" / "wrist.npy", frames[:9])
+    with pytest.raises(DataError, match="camera 'wrist': no frame for row 5 at 0.5 s, the nearest is 0.229 s away"):
+        read_recordings(tmp_path)
+
+
+def test_what_is_cut_is_cut_from_the_cameras_too(tmp_path):
+    states = np.r_[np.zeros(5), np.arange(20.0), np.full(5, 19.0)][:, None]
+    (tmp_path / "a").mkdir()
+    np.savez(tmp_path / "a.npz", states=states, actions=states[:-1], control_hz=10.0)
+    np.save(tmp_path / "a" / "top.npy", film(30))
+    np.savez(tmp_path / "b.npz", states=states[:9], actions=states[:8], control_hz=10.0)
+    (tmp_path / "b").mkdir()
+    np.save(tmp_path / "b" / "top.npy", film(9, 1))
+    recordings = read_recordings(tmp_path)
+    short = drop_short(recordings)
+    assert len(short.cameras["top"]) == len(short.states) == 1
+    cut = trim_still(recordings)
+    assert [len(clip) for clip in cut.cameras["top"]] == [len(frames) for frames in cut.states]
+    assert len(cut.states[0]) < 30
+    np.testing.assert_array_equal(read(cut, "top")[5], film(30)[int(np.argmax(states == cut.states[0][5]))])
+
+
+def test_episodes_of_one_table_have_their_own_frames(tmp_path):
+    table = "x,action_0,episode\n" + "".join(f"{row * row},{row},{row // 4}\n" for row in range(8))
+    (tmp_path / "all.csv").write_text(table)
+    (tmp_path / "all").mkdir()
+    np.save(tmp_path / "all" / "top.npy", film(8))
+    recordings = read_recordings(tmp_path, control_hz=10)
+    np.testing.assert_array_equal(read(recordings, "top", 1), film(8)[4:])
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_cameras_of_robomimic(tmp_path, behind):
+    h5py = pytest.importorskip("h5py")
+    frames = film(7)
+    with h5py.File(tmp_path / "demo.hdf5", "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo["obs/joints"], demo["obs/agentview_image"] = np.random.default_rng(0).normal(size=(6, 2)), frames[:6]
+        demo["actions"] = np.zeros((6, 2))
+        if behind:
+            demo["next_obs/joints"], demo["next_obs/agentview_image"] = np.zeros((6, 2)), frames[1:]
+    recordings = read_recordings(tmp_path / "demo.hdf5", control_hz=20)
+    assert len(recordings.states[0]) == 6 + behind and not recordings.skipped
+    np.testing.assert_array_equal(read(recordings, "agentview_image"), frames[: 6 + behind])
+
+
+@pytest.mark.parametrize("embodiment", ["robot", "hand"])
+def test_pictures_of_lerobot(tmp_path, embodiment):
+    recordings = read_recordings(write_camera_set(tmp_path / "set", embodiment), action_dim=7)
+    assert recordings.state_names == ("x", "y", "z") and list(recordings.skipped) == ["timestamp"]
+    for seed in range(2):
+        wanted = episode(embodiment, 6 + seed, seed)
+        np.testing.assert_array_equal(read(recordings, "third_person", seed), wanted.frames)
+        np.testing.assert_allclose(recordings.states[seed], wanted.state, rtol=1e-6)
+        if embodiment == "robot":
+            np.testing.assert_allclose(recordings.actions[seed], wanted.action, rtol=1e-6)
+    assert bool(recordings.num_labels) == (embodiment == "robot")
+
+
+def test_several_cameras_of_lerobot_are_told_apart(tmp_path):
+    root = write_camera_set(tmp_path / "set", "robot", count=1)
+    info = json.loads((root / "meta/info.json").read_text())
+    other, own = "observation.images.wrist", "observation.images.third_person"
+    info["features"][other] = info["features"][own]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    (file,) = (root / "data").rglob("*.parquet")
+    table = pq.read_table(file)
+    pq.write_table(table.append_column(other, table[own].take(list(range(len(table)))[::-1])), file)
+    recordings = read_recordings(root)
+    assert np.array_equal(read(recordings, "third_person")[::-1], read(recordings, "wrist"))
+
+
+def write_videos(root, version, lengths=(14, 11)):
+    """A LeRobot data set with one video of a dot that moves; in 3.0 both episodes lie in one file."""
+    av = pytest.importorskip("av")
+    camera = "observation.images.front"
+    writer = LeRobotWriter(root, fps=10, state_names="x", action_names="a")
+    films = [np.full((length, 64, 64, 3), 0, np.uint8) for length in lengths]
+    for number, frames in enumerate(films):
+        for index, frame in enumerate(frames):
+            frame[16 * number : 16 * number + 16, 4 * index : 4 * index + 4] = 255
+        writer.add(np.random.default_rng(0).normal(size=(len(frames), 1)), np.ones((len(frames) - 1, 1)))
+    writer.close()
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"][camera] = {"dtype": "video", "shape": [64, 64, 3], "names": None}
+    info["video_path"] = "{video_key}/{episode_index}.mp4"
+    files = {f"{number}.mp4": frames for number, frames in enumerate(films)}
+    file = root / "meta/episodes/chunk-000/file-000.parquet"
+    if version == "v3.0":
+        info["video_path"], files = "{video_key}/{chunk_index}-{file_index}.mp4", {"0-5.mp4": np.concatenate(films)}
+        about = {"chunk_index": [0, 0], "file_index": [5, 5], "from_timestamp": [0.0, lengths[0] / 10]}
+        table = pq.read_table(file)
+        for name, values in about.items():
+            table = table.append_column(f"videos/{camera}/{name}", pa.array(values))
+        pq.write_table(table, file)
+    else:
+        file.unlink()
+    (root / "meta/info.json").write_text(json.dumps(info))
+    (root / camera).mkdir()
+    for name, frames in files.items():
+        with av.open(root / camera / name, "w") as container:
+            stream = container.add_stream("libx264", rate=10)
+            stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+            for frame in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+            container.mux(stream.encode())
+    return films, root / camera / next(reversed(files))
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_frames_of_a_video(version, tmp_path):
+    """In 3.0 the second episode begins behind the first one, in the same file."""
+    films, last = write_videos(tmp_path, version)
+    recordings = read_recordings(tmp_path)
+    for index, frames in enumerate(films):
+        assert np.abs(read(recordings, "front", index).astype(int) - frames).mean() < 3  # a video is not exact
+        assert (read(recordings, "front", index)[..., 0] > 128).sum((1, 2)).min() > 32
+    last.write_bytes(b"no video")
+    with pytest.raises(ValueError, match=r"frame \d+: PyAV cannot decode .*mp4.*ffmpeg -i OLD"):
+        read(recordings, "front", 1)
+    last.unlink()
+    with pytest.raises(ValueError, match=r"frame \d+: .*mp4 is not there \(any more\): convert the data again"):
+        read(recordings, "front", 1)
+
+
+def test_a_video_with_fewer_frames_than_rows(tmp_path):
+    write_videos(tmp_path, "v2.1")
+    clip = read_recordings(tmp_path).cameras["front"][1]
+    with pytest.raises(ValueError, match=r"frame 12 is missing: .*1.mp4 ends with frame 10"):
+        list(Clip(clip.file, (*clip.numbers, 12)).read())
+
+
+def test_videos_that_are_not_there_are_skipped(tmp_path):
+    _, last = write_videos(tmp_path, "v3.0")
+    last.unlink()
+    recordings = read_recordings(tmp_path)
+    assert not recordings.cameras and "observation.images.front" in recordings.skipped
+
+
+def test_videos_need_an_extra(tmp_path, monkeypatch):
+    write_videos(tmp_path, "v3.0")
+    clip = read_recordings(tmp_path).cameras["front"][0]
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(RuntimeError, match=r"pip install 'torchrl_koap\[video\]'"):
+        next(clip.read())
+
+
+def test_what_is_missing_is_named(tmp_path):
+    write_tables(tmp_path)
+    (tmp_path / "run_1" / "top" / "000002.png").unlink()
+    with pytest.raises(DataError, match=r"run_1.npz.*camera 'top': frame 2 is missing"):
+        read_recordings(tmp_path)
+    (tmp_path / "run_1" / "top" / "000003.png").unlink()
+    (tmp_path / "run_1" / "top" / "000004.png").unlink()
+    with pytest.raises(DataError, match=r"run_1.npz: camera 'top' has 2 frames for 5 rows: .*drop_columns top"):
+        read_recordings(tmp_path)
+    (tmp_path / "run_1" / "wrist.npy").unlink()
+    with pytest.raises(DataError, match="camera 'wrist' has no frames in run_1.npz"):
+        read_recordings(tmp_path, drop_columns=["top"])
+    with pytest.raises(DataError, match="must end in a number of its own"):
+        (tmp_path / "run_1" / "top" / "final.png").write_bytes(b"")
+        read_recordings(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("frame", "says"),
+    [
+        (np.zeros((8, 8), np.uint8), r"is greyscale \[8, 8\], wanted three colours"),
+        (np.zeros((8, 8, 1), np.uint8), "is greyscale"),
+        (np.zeros((8, 8, 4), np.uint8), r"is RGBA \[8, 8, 4\].*save it as RGB"),
+        (np.zeros((3, 8, 8), np.uint8), r"has shape \[3, 8, 8\].*put the colours last"),
+        (np.zeros((8, 8, 3)), "is float64, wanted uint8 in 0 to 255: scale and round it"),
+        (np.zeros((8, 9, 3), np.uint8), "is 8 x 9, the camera's others are 8 x 8: bring all to one size"),
+    ],
+)
+def test_frames_of_another_kind_are_refused(frame, says, tmp_path):
+    assert fault_of(np.zeros((8, 8, 3), np.uint8), (8, 8)) is None
+    np.save(tmp_path / "top.npy", frame[None])
+    with pytest.raises(ValueError, match=f"frame 0 {says}"):
+        list(Clip(str(tmp_path / "top.npy"), (0,)).read((8, 8)))
+
+
+def test_damaged_pictures_are_named(tmp_path):
+    write_tables(tmp_path)
+    clip = read_recordings(tmp_path).cameras["top"][0]
+    (tmp_path / "run_0" / "top" / "000003.png").write_bytes(b"PNG")
+    with pytest.raises(ValueError, match=r"frame 3 \(000003.png\) is no picture that can be read"):
+        list(clip.read())
+    (tmp_path / "run_0" / "top" / "000003.png").unlink()
+    with pytest.raises(ValueError, match="frame 3 is missing in"):
+        list(clip.read())

@@ -1,0 +1,139 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Camera frames as columns of a data set: which ones, fitted to what, resumed, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from camera_sets import episode
+from camera_sets import write_camera_set as write
+
+from torchrl_koap.data import load_ted, read_about, read_recordings, save_demonstrations
+from torchrl_koap.files import DataError
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.vision import Observer, Projection, backbones, load_cameras, load_encoder
+from torchrl_koap.vision.embedding import embed_recordings, read_sources
+
+OWN = "tiny_network:random_layer"
+
+
+def write_own(folder, cameras=("top", "wrist"), trajectories=12, size=(16, 24)):
+    """A data set of `koap convert`, whose cameras see a square where the robot is."""
+    generator = np.random.default_rng(0)
+    for number in range(trajectories):
+        path = np.clip(generator.normal(size=(20, 2)).cumsum(0) / 4 + 6, 0, 11)
+        (folder / "raw" / f"{number:02d}").mkdir(parents=True)
+        np.savez(folder / "raw" / f"{number:02d}.npz", states=path, actions=np.diff(path, axis=0), control_hz=10.0)
+        for camera in cameras:
+            frames = np.zeros((len(path), *size, 3), np.uint8)
+            for frame, (x, y) in zip(frames, path.astype(int), strict=True):
+                frame[y : y + 4, x : x + 4, len(camera) % 3] = 255
+            np.save(folder / "raw" / f"{number:02d}" / f"{camera}.npy", frames)
+    return save_demonstrations(folder / "own", read_recordings(folder / "raw"))
+
+
+def embed(folder, out, **options):
+    recordings, task = read_sources([folder], None)
+    return embed_recordings(recordings, task, out, network=OWN, components=5, **options)
+
+
+def test_embeddings_are_further_columns_that_are_not_the_robot_s(tmp_path):
+    own, done = write_own(tmp_path), []
+    reports = embed(own, tmp_path / "seen", progress=lambda now, total: done.append((now, total)))
+    assert done[-1] == (2 * 240, 2 * 240) and list(reports) == ["top", "wrist"]
+    data, task = load_ted(tmp_path / "seen" / "ted")
+    before, earlier = load_ted(own / "ted")
+    assert task.observation_dim == 2 + 5 + 5 and task.robot == (0, 1) and task.targets == earlier.targets
+    assert task.state_names[2:4] == ("top_0", "top_1") and task.state_names[-1] == "wrist_4"
+    assert torch.equal(data["observation"][:, :2], before["observation"])
+    assert torch.equal(data["action"], before["action"])
+    columns = load_demonstrations(str(tmp_path / "seen"), task)["state"]
+    assert columns.shape[1] == 12 and not (tmp_path / "seen" / "unfinished").exists()
+    for name, report in reports.items():
+        assert report.size == (16, 24) and report.components == 5 and report.rate > 0
+        assert report.error == pytest.approx((1 - report.kept) ** 0.5) and 0.3 < report.kept < 1, name
+    cameras = load_cameras(tmp_path / "seen" / "cameras")
+    frames = np.load(tmp_path / "raw" / "03" / "top.npy")
+    wanted = load_encoder(cameras["top"]).embed(torch.from_numpy(frames[:-1]))
+    torch.testing.assert_close(data["observation"][data["episode"] == 3][:, 2:7], wanted, rtol=1e-4, atol=1e-5)
+    states = np.load(tmp_path / "raw" / "03.npz")["states"]
+    given = {"state": states[4], **{name: np.load(tmp_path / "raw" / "03" / f"{name}.npy")[4] for name in cameras}}
+    torch.testing.assert_close(
+        Observer(task, cameras)(given).float(), data["observation"][data["episode"] == 3][4], rtol=1e-4, atol=1e-5
+    )
+
+
+def test_one_camera_of_two(tmp_path):
+    own = write_own(tmp_path)
+    assert list(embed(own, tmp_path / "seen", cameras=["wrist"])) == ["wrist"]
+    assert load_ted(tmp_path / "seen" / "ted")[1].observation_dim == 7
+    with pytest.raises(ValueError, match="unknown camera 'wrst'; did you mean 'wrist'"):
+        embed(own, tmp_path / "again", cameras=["wrst"])
+
+
+def test_an_interrupted_embedding_goes_on(tmp_path, monkeypatch):
+    own, shown = write_own(tmp_path, cameras=("top",)), []
+
+    def stop(done, total):
+        if done > 100:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        embed(own, tmp_path / "seen", progress=stop)
+    assert not (tmp_path / "seen" / "ted").exists()
+    forward = backbones.Backbone.forward
+    monkeypatch.setattr(
+        backbones.Backbone, "forward", lambda self, given: shown.append(len(given)) or forward(self, given)
+    )
+    embed(own, tmp_path / "seen")
+    assert 0 < sum(shown) - 2 < 240 - 80  # beside the two black frames that tell the size of maps
+    embed(own, tmp_path / "whole")
+    (one, _), (other, _) = (load_ted(tmp_path / name / "ted") for name in ("seen", "whole"))
+    assert torch.equal(one["observation"], other["observation"])
+
+
+def test_a_task_with_embeddings_of_its_own_takes_several_sources(tmp_path):
+    pytest.importorskip("pyarrow")
+    robot, hand = (write(tmp_path / who, who) for who in ("robot", "hand"))
+    recordings, task = read_sources([robot, hand], get_task("scooping"))
+    fitted = Projection.fit(torch.randn(200, 144, generator=torch.Generator().manual_seed(0)), 96)
+    fitted.about = {**embedder_of(8).identity}
+    embed_recordings(recordings, task, tmp_path / "both", network=OWN, projection=fitted)
+    data, about = load_ted(tmp_path / "both" / "ted")[0], read_about(tmp_path / "both" / "ted")
+    assert about["lengths"] == [6, 7, 6, 7] and about["labelled_steps"] == 13 and about["task"] == "scooping"
+    assert data["has_action"][:13].all() and not data["has_action"][13:].any()
+    wanted = load_encoder(tmp_path / "both" / "cameras" / "third_person.safetensors")
+    frames = torch.from_numpy(episode("robot").frames)
+    torch.testing.assert_close(data["observation"][:6, :96], wanted.embed(frames)[:6], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(data["observation"][:6, 96:], episode("robot").state[:6], rtol=1e-6)
+
+
+def embedder_of(size):
+    from torchrl_koap.vision import FrozenImageEncoder, load_backbone
+
+    return FrozenImageEncoder(load_backbone(OWN), size=size)
+
+
+def test_bad_data_are_refused_by_camera_trajectory_and_frame(tmp_path):
+    own = write_own(tmp_path)
+    file = tmp_path / "raw" / "07" / "top.npy"
+    frames = np.load(file)
+    np.save(file, frames[:, :8])
+    with pytest.raises(DataError, match=r"camera 'top' of 7 cannot be used: frame 0 is 8 x 24, .* others are 16 x 24"):
+        embed(own, tmp_path / "seen")
+    np.save(file, frames[:12])
+    with pytest.raises(DataError, match=r"camera 'top' of 7 cannot be used: frame 12 is missing: .* has 12"):
+        embed(own, tmp_path / "seen")
+    assert not (tmp_path / "seen" / "ted").exists()
+    with pytest.raises(ValueError, match="one projection cannot be for 2 cameras"):
+        embed(own, tmp_path / "seen", projection=Projection(torch.zeros(4), torch.zeros(4, 2)))
+    with pytest.raises(DataError, match="`koap convert` it, or name its --task"):
+        read_sources([tmp_path / "raw"], None)
+    plain = save_demonstrations(tmp_path / "plain", [np.random.rand(9, 2)], control_hz=10, action_dim=1)
+    with pytest.raises(DataError, match="there are no cameras"):
+        embed(plain, tmp_path / "seen")
+    with pytest.raises(DataError, match="its columns are state_0, state_1, state_2"):
+        other = save_demonstrations(tmp_path / "other", [np.random.rand(9, 3)], control_hz=10, action_dim=2)
+        read_sources([own, other], None)

@@ -1,0 +1,66 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a robot gives, with frames, as the observation that a policy reads: columns in order, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.tasks import Action, Task
+from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, load_backbone, load_encoder
+
+OWN = "tiny_network:random_layer"
+FRAME = np.random.default_rng(0).integers(0, 256, (16, 24, 3), dtype=np.uint8)
+
+
+def make(hidden=()):
+    parts = {"top": 3, "joints": 2, "wrist": 4, "cup": ("x", "y")}
+    task = Task(name="arm", observation_parts=parts, actions={"a": Action("m")}, position="cup", hidden=hidden)
+    about = FrozenImageEncoder(load_backbone(OWN), size=(16, 24)).identity
+    cameras = {
+        name: Projection(torch.zeros(144), torch.randn(144, width), about)
+        for name, width in {"top": 3, "wrist": 4}.items()
+    }
+    return Observer(task, cameras), cameras
+
+
+def test_columns_are_those_of_the_task():
+    observe, cameras = make()
+    seen = observe({"wrist": FRAME[::-1], "state": [1.0, 2.0, 3.0, 4.0], "top": FRAME})
+    assert seen.shape == (11,) and seen[[3, 4, 9, 10]].tolist() == [1, 2, 3, 4]
+    for name, columns, frame in (("top", slice(0, 3), FRAME), ("wrist", slice(5, 9), FRAME[::-1].copy())):
+        torch.testing.assert_close(seen[columns], load_encoder(cameras[name]).embed(torch.from_numpy(frame)))
+    several = {name: np.stack([frame] * 2) for name, frame in {"top": FRAME, "wrist": FRAME[::-1]}.items()}
+    torch.testing.assert_close(observe({"state": np.array([[1.0, 2, 3, 4]] * 2), **several})[1].float(), seen)
+    assert observe(observe.example()).shape == (11,) and observe.example()["top"].shape == (16, 24, 3)
+
+
+def test_numbers_that_no_policy_sees_may_be_left_out():
+    observe, _ = make(hidden=("joints", "cup"))
+    assert observe({"top": FRAME, "wrist": FRAME})[3:5].tolist() == [0, 0]
+    with pytest.raises(ValueError, match="has no 'state': wanted state, top, wrist, got top, wrist"):
+        make()[0]({"top": FRAME, "wrist": FRAME})
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"wrst": FRAME}, "has an unknown 'wrst': wanted state, top, wrist"),
+        ({"state": np.zeros(3)}, r"'state' must be \[4\] beside these frames, got \[3\]"),
+        ({"top": FRAME[..., :1]}, "the frame of camera 'top' is greyscale"),
+        ({"top": FRAME / 255}, "the frame of camera 'top' is float64, wanted uint8"),
+        ({"wrist": np.dstack([FRAME, FRAME[..., :1]])}, "the frame of camera 'wrist' is RGBA"),
+        ({"top": FRAME.transpose(2, 0, 1)}, "put the colours last"),
+    ],
+)
+def test_other_entries_are_refused(change, says):
+    with pytest.raises(ValueError, match=says):
+        make()[0]({"state": np.zeros(4), "top": FRAME, "wrist": FRAME} | change)
+
+
+def test_a_camera_needs_its_part_of_the_task():
+    observe, cameras = make()
+    task = Task(name="arm", observation_parts={"top": 3, "x": 1}, actions={"a": Action("m")}, position="x")
+    with pytest.raises(ValueError, match="camera 'wrist' has embeddings of 4 columns, task 'arm' has none"):
+        Observer(task, cameras)

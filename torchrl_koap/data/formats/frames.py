@@ -1,0 +1,330 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Camera frames where they lie: convert keeps references, and pictures are read when they are embedded.
+
+::
+
+    recordings/run_000.npz              a trajectory, and beside it a folder of its name with its cameras:
+    recordings/run_000/top/000000.png   a picture per row, the names end in their numbers (PNG or JPEG), or
+    recordings/run_000/top.npy          uint8 [T, H, W, 3]
+    recordings/run_000/top_times.npy    optional, in s on the clock of the rows: a row takes the nearest frame
+
+HDF5 files hold ``[T, H, W, 3]`` beside the numbers, LeRobot data sets pictures in parquet, or videos (extra ``video``).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchrl_koap.data.formats.arrow import import_pyarrow
+from torchrl_koap.files import DataError, read_bytes, some
+
+if TYPE_CHECKING:
+    from torchrl_koap.data.formats.columns import Piece
+
+PICTURES = (".png", ".jpg", ".jpeg")
+TIMES = "_times.npy"
+LATE = 1.5  # usual steps of a camera's clock that a frame may lie away from its row
+_COLOURS = {1: "greyscale", 2: "greyscale with alpha", 4: "RGBA"}
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Where the frames of one camera in one trajectory lie.
+
+    Args:
+        file (str): a folder of pictures, an array (``*.npy``), an HDF5 file, a parquet file, or a video.
+        numbers (tuple of int): for every row the number of its frame, in the file's own count.
+        entry (str): data set of an HDF5 file, or column of a parquet file.
+        episode (int): episode of a parquet file, which may hold several.
+
+    Examples:
+        >>> from torchrl_koap.data.formats.frames import Clip
+        >>> Clip("run/top.npy", (0, 1, 2, 3)).take([1, 3]).numbers
+        (1, 3)
+    """
+
+    file: str
+    numbers: tuple[int, ...]
+    entry: str = ""
+    episode: int = 0
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def take(self, rows: Sequence[int] | np.ndarray) -> Clip:
+        """Selects the frames of some rows."""
+        return replace(self, numbers=tuple(self.numbers[row] for row in rows))
+
+    def read(self, size: Sequence[int] | None = None) -> Iterator[np.ndarray]:
+        """Yields the frames, uint8 ``[H, W, 3]``.
+
+        Args:
+            size (sequence of int, optional): height and width that they must have. Default: those of the first one.
+
+        Raises:
+            ValueError: for a frame that is missing, damaged, of another size or type; the message begins with it.
+            RuntimeError: if an extra is missing that reads them.
+        """
+        suffix = Path(self.file).suffix
+        read = _READERS.get("folder" if Path(self.file).is_dir() else suffix, _video)
+        if not Path(self.file).exists():
+            raise ValueError(f"frame {self.numbers[0]}: {self.file} is not there (any more): convert the data again")
+        for number, frame in zip(self.numbers, read(self), strict=True):
+            fault = fault_of(frame, size)
+            if fault is not None:
+                raise ValueError(f"frame {number} {fault}")
+            size = frame.shape[:2]
+            yield frame
+
+
+def stored_clips(notes: Mapping[str, Any]) -> dict[str, list[Clip]]:
+    """Reads the references in the notes of a data set, by camera for every trajectory."""
+    return {
+        name: [Clip(**clip | {"numbers": tuple(clip["numbers"])}) for clip in clips]
+        for name, clips in notes.get("cameras", {}).items()
+    }
+
+
+def fault_of(frame: np.ndarray, size: Sequence[int] | None = None) -> str | None:
+    """Says what is wrong with a picture, and what would do; None if it is uint8 ``[H, W, 3]`` of the size.
+
+    Args:
+        frame (np.ndarray): the picture.
+        size (sequence of int, optional): height and width that it must have.
+    """
+    shape = list(frame.shape)
+    channels = 1 if len(shape) == 2 else shape[-1] if len(shape) == 3 else 0
+    if channels in _COLOURS:
+        return f"is {_COLOURS[channels]} {shape}, wanted three colours [H, W, 3]: save it as RGB"
+    if channels != 3:
+        turned = "put the colours last" if shape[:1] == [3] else "a frame is one picture"
+        return f"has shape {shape}, wanted [H, W, 3]: {turned}"
+    if frame.dtype != np.uint8:
+        return f"is {frame.dtype}, wanted uint8 in 0 to 255: scale and round it"
+    if size is not None and tuple(shape[:2]) != tuple(size):
+        height, width = size
+        return f"is {shape[0]} x {shape[1]}, the camera's others are {height} x {width}: bring all to one size"
+    return None
+
+
+def _folder(clip: Clip) -> Iterator[np.ndarray]:
+    files = _numbered(Path(clip.file))
+    for number in clip.numbers:
+        if number not in files:
+            raise ValueError(f"frame {number} is missing in {clip.file}")
+        yield _decode(read_bytes(files[number]), f"{number} ({files[number].name})")
+
+
+def _decode(content: bytes, what: object) -> np.ndarray:
+    from PIL import Image
+
+    try:
+        image = Image.open(io.BytesIO(content))
+        return np.asarray(image.convert("RGB") if image.mode == "P" else image)
+    except Exception as error:  # what a damaged picture makes of a decoder
+        raise ValueError(f"frame {what} is no picture that can be read: {error}") from None
+
+
+def _array(clip: Clip) -> Iterator[np.ndarray]:
+    frames = np.load(clip.file, mmap_mode="r", allow_pickle=False)
+    for number in clip.numbers:
+        if number >= len(frames):
+            raise ValueError(f"frame {number} is missing: {clip.file} has {len(frames)}")
+        yield frames[number]
+
+
+def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
+    import h5py
+
+    with h5py.File(clip.file, "r") as stream:
+        frames, behind = stream[clip.entry], clip.entry.replace("/obs/", "/next_obs/")
+        for number in clip.numbers:  # the one behind the last is that of the observation that followed
+            yield frames[number] if number < len(frames) else stream[behind][-1]
+
+
+def _parquet(clip: Clip) -> Iterator[np.ndarray]:
+    read, filters = import_pyarrow().parquet, [("episode_index", "=", clip.episode)]
+    if clip.entry not in read.read_schema(clip.file).names:
+        raise ValueError(f"frame {clip.numbers[0]} is missing: {clip.file} has no column {clip.entry!r}")
+    table = read.read_table(clip.file, columns=["frame_index", clip.entry], filters=filters)
+    cells = dict(zip(table["frame_index"].to_pylist(), table[clip.entry].to_pylist(), strict=True))
+    for number in clip.numbers:
+        content = cells.get(number)
+        content = content.get("bytes") if isinstance(content, dict) else None
+        if not isinstance(content, bytes):
+            raise ValueError(f"frame {number} is missing: column {clip.entry!r} has no picture in its row")
+        yield _decode(content, number)
+
+
+def _video(clip: Clip) -> Iterator[np.ndarray]:
+    """Frames by the time at which they are shown, from the key frame before the first one."""
+    if importlib.util.find_spec("av") is None:
+        raise RuntimeError("videos are read with an extra: pip install 'torchrl_koap[video]'")
+    import av
+
+    try:
+        with av.open(clip.file) as container:
+            yield from _shown(clip, container, container.streams.video[0])
+    except (av.FFmpegError, IndexError) as error:
+        raise ValueError(
+            f"frame {clip.numbers[0]}: PyAV cannot decode {clip.file} ({error}): encode it anew, such as by ffmpeg -i"
+            " OLD -c:v libx264 NEW.mp4"
+        ) from error
+
+
+def _shown(clip: Clip, container: Any, stream: Any) -> Iterator[np.ndarray]:
+    rate, base = float(stream.average_rate), stream.time_base
+    container.seek(int(min(clip.numbers) / rate / base), stream=stream)
+    coming = ((round(float(frame.pts * base) * rate), frame) for frame in container.decode(stream))
+    place, frame = next(coming, (-1, None))
+    for number in clip.numbers:
+        while frame is not None and place < number:
+            place, frame = next(coming, (place, None))
+        if frame is None:
+            raise ValueError(f"frame {number} is missing: {clip.file} ends with frame {place}")
+        yield frame.to_ndarray(format="rgb24")
+
+
+_READERS = {
+    "folder": _folder,
+    ".npy": _array,
+    ".hdf5": _hdf5,
+    ".h5": _hdf5,
+    ".parquet": _parquet,
+}
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Pictures of a folder by the number in which their names end."""
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in PICTURES:
+            digits = re.search(r"\d+$", path.stem)
+            if digits is None or int(digits[0]) in found:
+                raise ValueError(f"{path} must end in a number of its own")
+            found[int(digits[0])] = path
+    return found
+
+
+def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
+    """Finds the cameras of a table in the folder of its name.
+
+    Args:
+        file (Path): the table.
+        clock (np.ndarray, optional): time of every row in s.
+
+    Raises:
+        ValueError: if frames are missing or their times cannot be used; the message names the camera.
+    """
+    folder = file.with_suffix("")
+    found: dict[str, Clip] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if path.is_dir() and _numbered(path):
+            name, held = path.name, sorted(_numbered(path))
+        elif path.suffix == ".npy" and not path.name.endswith(TIMES):
+            frames = np.load(path, mmap_mode="r", allow_pickle=False)
+            name, held = path.stem, list(range(len(frames)))
+        else:
+            continue
+        times = folder / f"{name}{TIMES}"
+        if times.is_file():
+            stamps = np.load(times, allow_pickle=False)
+            if clock is None or stamps.shape != (len(held),):
+                lacks = "the table has no clock" if clock is None else f"it has {list(stamps.shape)} times"
+                raise ValueError(f"camera {name!r}: {times.name} is for {len(held)} frames and a clock, {lacks}")
+            held = [held[index] for index in _nearest(stamps, clock, name)]
+        elif held != list(range(held[0], held[0] + len(held))):
+            absent = sorted({*range(held[0], held[-1])} - {*held})
+            raise ValueError(f"camera {name!r}: frame {some([str(number) for number in absent])} is missing")
+        found[name] = Clip(str(path.resolve()), tuple(held))
+    return found
+
+
+def _nearest(stamps: np.ndarray, clock: np.ndarray, camera: str) -> np.ndarray:
+    """For every row the frame that is nearest in time."""
+    after = np.searchsorted(stamps, clock).clip(1, len(stamps) - 1)
+    nearest = np.where(clock - stamps[after - 1] <= stamps[after] - clock, after - 1, after)
+    off, most = np.abs(stamps[nearest] - clock), LATE * float(np.median(np.diff(stamps)))
+    if off.max() > most:
+        row = int(off.argmax())
+        raise ValueError(
+            f"camera {camera!r}: no frame for row {row} at {clock[row]:.4g} s, the nearest is {off[row]:.3g} s away"
+        )
+    return nearest
+
+
+def lerobot_clips(
+    root: str | Path, info: Mapping[str, Any], cameras: Sequence[str], rows: Mapping[int, Mapping[str, Any]]
+) -> dict[int, dict[str, Clip]]:
+    """Says of every episode of a LeRobot data set where the frames of its cameras lie.
+
+    Args:
+        root (str or Path): the data set.
+        info (mapping): its description.
+        cameras (sequence of str): features of frames. One whose videos are nowhere is left out.
+        rows (mapping): of every episode its ``file``, its ``frame_index`` ``[T]`` and perhaps ``timestamp`` ``[T, 1]``.
+    """
+    found: dict[int, dict[str, Clip]] = {number: {} for number in rows}
+    for camera in cameras:
+        name, video = camera.split(".")[-1], info["features"][camera].get("dtype") == "video"
+        begins = _video_starts(Path(root), camera) if video else {}
+        for number, columns in rows.items():
+            if not video:
+                counted = tuple(columns["frame_index"].astype(int).tolist())
+                found[number][name] = Clip(str(Path(columns["file"]).resolve()), counted, camera, number)
+                continue
+            size = int(info.get("chunks_size") or 1000)
+            names = {"video_key": camera, "episode_index": number, "episode_chunk": number // size}
+            chunk, file, start = begins.get(number, (0, 0, 0.0))
+            path = Path(root) / str(info.get("video_path")).format(**names, chunk_index=chunk, file_index=file)
+            if path.is_file():
+                fps, stamps = float(info["fps"]), columns.get("timestamp", np.full((1, 1), np.nan))[:, 0]
+                shown = stamps * fps if np.isfinite(stamps).all() else columns["frame_index"]
+                numbers = np.round(shown + start * fps).astype(int)
+                found[number][name] = Clip(str(path.resolve()), tuple(numbers.tolist()))
+    return found
+
+
+def _video_starts(root: Path, camera: str) -> dict[int, tuple[int, int, float]]:
+    """Of every episode chunk and file of its video, and where it begins in it (s); empty before format 3.0."""
+    columns = [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    found = {}
+    for file in (root / "meta/episodes").rglob("*.parquet"):
+        table = import_pyarrow().parquet.read_table(file)
+        if set(columns) <= set(table.column_names):
+            for row in table.select(["episode_index", *columns]).to_pylist():
+                found[row["episode_index"]] = tuple(row[column] for column in columns)
+    return found
+
+
+def check_cameras(pieces: Sequence[Piece], source: str) -> None:
+    """Checks that every trajectory has every camera, and a frame per row.
+
+    Args:
+        pieces (sequence of Piece): what was found.
+        source (str): what messages call the whole.
+
+    Raises:
+        DataError: with all that is missing.
+    """
+    names = dict.fromkeys(name for piece in pieces for name in piece.cameras)
+    problems = []
+    for name in names:
+        cure = f"record them, or leave the camera out with drop_columns {name}"
+        absent = [piece.name for piece in pieces if name not in piece.cameras]
+        if absent:
+            problems.append(f"camera {name!r} has no frames in {some(absent)}: {cure}")
+        for piece in pieces:
+            clip, rows = piece.cameras.get(name), len(next(iter(piece.states.values()), ()))
+            if clip is not None and len(clip) != rows:
+                problems.append(f"{piece.name}: camera {name!r} has {len(clip)} frames for {rows} rows: {cure}")
+    if problems:
+        raise DataError(source, problems)

@@ -1,0 +1,262 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Data with camera frames as data with embeddings, which ``koap train --dataset`` takes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted, stored_task
+from torchrl_koap.data.formats import Recordings
+from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.files import DataError, replacing_file
+from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks import Task
+from torchrl_koap.vision.backbones import load_backbone
+from torchrl_koap.vision.encoder import BATCH, FrozenImageEncoder
+from torchrl_koap.vision.projection import CAMERAS, Projection, load_encoder
+
+MOST = 4000  # frames that components are fitted to
+HELD_OUT = 10  # one trajectory in so many judges them
+
+
+@dataclass(frozen=True)
+class CameraReport:
+    """How well embeddings hold what a camera saw.
+
+    Args:
+        size (tuple of int): height and width of its frames.
+        components (int): columns of an embedding.
+        kept (float): share of the variance of the features that they keep, on trajectories that they were not fitted
+            to.
+        error (float): what reconstructed features are off, over the features' spread.
+        rate (float): frames that were embedded in a second; NaN where all of them had been before.
+    """
+
+    size: tuple[int, int]
+    components: int
+    kept: float
+    error: float
+    rate: float
+
+    def __str__(self) -> str:
+        speed = "embedded before" if np.isnan(self.rate) else f"{self.rate:.0f} frames a second"
+        return (
+            f"{self.size[0]} x {self.size[1]}, {self.components} components keep {self.kept:.1%} of the variance,"
+            f" reconstruction error {self.error:.2f} of the spread, {speed}"
+        )
+
+
+def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Recordings, Task]:
+    """Reads data sets with camera frames as one, and the task that they are of.
+
+    Args:
+        sources (sequence of str or Path): what ``koap convert`` wrote; where a task is given, any recordings.
+        task (Task, optional): a task that has the embeddings among its columns. Default: that of the first source.
+
+    Raises:
+        DataError: if the columns of two sources differ, or one is not converted.
+    """
+    found = []
+    for source in sources:
+        stored = stored_folder(source)
+        if stored is None and task is None and Path(source).exists():
+            raise DataError(source, "it does not say what its columns are for: `koap convert` it, or name its --task")
+        asked = {} if stored is not None or task is None else {"action_dim": task.action_dim}
+        found.append(read_recordings(source, **asked))
+    return join_recordings(found), task or stored_task(stored_folder(sources[0]) or sources[0])
+
+
+def join_recordings(parts: Sequence[Recordings]) -> Recordings:
+    """Lays recordings with the same columns one after the other, with the cameras that all of them have.
+
+    Raises:
+        DataError: if the columns of two of them differ.
+    """
+    first = parts[0]
+    for other in parts[1:]:
+        if other.state_names != first.state_names or other.actions[0].shape[1] != first.actions[0].shape[1]:
+            columns = "; those of the first ".join(", ".join(part.state_names) for part in (other, first))
+            raise DataError(f"the source of {other.sources[0]}", f"its columns are {columns}")
+    shared = [name for name in first.cameras if all(name in other.cameras for other in parts)]
+    return replace(
+        first,
+        states=[states for part in parts for states in part.states],
+        actions=[steps for part in parts for steps in part.actions],
+        sources=tuple(name for part in parts for name in part.sources),
+        cameras={name: [clip for part in parts for clip in part.cameras[name]] for name in shared},
+    )
+
+
+def embed_recordings(
+    recordings: Recordings,
+    task: Task,
+    out: str | Path,
+    *,
+    cameras: Sequence[str] = (),
+    network: str | Path | None = None,
+    components: int = 64,
+    projection: Projection | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, CameraReport]:
+    """Writes recordings with the embeddings of their frames into ``out/ted``, and projections into ``out/cameras``.
+
+    A camera that is a part of the task's observation fills it. Embeddings of any other one are further columns, which
+    are not the robot's. Features lie in ``out/unfinished`` until all is done, so that the same call goes on.
+
+    Args:
+        recordings (Recordings): with the columns of the task that are no embeddings.
+        task (Task): what they are of.
+        out (str or Path): folder to write.
+
+    Keyword Args:
+        cameras (sequence of str): which of them. Default: all.
+        network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`.
+        components (int): principal components per camera, fitted to frames of nine trajectories in ten; a part of the
+            task has its own number.
+        projection (Projection, optional): take this one instead of fitting; for a single camera.
+        progress (callable, optional): called with the number of frames that are done, and that of all.
+
+    Returns:
+        dict: how well the embeddings of every camera hold its frames.
+
+    Raises:
+        DataError: if there are no frames, or some are missing, damaged or unlike the others; camera, trajectory and
+            frame are named.
+        ValueError: for an unknown camera, or more components than frames or features.
+        WeightsError: if weights are missing or others than those of the projection.
+    """
+    out, chosen = Path(out), list(cameras) or list(recordings.cameras)
+    if not chosen:
+        raise DataError(out, "there are no cameras: the data have no frames, or were converted before these were kept")
+    for name in chosen:
+        lookup(recordings.cameras, name, "camera")
+    if projection is not None and len(chosen) > 1:
+        raise ValueError(f"one projection cannot be for {len(chosen)} cameras: name one of {', '.join(chosen)}")
+    given = None if projection is None else load_encoder(projection, network)
+    backbone = load_backbone(network) if given is None else given.backbone
+    total, done = len(chosen) * sum(map(len, recordings.states)), 0
+    embedded: dict[str, list[Tensor]] = {}
+    reports, projections = {}, {}
+    for name in chosen:
+        size = next(_read(recordings, name, 0)).shape[:2]
+        encoder = FrozenImageEncoder(backbone, size=size) if given is None else given
+        film = _Film(name, recordings, encoder, out / "unfinished")
+        for count in film.embed():
+            done += count
+            if progress is not None:
+                progress(done, total)
+        width = task.observation[name].stop - task.observation[name].start if name in task.observation else components
+        fitted = film.fit(width) if projection is None else projection
+        fitted.save(out / CAMERAS / f"{name}.safetensors")
+        projections[name] = fitted = Projection.load(out / CAMERAS / f"{name}.safetensors")  # as it is used
+        reports[name] = film.report(fitted)
+        embedded[name] = [fitted(features) for features in film.features()]
+    task, states = _with_columns(task, recordings, embedded)
+    data = flatten_trajectories(states, recordings.actions, action_dim=task.action_dim)
+    save_ted(data, out / "ted", task, {"embedded": chosen, "network": backbone.name})
+    shutil.rmtree(out / "unfinished")
+    return reports
+
+
+def _with_columns(
+    task: Task, recordings: Recordings, embedded: Mapping[str, Sequence[Tensor]]
+) -> tuple[Task, list[np.ndarray]]:
+    """The task with the embeddings among its parts, and its observations."""
+    further = {name: films[0].shape[1] for name, films in embedded.items() if name not in task.observation}
+    if further:
+        task = replace(
+            task,
+            observation_parts={**task.observation_parts, **further},
+            observation_units=(task.observation_units or ("",) * task.observation_dim) + ("",) * sum(further.values()),
+            state={**task.state, **dict.fromkeys(further, "plain")} if task.state else {},
+            robot=task.robot or tuple(range(task.state_dim)),
+        )
+    own = {name: part.stop - part.start for name, part in task.observation.items() if name not in embedded}
+    if sum(own.values()) != recordings.states[0].shape[1]:
+        raise DataError(
+            f"task {task.name!r}",
+            f"it has {sum(own.values())} columns beside the embeddings ({', '.join(own)}), the data have"
+            f" {recordings.states[0].shape[1]}: {', '.join(recordings.state_names)}",
+        )
+    ends = np.cumsum(list(own.values()))[:-1]
+    columns = [dict(zip(own, np.split(states, ends, 1), strict=True)) for states in recordings.states]
+    seen = [
+        np.concatenate([embedded[name][index] if name in embedded else parts[name] for name in task.observation], 1)
+        for index, parts in enumerate(columns)
+    ]
+    return task, seen
+
+
+def _read(recordings: Recordings, camera: str, index: int, size: Sequence[int] | None = None) -> Iterator[np.ndarray]:
+    try:
+        yield from recordings.cameras[camera][index].read(size)
+    except (ValueError, OSError, KeyError) as error:
+        raise DataError(f"camera {camera!r} of {recordings.sources[index]}", str(error)) from error
+
+
+class _Film:
+    """What one camera saw in all trajectories, as features in files."""
+
+    def __init__(self, camera: str, recordings: Recordings, encoder: FrozenImageEncoder, folder: Path):
+        self.camera, self.recordings, self.encoder = camera, recordings, encoder
+        self.clips = recordings.cameras[camera]
+        about = [encoder.identity, [asdict(clip) for clip in self.clips]]
+        key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+        self._folder, self._frames, self._seconds = folder / f"{camera}-{key}", 0, 0.0
+
+    def _file(self, index: int) -> Path:
+        return self._folder / f"{index:06d}.safetensors"
+
+    def embed(self) -> Iterator[int]:
+        """Writes the features of trajectories that lack them; yields numbers of frames as they are done."""
+        for index, clip in enumerate(self.clips):
+            if self._file(index).is_file():
+                yield len(clip)
+                continue
+            found, frames = [], _read(self.recordings, self.camera, index, self.encoder.size)
+            while part := list(islice(frames, BATCH)):
+                began = time.perf_counter()
+                found.append(self.encoder.features(torch.from_numpy(np.stack(part))))
+                self._frames, self._seconds = self._frames + len(part), self._seconds + time.perf_counter() - began
+                yield len(part)
+            with replacing_file(self._file(index)) as aside:
+                save_file({"features": torch.cat(found)}, aside)
+
+    def features(self) -> Iterator[Tensor]:
+        """Features ``[T, F]`` of every trajectory."""
+        for index in range(len(self.clips)):
+            yield load_file(self._file(index))["features"]
+
+    def _sample(self, held_out: bool) -> Tensor:
+        """Features of up to so many frames, spread evenly."""
+        apart = len(self.clips) >= HELD_OUT
+        rows = [
+            index for index in range(len(self.clips)) if not apart or (index % HELD_OUT == HELD_OUT - 1) == held_out
+        ]
+        every = max(1, -(-sum(len(self.clips[index]) for index in rows) // MOST))
+        return torch.cat([load_file(self._file(index))["features"][index % every :: every] for index in rows])
+
+    def fit(self, components: int) -> Projection:
+        """Principal components of the features."""
+        fitted = Projection.fit(self._sample(held_out=False), components)
+        fitted.about = self.encoder.identity
+        return fitted
+
+    def report(self, projection: Projection) -> CameraReport:
+        """How much of the frames they keep that they were not fitted to."""
+        kept, error = projection.kept(self._sample(held_out=True))
+        rate = self._frames / self._seconds if self._frames else float("nan")
+        height, width = self.encoder.size
+        return CameraReport((height, width), projection.dim, kept, error, rate)

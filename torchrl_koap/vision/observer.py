@@ -1,0 +1,100 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a robot gives, numbers and camera frames, as the observation that a policy was trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_koap.data.formats.frames import fault_of
+from torchrl_koap.tasks import Task
+from torchrl_koap.vision.encoder import FrozenImageEncoder
+from torchrl_koap.vision.projection import Projection, load_encoder
+
+STATE = "state"
+
+
+class Observer:
+    """Lays the numbers of a robot and the embeddings of its frames side by side, as the task's columns are.
+
+    Args:
+        task (Task): whose observation; a part with the name of a camera is that camera's embedding.
+        cameras (mapping): projection of every camera; its network is loaded with the first frame.
+
+    Raises:
+        ValueError: if the task has no part of a camera's name and size. In use, for entries that are missing, unknown,
+            of another width or no frames.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap import Trained
+        >>> observe = Trained.load("runs/arm").policy().observe  # doctest: +SKIP
+        >>> observe({"state": np.zeros(7), "top": np.zeros((96, 96, 3), np.uint8)}).shape  # doctest: +SKIP
+        torch.Size([71])
+    """
+
+    def __init__(self, task: Task, cameras: Mapping[str, Projection]):
+        self.cameras = dict(cameras)
+        self._widths = {name: part.stop - part.start for name, part in task.observation.items()}
+        self._hidden = set(task.hidden)
+        for name, projection in cameras.items():
+            if self._widths.get(name) != projection.dim:
+                raise ValueError(
+                    f"camera {name!r} has embeddings of {projection.dim} columns, task {task.name!r} has"
+                    f" {self._widths.get(name, 'none')} of that name"
+                )
+        self._encoders: dict[str, FrozenImageEncoder] = {}
+
+    @classmethod
+    def of(cls, task: Task, cameras: Mapping[str, Projection]) -> Observer | None:
+        """Makes one where there are cameras, else None."""
+        return cls(task, cameras) if cameras else None
+
+    @property
+    def state_dim(self) -> int:
+        """Number of observation columns that are no embedding."""
+        return sum(width for name, width in self._widths.items() if name not in self.cameras)
+
+    def example(self) -> dict[str, np.ndarray]:
+        """Zeros and black frames, as a robot gives them."""
+        sides = {name: [int(side) for side in each.about["size"].split("x")] for name, each in self.cameras.items()}
+        black = {name: np.zeros((*(size * 2)[:2], 3), np.uint8) for name, size in sides.items()}
+        return {STATE: np.zeros(self.state_dim, np.float32), **black}
+
+    def __call__(self, given: Mapping[str, Any]) -> Tensor:
+        """Computes observations ``[*B, obs]``.
+
+        Args:
+            given (mapping): ``"state"``, the columns that are no embedding ``[*B, d]``, left out where the policy sees
+                none of them; and a frame of every camera by its name, uint8 ``[*B, H, W, 3]``.
+        """
+        numbers = {name: width for name, width in self._widths.items() if name not in self.cameras}
+        wanted = [*([STATE] if numbers else []), *self.cameras]
+        needed = [name for name in wanted if name != STATE or not set(numbers) <= self._hidden]
+        missing = [name for name in needed if name not in given]
+        unknown = [name for name in given if name not in wanted]
+        if missing or unknown:
+            what = f"has no {missing[0]!r}" if missing else f"has an unknown {unknown[0]!r}"
+            raise ValueError(f"the observation {what}: wanted {', '.join(wanted)}, got {', '.join(map(str, given))}")
+        seen = {name: self._embedded(name, given[name]) for name in self.cameras}
+        batch = next(iter(seen.values())).shape[:-1]
+        state = torch.as_tensor(given.get(STATE, np.zeros((*batch, self.state_dim), np.float32)))
+        if state.shape != (*batch, self.state_dim):
+            raise ValueError(f"'state' must be {[*batch, self.state_dim]} beside these frames, got {list(state.shape)}")
+        seen |= dict(zip(numbers, state.split(list(numbers.values()), -1), strict=True))
+        dtype = torch.promote_types(state.dtype, torch.float32)
+        return torch.cat([seen[name].to(dtype) for name in self._widths], -1)
+
+    def _embedded(self, name: str, frames: Any) -> Tensor:
+        """Embeddings ``[*B, d]`` of one camera's frames."""
+        given = frames.cpu().numpy() if isinstance(frames, Tensor) else np.asarray(frames)
+        fault = fault_of(given if given.ndim < 4 else given[(0,) * (given.ndim - 3)])
+        if fault is not None:
+            raise ValueError(f"the frame of camera {name!r} {fault}")
+        if name not in self._encoders:
+            self._encoders[name] = load_encoder(self.cameras[name])
+        return self._encoders[name].embed(torch.from_numpy(np.ascontiguousarray(given)))
