@@ -8,8 +8,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load, save
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import nn
 
 from torchrl_koap.modules import Normalizer
@@ -138,15 +136,6 @@ def test_without_statistics_nothing_changes_until_they_are_loaded():
     assert torch.equal(policy(x), trained(x))
 
 
-def test_module_in_a_tensordict():
-    values = torch.randn(20, 3)
-    module = TensorDictModule(Normalizer.fit(values), in_keys=["state"], out_keys=[("scaled", "state")])
-    out = module(TensorDict({"state": values.reshape(4, 5, 3)}, [4, 5]))
-    assert out["scaled", "state"].shape == (4, 5, 3)
-    assert out["scaled", "state"].abs().max() <= 1 + 1e-6
-    assert not list(module.parameters())
-
-
 def test_gradients_and_types_follow_the_argument():
     normalizer = Normalizer.fit(torch.tensor([[0.0], [4.0]]))
     x = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
@@ -155,13 +144,6 @@ def test_gradients_and_types_follow_the_argument():
     y.sum().backward()
     assert x.grad.item() == 0.5
     assert normalizer.double().offset.dtype == torch.float64
-
-
-def test_compiles_without_breaks():
-    normalizer = Normalizer.fit(torch.rand(9, 2))
-    compiled = torch.compile(normalizer, fullgraph=True, backend="eager")
-    x = torch.rand(4, 2)
-    assert torch.equal(compiled(x), normalizer(x))
 
 
 def test_shared_keeps_how_much_larger_one_column_is_than_another():

@@ -21,16 +21,15 @@ from torchrl_koap.modules.execution.policy import PlanningPolicy
 from torchrl_koap.modules.execution.policy_env import PolicyEnv, policy_transforms
 from torchrl_koap.modules.execution.response_model import ResponseModel
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import (
     LatentActionFourier,
     LatentActionLSTM,
     LatentActionMLP,
     LatentActionModule,
+    LinearActionDecoder,
 )
-from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.koopman.operator import KoopmanOperator
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.denoisers import MLPDenoiser

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import inverse_dynamics_test_base as base
 import pytest
 import torch
@@ -68,15 +66,6 @@ def test_inference_is_normalise_infer_decode_denormalise():
         model.normalize_action(td["action"], state)[..., 1:, :],
         model.action_decoder.linear(td["latent_action"])[..., 1:, :],
     )
-
-
-def test_without_normalisers_nothing_is_scaled():
-    model, state = make_model(normalizers=False), windows(4)
-    assert model.in_keys == ["state"] and model.out_keys == ["latent_action", "action"]
-    assert torch.equal(model.normalize_state(state), state)
-    td = model(TensorDict({"state": state}, [4]))
-    assert set(td.keys()) == {"state", "latent_action", "action"}
-    torch.testing.assert_close(td["action"], model.action_decoder.linear(td["latent_action"]))
 
 
 class TestKoopmanInverseDynamics(InverseDynamicsTestBase):
@@ -211,14 +200,6 @@ def test_normalisers_never_see_an_action_outside_the_mask():
         assert torch.equal(value, models[1].state_dict()[name]), name
 
 
-def test_scales_are_fitted_in_normalised_units():
-    model, state = make_model(), windows(100)
-    model.prepare(state)
-    x = model.normalize_state(state)
-    expected = (x[:, 4:9] - x[:, 1:6]).square().mean((0, 1)).sqrt()
-    torch.testing.assert_close(model.reader.scales[-1], expected)
-
-
 def test_bad_fits_are_explained():
     model = make_model()
     data, mask = labelled(4)
@@ -311,19 +292,6 @@ def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held()
 def test_parts_that_do_not_fit_are_refused(parts, message):
     with pytest.raises(ValueError, match=message):
         make_model(parts=parts)
-
-
-def test_statistics_travel_with_the_weights():
-    model, data = make_model(), labelled(20)
-    model.prepare(data[0]["state"])
-    model.fit_labels(*data)
-    state = windows(4)
-    expected = model(TensorDict({"state": state}, [4]))["action"]
-    other = make_model(seed=5, state_normalizer=Normalizer(3), action_normalizer=Normalizer(2))
-    other.load_state_dict(model.state_dict())
-    for restored in (other, copy.deepcopy(model)):
-        assert torch.equal(restored(TensorDict({"state": state}, [4]))["action"], expected)
-    assert len({value.data_ptr() for value in model.state_dict().values()}) == len(model.state_dict())  # each once
 
 
 def test_weights_are_drawn_anew():

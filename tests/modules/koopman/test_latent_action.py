@@ -9,8 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.modules import LatentActionFourier, LatentActionLSTM, LatentActionMLP
-from torchrl_koap.modules.koopman.latent_action import LatentActionModule
+from torchrl_koap.modules import LatentActionFourier, LatentActionLSTM, LatentActionMLP, LinearActionDecoder, ridge
 
 KINDS = [LatentActionMLP, LatentActionLSTM, LatentActionFourier]
 
@@ -45,20 +44,6 @@ def test_keys_and_wrong_width(kind):
         network.gather(windows(3, d=5))
 
 
-def test_the_base_infers_nothing():
-    with pytest.raises(NotImplementedError):
-        LatentActionModule(2, 3)(TensorDict({"state": windows(1)}, [1]))
-
-
-def test_absolute_frames_are_gathered_as_they_are():
-    network = LatentActionMLP(2, 3, num_past=1, look_ahead=(2, 4))
-    state = windows(3)
-    read = network.gather(state, range(1, 12))
-    for t in range(1, 12):
-        expected = torch.stack([state[:, t - 1], state[:, t], state[:, t + 2], state[:, t + 4]], 1)
-        assert torch.equal(read[:, t - 1], expected)
-
-
 def test_relative_latent_actions_of_a_shifted_window_differ_by_the_current_frame_alone():
     network = LatentActionFourier(2, 8, position_scale=1e9)
     state = windows(4)
@@ -66,18 +51,6 @@ def test_relative_latent_actions_of_a_shifted_window_differ_by_the_current_frame
     torch.testing.assert_close(network.infer(network.gather(state)), network.infer(network.gather(moved)))
     near = LatentActionFourier(2, 8, position_scale=1.0)
     assert not torch.allclose(near.infer(near.gather(state)), near.infer(near.gather(moved)), atol=1e-3)
-
-
-def test_a_window_too_short_leaves_the_scales_as_they_were():
-    network = LatentActionMLP(2, 3, relative=True)
-    network.prepare(windows(50))
-    before = network.reader.scales.clone()
-    with pytest.raises(ValueError, match="too short"):
-        network.prepare(windows(50, num_frames=5))
-    assert torch.equal(network.reader.scales, before) and not torch.equal(before, torch.ones_like(before))
-    absolute = LatentActionMLP(2, 3)
-    absolute.prepare(windows(50))
-    assert absolute.reader.scales is None and not any("scales" in name for name in absolute.state_dict())
 
 
 def test_the_lstm_reads_its_frames_in_order():
@@ -170,3 +143,24 @@ def test_the_place_is_a_further_linear_part_and_changes_nothing_else():
     assert placed.latent_dim == plain.latent_dim + 3 == with_place.shape[-1]
     torch.testing.assert_close(with_place[..., :-3], plain.infer(frames))
     torch.testing.assert_close(with_place[..., -3:], 2 / 3**0.5 * frames[..., 1, :])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_weights_of_a_fit_in_the_type_of_the_decoder(dtype):
+    generator = torch.Generator().manual_seed(0)
+    latent = torch.randn(40, 6, generator=generator, dtype=dtype)
+    action = latent @ torch.randn(6, 2, generator=generator, dtype=dtype) + 1
+    fit, decoder = ridge(latent, action, penalties=(1e-2,)), LinearActionDecoder(6, 2).to(dtype)
+    decoder.assign(fit)
+    assert {value.dtype for value in decoder.state_dict().values()} == {dtype}
+    torch.testing.assert_close(decoder.linear.weight, fit.weight.to(dtype))
+    torch.testing.assert_close(decoder.linear(latent), fit.predict(latent))
+
+
+def test_forward_and_keys_and_state_dict():
+    latent, decoder = torch.randn(5, 8, 6), LinearActionDecoder(6, 2)
+    other = LinearActionDecoder(6, 2, in_key=("a", "u"), out_key=("a", "v"))
+    other.load_state_dict(decoder.state_dict())
+    assert set(other.state_dict()) == {"linear.weight", "linear.bias"}
+    expected = latent @ decoder.linear.weight.T + decoder.linear.bias
+    torch.testing.assert_close(other(TensorDict({"a": {"u": latent}}, [5]))["a", "v"], expected)

@@ -9,12 +9,10 @@ from tensordict import TensorDict
 
 from torchrl_koap.modules import (
     PRESETS,
-    LatentActionFourier,
     LatentActionLSTM,
     Normalizer,
     make_koopman_inverse_dynamics,
 )
-from torchrl_koap.modules.koopman.presets import NETWORK_OPTIONS
 from torchrl_koap.objectives import KOAPLoss
 
 
@@ -67,16 +65,6 @@ def test_every_preset_trains(preset):
     assert model(batch.select("state"))["action"].shape == (8, 17, 2)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize(("network", "kind"), [("fourier", LatentActionFourier), ("lstm", LatentActionLSTM)])
-def test_every_network_fits_every_preset(preset, network, kind):
-    model = make_koopman_inverse_dynamics(4, 3, preset=preset, network=network, latent_dim=8, hidden_dim=16)
-    assert isinstance(model.latent_action, kind)
-    assert (model.operator.input is not None) == (network == "fourier")
-    td = model(TensorDict({"state": torch.randn(2, 16, 4)}, [2]))
-    assert td["action"].shape == (2, 16, 3)
-
-
 def test_options_override_the_preset_and_reach_the_parts():
     model = make_koopman_inverse_dynamics(
         2,
@@ -93,7 +81,7 @@ def test_options_override_the_preset_and_reach_the_parts():
     assert (reader.num_past, reader.look_ahead, reader.clamped) == (3, (2, 5), False)
     assert reader.scales is not None and model.latent_action.latent_dim == 10 and model.lifting.include_state
     fourier = make_koopman_inverse_dynamics(
-        2, 2, network="fourier", num_features=32, curvature=0.5, motion_scale=2.0, position_scale=3.0
+        2, 2, num_features=32, curvature=0.5, motion_scale=2.0, position_scale=3.0
     ).latent_action
     assert fourier.amplitude == pytest.approx((2 * 0.5 / 32) ** 0.5)
     assert (fourier.motion_scale, fourier.position_scale, fourier.phase.numel()) == (2.0, 3.0, 32)
@@ -105,36 +93,10 @@ def test_options_override_the_preset_and_reach_the_parts():
         ({"preset": "paperr"}, "unknown preset 'paperr'; did you mean 'paper'"),
         ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, absolute, semi_supervised, paper"),
         ({"preset": None}, "unknown preset None"),
-        ({"network": "tcn"}, "unknown network 'tcn'; known: fourier, smoothed, lstm"),
-        ({"network": "lstmm"}, "unknown network 'lstmm'; did you mean 'lstm'"),
         ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
-        ({"preset": "paper", "curvature": 0.1}, "option .* network 'lstm': 'curvature'"),
+        ({"preset": "paper", "curvature": 0.1}, "option .* preset 'paper': 'curvature'"),
     ],
 )
 def test_unknown_names_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         make_koopman_inverse_dynamics(2, 2, **options)
-
-
-def test_presets_name_only_known_options():
-    common = None
-    for name, preset in PRESETS.items():
-        foreign = {option for options in NETWORK_OPTIONS.values() for option in options}
-        rest = set(preset) - foreign
-        common = rest if common is None else common
-        assert rest == common, (
-            name
-        )  # the same choices in every preset, so that two presets can be compared line by line
-
-
-def test_normalisers_are_used():
-    scale = Normalizer(2, scale=torch.full((2,), 10.0))
-    torch.manual_seed(0)
-    plain = make_koopman_inverse_dynamics(2, 2, preset="paper")
-    scaled = make_koopman_inverse_dynamics(2, 2, preset="paper", state_normalizer=scale, action_normalizer=scale)
-    for name in ("latent_action", "action_decoder"):
-        getattr(scaled, name).load_state_dict(getattr(plain, name).state_dict())
-    state = torch.randn(3, 16, 2)
-    td = scaled(TensorDict({"state": 10 * state}, [3]))
-    torch.testing.assert_close(td["action"], 10 * plain(TensorDict({"state": state}, [3]))["action"])
-    assert scaled.in_keys == ["state"] and scaled.out_keys[-1] == "action"

@@ -23,9 +23,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrl_koap.envs.contexts import check_contexts
-from torchrl_koap.envs.experts.noise import ar1_noise
 from torchrl_koap.envs.experts.push_planning import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 

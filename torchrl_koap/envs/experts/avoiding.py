@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS, ROW_Y
 
 FULL_PUSH = 0.0124  # m per control step at full deflection

@@ -47,7 +47,7 @@ def record_to_folder(
         folder (str or Path): where ``ted`` shall lie.
         task (Task): the task.
         episodes (int): and the other arguments, see
-            :func:`~torchrl_koap.envs.experts.demonstrations.record_demonstrations`.
+            :func:`~torchrl_koap.envs.experts.demonstrations.iterate_takes`.
 
     Raises:
         FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,35 +39,22 @@ def record_demonstrations(
     task: Task | str = "avoiding",
     episodes: int = 96,
     seed: int = 0,
-    num_threads: int = 2,
-    progress: Callable[[int, int], None] | None = None,
     *,
     dtype: torch.dtype = torch.float32,
-    batch_size: int = BATCH_SIZE,
     disturbance: float | None = None,
+    **options: Any,
 ) -> tuple[TensorDict, RecordingReport]:
     """Records demonstrations of a scripted expert as flat TED data, every action labelled.
 
-    The modes of the task are balanced: with 24 modes, 96 episodes are four of each; a remainder goes to modes that the
-    seed chooses.
-
     Args:
-        task (Task or str): the task.
-        episodes (int): number of demonstrations.
-        seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
-        num_threads (int): threads that advance the physics.
-        progress (callable, optional): called with the number of demonstrations recorded and wanted.
+        task (Task or str): and all arguments but ``dtype``, see :func:`iterate_takes`.
         dtype (torch.dtype): floating type of the entries; everything is computed in float64.
-        batch_size (int): episodes played at once. The demonstrations do not depend on it.
-        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
-            the task.
 
     Returns:
         tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the :class:`RecordingReport`.
 
     Raises:
-        ValueError: if the task is unknown or has no expert, or a number is out of range.
-        RecordingError: if an episode fails again and again.
+        ValueError: as there, like ``RecordingError``.
 
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import record_demonstrations
@@ -75,9 +63,7 @@ def record_demonstrations(
         (2, True, 3)
     """
     task, start = get_task(task), time.perf_counter()
-    takes = list(
-        iterate_takes(task, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance)
-    )
+    takes = list(iterate_takes(task, episodes, seed, disturbance=disturbance, **options))
     seconds, share = time.perf_counter() - start, share_disturbed(task, disturbance)
     report = RecordingReport(get_task(task.source), seed, [take.account for take in takes], seconds, share)
     frames = [torch.from_numpy(take.frames) for take in takes]
@@ -97,8 +83,18 @@ def iterate_takes(
 ) -> Iterator[Take]:
     """Plays demonstrations one after the other, in their order; memory holds no more than a batch of them.
 
+    The modes of the task are balanced: with 24 modes, 96 episodes are four of each; a remainder goes to modes that the
+    seed chooses.
+
     Args:
-        task (Task or str): and the other arguments, see :func:`record_demonstrations`.
+        task (Task or str): the task.
+        episodes (int): number of demonstrations.
+        seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
+        num_threads (int): threads that advance the physics.
+        progress (callable, optional): called with the number of demonstrations recorded and wanted.
+        batch_size (int): episodes played at once. The demonstrations do not depend on it.
+        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
+            the task.
         done (collection of int): numbers of demonstrations that are there already and left out.
 
     Yields:

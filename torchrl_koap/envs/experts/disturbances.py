@@ -72,35 +72,20 @@ class Disturbances:
     """
 
     def __init__(self, task: Task, seeds: Sequence, disturbed: Sequence[bool]):
-        self._columns, self._height = disturbed_columns(task), height_column(task)
-        chosen = [tuple(seed) if each else None for seed, each in zip(seeds, disturbed, strict=True)]
+        columns, height = disturbed_columns(task), height_column(task)
         self._hands = [
-            None if seed is None else _Hand(np.random.default_rng((*seed, _STREAM)), len(self._columns))
-            for seed in chosen
-        ]
-        self._lifts = [
-            None if seed is None or self._height is None else _Lift(np.random.default_rng((*seed, _HEIGHT_STREAM)))
-            for seed in chosen
+            _Hand(tuple(seed), columns, height) if each else None for seed, each in zip(seeds, disturbed, strict=True)
         ]
 
     def disturb(self, action: np.ndarray) -> np.ndarray:
         """Returns the actions ``[n, act]`` that are executed where the operators want ``action`` ``[n, act]``."""
-        done = action.copy()
-        for row, hand in enumerate(self._hands):
-            if hand is not None:
-                done[row, self._columns] = hand.disturb(action[row, self._columns])
-            lift = self._lifts[row]
-            if hand is not None and lift is not None:
-                done[row, self._height] = lift.drift(float(done[row, self._height]), hand.pace)
-        return done
+        rows = zip(self._hands, action, strict=True)
+        return np.stack([wanted if hand is None else hand.disturb(wanted) for hand, wanted in rows])
 
     @property
     def spells(self) -> list[list[tuple[int, int, str]]]:
         """Of every episode so far the disturbances: first control step, the one after the last, kind."""
-        return [
-            [] if hand is None else sorted(hand.spells + ([] if lift is None else lift.spells))
-            for hand, lift in zip(self._hands, self._lifts, strict=True)
-        ]
+        return [[] if hand is None else sorted(hand.spells) for hand in self._hands]
 
 
 def disturbed_columns(task: Task) -> np.ndarray:
@@ -128,42 +113,62 @@ def count_spells(spells: Sequence[Sequence[tuple[int, int, str]]]) -> dict[str, 
     return {kind: counts[kind] for kind in KINDS}
 
 
+def _spell(now: int, draw: np.random.Generator, kinds: Sequence[str]) -> tuple[int, int, str]:
+    """The next disturbance: first control step, the one after the last, kind."""
+    start = now + _QUIET + int(draw.exponential(_MEAN_GAP))
+    kind = kinds[draw.integers(len(kinds))]
+    return start, start + int(draw.integers(*_STEPS[kind])), kind
+
+
 class _Hand:
-    """One episode: when the next disturbance comes, and what it does."""
+    """One episode: what is disturbed sideways, and how the height drifts besides."""
 
-    def __init__(self, generator: np.random.Generator, width: int):
-        self._generator, self._width = generator, width
-        self._time, self.pace = 0, 0.0
-        self._held, self._last = np.zeros(width), np.zeros(width)
-        self._plan(0)
+    def __init__(self, seed: tuple[int, ...], columns: np.ndarray, height: int | None):
+        self._columns, self._height, self._width = columns, height, len(columns)
+        self._sideways, self._upwards = (np.random.default_rng((*seed, own)) for own in (_STREAM, _HEIGHT_STREAM))
+        self._time, self._pace = 0, 0.0
+        self._held, self._last = np.zeros(self._width), np.zeros(self._width)
         self.spells: list[tuple[int, int, str]] = []
+        self._plan()
+        self._plan_drift()
 
-    def _plan(self, now: int) -> None:
-        draw = self._generator
-        self._start = now + _QUIET + int(draw.exponential(_MEAN_GAP))
-        self._kind = _SIDEWAYS[draw.integers(len(_SIDEWAYS))]
-        self._end = self._start + int(draw.integers(*_STEPS[self._kind]))
+    def _plan(self) -> None:
+        draw = self._sideways
+        self._spell = _spell(self._time, draw, _SIDEWAYS)
         direction = draw.normal(size=self._width)
         self._push = draw.uniform(0.7, 1.4) * direction / np.linalg.norm(direction)
         self._turn = draw.uniform(*_SLIP) * draw.choice((-1.0, 1.0))
         self._share = draw.uniform(-1.0, 1.0, self._width)
 
-    def disturb(self, wanted: np.ndarray) -> np.ndarray:
-        self.pace = max(float(np.linalg.norm(wanted)), _MEMORY * self.pace)
-        done = wanted
-        if self._time >= self._start:
-            if self._time == self._start:
-                self._held = self._last.copy()
-                self.spells.append((self._start, self._end, self._kind))
-            done = {"impulse": self._impulse, "slip": self._slip, "late_turn": self._late_turn}[self._kind](wanted)
+    def _plan_drift(self) -> None:
+        draw = self._upwards
+        self._drift = _spell(self._time, draw, ("drift",))
+        self._rate = draw.uniform(*_DRIFT) * draw.choice((-1.0, 1.0))
+
+    def disturb(self, action: np.ndarray) -> np.ndarray:
+        wanted, done = action[self._columns], action.copy()
+        self._pace = max(float(np.linalg.norm(wanted)), _MEMORY * self._pace)
+        (start, end, kind), (drift_start, drift_end, _) = self._spell, self._drift
+        if self._time == start:
+            self._held = self._last.copy()
+            self.spells.append(self._spell)
+        if self._time >= start:
+            kinds = {"impulse": self._impulse, "slip": self._slip, "late_turn": self._late_turn}
+            done[self._columns] = kinds[kind](wanted)
+        if self._height is not None and self._time >= drift_start:
+            done[self._height] = self._pace * self._rate
+            if self._time == drift_start:
+                self.spells.append(self._drift)
         self._last = wanted
         self._time += 1
-        if self._time >= self._end:
-            self._plan(self._time)
+        if self._time >= end:
+            self._plan()
+        if self._time >= drift_end:
+            self._plan_drift()
         return done
 
     def _impulse(self, wanted: np.ndarray) -> np.ndarray:
-        return wanted + self.pace * self._push
+        return wanted + self._pace * self._push
 
     def _slip(self, wanted: np.ndarray) -> np.ndarray:
         if self._width != 2:  # no one side to run off to: a push that grows with the speed
@@ -173,27 +178,3 @@ class _Hand:
 
     def _late_turn(self, wanted: np.ndarray) -> np.ndarray:
         return self._held
-
-
-class _Lift:
-    """The height in one episode: when it drifts next, how quickly and for how long."""
-
-    def __init__(self, generator: np.random.Generator):
-        self._generator, self._time = generator, 0
-        self._plan()
-        self.spells: list[tuple[int, int, str]] = []
-
-    def _plan(self) -> None:
-        draw = self._generator
-        self._start = self._time + _QUIET + int(draw.exponential(_MEAN_GAP))
-        self._end = self._start + int(draw.integers(*_STEPS["drift"]))
-        self._rate = draw.uniform(*_DRIFT) * draw.choice((-1.0, 1.0))
-
-    def drift(self, wanted: float, pace: float) -> float:
-        if self._time == self._start:
-            self.spells.append((self._start, self._end, "drift"))
-        done = pace * self._rate if self._time >= self._start else wanted
-        self._time += 1
-        if self._time >= self._end:
-            self._plan()
-        return done

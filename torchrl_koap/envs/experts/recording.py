@@ -123,6 +123,25 @@ def check_episodes(modes: Sequence, seeds: Sequence, contexts: Any = None, objec
         raise ValueError(f"as many {asked} as modes are needed, at least one, got {got}")
 
 
+def ar1_noise(
+    generator: np.random.Generator, memory: float, deviation: float, size: int | tuple[int, ...]
+) -> np.ndarray:
+    """Draws noise ``[*size]`` of an autoregressive process of order one in its steady state: a drifting hand.
+
+    Args:
+        generator (np.random.Generator): where the draws come from.
+        memory (float): steps after which a share 1/e remains.
+        deviation (float): standard deviation.
+        size (int or tuple of int): number of steps, or a shape that begins with it.
+    """
+    keep = np.exp(-1 / memory)
+    values = generator.normal(0, deviation, size)
+    values[1:] *= np.sqrt(1 - keep**2)
+    for step in range(1, len(values)):
+        values[step] += keep * values[step - 1]
+    return values
+
+
 def expert_of(task: Task) -> type[Expert]:
     """Returns the task's scripted expert.
 

@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
 from torchrl_koap.envs.experts.sorting_decision import decide, pushing_cost
 from torchrl_koap.envs.sorting import box_colours, mode_colours
 from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X

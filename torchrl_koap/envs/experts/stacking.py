@@ -21,8 +21,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, check_episodes
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
 from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.stacking import BOXES, TARGET

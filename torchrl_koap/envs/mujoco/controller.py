@@ -21,8 +21,7 @@ from llvmlite import ir
 from numba import carray, njit, types
 from numba.extending import intrinsic
 
-from torchrl_koap.envs.mujoco.kinematics import TIMESTEP, inverse_kinematics
-from torchrl_koap.envs.mujoco.linear_algebra import clip
+from torchrl_koap.envs.mujoco.kinematics import TIMESTEP, clip, inverse_kinematics
 
 KP = np.array([120.0, 120.0, 120.0, 120.0, 50.0, 30.0, 10.0])
 KD = np.array([10.0, 10.0, 10.0, 10.0, 6.0, 5.0, 3.0])
@@ -138,10 +137,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
         started (np.ndarray): False where the controller has not run since the reset [n], bool.
         log (np.ndarray): receives one row per simulation after the first substep [n, LOG_WIDTH + 7 free bodies].
     """
-    axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
-    tcp, quat, target = np.empty(3), np.empty(4), np.empty(7)
-    jacobian, matrix, factor, vectors = np.empty((6, 7)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    task, null, q, v, a = np.empty(6), np.empty(7), np.empty(7), np.empty(7), np.empty(7)
+    target, q, v, a = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
     for row in rows:
         qpos, qvel = _array(pointers[row, QPOS], 9), _array(pointers[row, QVEL], 9)
         ctrl, bias = _array(pointers[row, CTRL], 9), _array(pointers[row, BIAS], 9)
@@ -159,7 +155,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
             for j in range(7):
                 targets[row, j] = q[j]
                 speeds[row, j] = v[j]
-            inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors)
+            inverse_kinematics(target, q)
             for j in range(7):
                 v[j] = (q[j] - targets[row, j]) / TIMESTEP
                 a[j] = 0.4 * (v[j] - speeds[row, j]) / TIMESTEP  # logged by the original, used for nothing

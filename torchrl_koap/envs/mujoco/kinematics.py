@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Compiled kinematics of the Panda arm: the pose of its tool centre point (TCP), and damped steps towards a pose.
 
-Plain float64 arithmetic in a fixed order (docs/d3il.md, Controller).
+Plain float64 arithmetic in a fixed order (docs/d3il.md, Controller), which LAPACK would not have on every machine.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from torchrl_koap.envs.mujoco.linear_algebra import clip, solve_clipped
 from torchrl_koap.tasks.panda_kinematics import LINKS
 
 TIMESTEP = 0.001
@@ -21,6 +20,7 @@ Q_REST = np.array([0.0, 0.174, 0.0, -0.872, 0.0, 1.222, 0.785])
 IK_ITERATIONS = 3
 _OFFSETS, _TURNS = np.array([offset for offset, _ in LINKS]), np.array([turn for _, turn in LINKS])
 _COS45 = 0.5**0.5
+EIGENVALUE_MIN, EIGENVALUE_MAX = 0.01, 100.0
 
 
 @njit(cache=True)
@@ -105,15 +105,104 @@ def _quaternion(axes, quat):
 
 
 @njit(cache=True)
-def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
+def clip(value, low, high):
+    """Returns the value, or the bound that it lies beyond."""
+    return min(max(value, low), high)
+
+
+@njit(cache=True)
+def _cholesky(matrix, shift, factor):
+    """Lower Cholesky factor of ``matrix - shift * I``; False if that is not positive definite."""
+    for i in range(6):
+        for j in range(i + 1):
+            total = matrix[i, j] - (shift if i == j else 0.0)
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                factor[i, i] = np.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+    return True
+
+
+@njit(cache=True)
+def _diagonalise(matrix, vectors):
+    """Cyclic Jacobi rotations: ``matrix`` becomes diagonal, the columns of ``vectors`` are the eigenvectors."""
+    for i in range(6):
+        for j in range(6):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        off, diagonal = 0.0, 0.0
+        for i in range(6):
+            diagonal += matrix[i, i] ** 2
+            for j in range(i):
+                off += matrix[i, j] ** 2
+        if off <= 1e-32 * diagonal:
+            break
+        for p in range(5):
+            for r in range(p + 1, 6):
+                if matrix[p, r] == 0.0:
+                    continue
+                theta = (matrix[r, r] - matrix[p, p]) / (2.0 * matrix[p, r])
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                if theta < 0.0:
+                    t = -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(6):
+                    a, b = matrix[k, p], matrix[k, r]
+                    matrix[k, p], matrix[k, r] = c * a - s * b, s * a + c * b
+                for k in range(6):
+                    a, b = matrix[p, k], matrix[r, k]
+                    matrix[p, k], matrix[r, k] = c * a - s * b, s * a + c * b
+                for k in range(6):
+                    a, b = vectors[k, p], vectors[k, r]
+                    vectors[k, p], vectors[k, r] = c * a - s * b, s * a + c * b
+
+
+@njit(cache=True)
+def solve_clipped(matrix, rhs):
+    """Solves ``A x = b`` [6] for symmetric ``A`` [6, 6], its eigenvalues clipped to [0.01, 100] first; both are lost.
+
+    Clipping is rarely active. Two cheap tests say so: ``A - 0.01 I`` has a Cholesky factor, and the trace is below 100.
+    """
+    factor = np.empty((6, 6))
+    if np.trace(matrix) <= EIGENVALUE_MAX and _cholesky(matrix, EIGENVALUE_MIN, factor):
+        _cholesky(matrix, 0.0, factor)
+        for i in range(6):
+            for k in range(i):
+                rhs[i] -= factor[i, k] * rhs[k]
+            rhs[i] /= factor[i, i]
+        for i in range(5, -1, -1):
+            for k in range(i + 1, 6):
+                rhs[i] -= factor[k, i] * rhs[k]
+            rhs[i] /= factor[i, i]
+        return rhs
+    vectors, solution = np.empty((6, 6)), np.zeros(6)
+    _diagonalise(matrix, vectors)
+    for j in range(6):
+        total = 0.0
+        for i in range(6):
+            total += vectors[i, j] * rhs[i]
+        factor[0, j] = total / clip(matrix[j, j], EIGENVALUE_MIN, EIGENVALUE_MAX)
+    for i in range(6):
+        for j in range(6):
+            solution[i] += vectors[i, j] * factor[0, j]
+    return solution
+
+
+@njit(cache=True)
+def inverse_kinematics(target, q):
     """Moves joint angles in place, by three damped steps, towards a pose of the TCP.
 
     Args:
         target (np.ndarray): position (m) and unit quaternion (w, x, y, z) [7].
         q (np.ndarray): joint angles [7] (rad), overwritten.
-        axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors (np.ndarray): scratch space [8, 3, 3],
-            [8, 3], [3], [4], [6, 7], [6, 6], [6], [7], [6, 6], [6, 6].
     """
+    axes, origins, tcp, quat = np.empty((8, 3, 3)), np.empty((8, 3)), np.empty(3), np.empty(4)
+    jacobian, matrix, task, null = np.empty((6, 7)), np.empty((6, 6)), np.empty(6), np.empty(7)
     for _ in range(IK_ITERATIONS):
         forward_kinematics(q, axes, origins, tcp, quat)
         near = 0.0
@@ -143,7 +232,7 @@ def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, ta
                     total += jacobian[i, k] * jacobian[j, k]
                 matrix[i, j] = matrix[j, i] = total
             matrix[i, i] += 1e-12
-        solve_clipped(matrix, task, factor, vectors)
+        task = solve_clipped(matrix, task)
 
         square = 0.0
         for j in range(7):
@@ -164,14 +253,9 @@ def _poses(joints, positions, quaternions):
 
 @njit(cache=True)
 def _follow(joints, poses, iterations):
-    axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
-    tcp, quat = np.empty(3), np.empty(4)
-    jacobian, matrix, factor, vectors = np.empty((6, 7)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    task, null = np.empty(6), np.empty(7)
     for row in range(len(joints)):
         for _ in range(iterations):
-            scratch = (axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors)
-            inverse_kinematics(poses[row], joints[row], *scratch)
+            inverse_kinematics(poses[row], joints[row])
 
 
 def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

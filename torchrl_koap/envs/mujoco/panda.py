@@ -9,10 +9,31 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
+import sys
+import warnings
 from pathlib import Path
 
-from torchrl_koap.envs.mujoco.mjcf import mjcf
 from torchrl_koap.tasks.panda_kinematics import LINKS
+
+# Importing dm_control opens whatever OpenGL back end it finds (and fails if MUJOCO_GL names one that is not installed),
+# although building a scene needs none. A program that wants dm_control's own renderer imports it before this package.
+if "dm_control._render" in sys.modules:
+    from dm_control import mjcf
+else:
+    import mujoco  # noqa: F401  it reads MUJOCO_GL for itself, so before the variable is hidden
+
+    _chosen = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            from dm_control import mjcf
+    finally:
+        if _chosen is None:
+            del os.environ["MUJOCO_GL"]
+        else:
+            os.environ["MUJOCO_GL"] = _chosen
 
 TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
 FLANGE_OFFSET = 0.107  # link8 along the z axis of link7

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 
 import mujoco
 
-from torchrl_koap.envs.mujoco.mjcf import mjcf
-from torchrl_koap.envs.mujoco.panda import panda
+from torchrl_koap.envs.mujoco.panda import mjcf, panda
 
 TIMESTEP = 0.001
 TABLE_TOP = -0.019

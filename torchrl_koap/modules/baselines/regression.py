@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
+from torchrl_koap.modules.koopman.latent_action import LinearActionDecoder
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, ridge
 from torchrl_koap.modules.windows import WindowReader

@@ -11,11 +11,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
-from torchrl_koap.modules.koopman.latent_action import LatentActionModule
-from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.koopman.operator import KoopmanOperator
+from torchrl_koap.modules.koopman.latent_action import LatentActionModule, LinearActionDecoder
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import RAW
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, RidgeFit, ridge, shared_filter
 from torchrl_koap.modules.windows import WindowReader

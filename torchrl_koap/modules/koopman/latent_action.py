@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latent actions ("action proxies"), inferred from short state sequences alone."""
+"""Latent actions ("action proxies"): inferred from short state sequences alone, and decoded linearly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import LSTM, MLP
 
-from torchrl_koap.keys import LATENT_ACTION, STATE
+from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE
+from torchrl_koap.modules.ridge import RidgeFit
 from torchrl_koap.modules.windows import WindowReader
 
 
@@ -240,3 +241,44 @@ class LatentActionFourier(LatentActionModule):
         scales = torch.cat([self.reader.scales[:n], self.reader.scales[n + 1 :]])[:, axes]
         first = torch.arange(len(scales), device=scales.device)[:, None] * self.state_dim
         return first + torch.tensor(axes, device=scales.device), scales * math.sqrt(self.motion_dim)
+
+
+class LinearActionDecoder(TensorDictModuleBase):
+    r"""Decodes latent actions linearly: :math:`a_t = D u_t + b`.
+
+    Args:
+        latent_dim (int): size ``m`` of a latent action.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        in_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
+        out_key (NestedKey): actions ``[*B, T, act]`` in normalised units. Defaults to ``"action"``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import LinearActionDecoder
+        >>> from torchrl_koap.modules.ridge import ridge
+        >>> decoder, latent = LinearActionDecoder(4, 2), torch.randn(50, 4)
+        >>> decoder.assign(ridge(latent, latent[:, :2]))
+        >>> td = decoder(TensorDict({"latent_action": latent}, [50]))
+        >>> bool((td["action"] - latent[:, :2]).abs().max() < 1e-3)
+        True
+    """
+
+    def __init__(
+        self, latent_dim: int, action_dim: int, *, in_key: NestedKey = LATENT_ACTION, out_key: NestedKey = ACTION
+    ):
+        super().__init__()
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.linear = nn.Linear(latent_dim, action_dim)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the decoded actions."""
+        return tensordict.set(self.out_keys[0], self.linear(tensordict.get(self.in_keys[0])))
+
+    @torch.no_grad()
+    def assign(self, fit: RidgeFit) -> None:
+        """Takes over the weights of a ridge regression from latent actions to normalised actions."""
+        self.linear.weight.copy_(fit.weight)
+        self.linear.bias.copy_(fit.bias)

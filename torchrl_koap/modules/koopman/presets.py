@@ -8,83 +8,66 @@ from typing import Any
 from torch import nn
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
-from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM
-from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.koopman.operator import KoopmanOperator
+from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM, LinearActionDecoder
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 _DEFAULT: dict[str, Any] = {
     "normalization": {"state": "standard", "action": "rms"},  # modes of Normalizer.fit, for whoever makes them
+    "network": LatentActionFourier,
     "latent_dim": 32,
     "hidden_dim": 64,
     "include_state": True,
-    "network": "fourier",
-    "num_features": 512,
     "num_past": 4,
     "look_ahead": (2, 3, 4, 5),
     "clamped": False,
     "penalty": 0.15,
 }
 
+# everything that a variant is; what only its network takes stands last
 PRESETS: dict[str, dict[str, Any]] = {
     # best measured: observables of the frames relative to the current one, an input matrix B, no clamped look-ahead, a
     # decoder in closed form
-    "default": _DEFAULT,
+    "default": _DEFAULT
+    | {"num_features": 512, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "position_weight": 0.0},
     # actions that say where the robot is to be: what is read off the present frame counts more than the steps around it
     "absolute": _DEFAULT
     | {
         # such places are far from zero compared with their spread; among principal components size is information
         "normalization": {"state": "shared", "action": "standard"},
-        "num_features": 1024,
-        "curvature": 10.0,
-        "motion_scale": 3.0,
-        "position_scale": 2.0,
-        "position_weight": 1.0,
         "penalty": 1e-3,
-    },
+    }
+    | {"num_features": 1024, "curvature": 10.0, "motion_scale": 3.0, "position_scale": 2.0, "position_weight": 1.0},
     # where observations are noisy or wide: few coordinates that unlabelled windows determine, smoothed
     # (docs/results/unlabelled_data.md)
     "semi_supervised": _DEFAULT
     | {
+        "network": LatentActionSmoothed,
         "latent_dim": None,
         "include_state": False,
-        "network": "smoothed",
         "num_past": 8,
         "look_ahead": (2, 3, 4, 5, 6, 7, 8),
-    },
+    }
+    | {"num_features": 512},
     # the paper: g MLP, f LSTM, dense K, look-ahead k = 8
-    "paper": {
+    "paper": _DEFAULT
+    | {
         "normalization": {"state": "minmax", "action": "minmax"},
+        "network": LatentActionLSTM,
         "latent_dim": 64,
         "hidden_dim": 128,
         "include_state": False,
-        "network": "lstm",
         "num_past": 1,
         "look_ahead": 8,
         "clamped": True,
-        "relative": False,
-        "penalty": 0.15,
-    },
+    }
+    | {"relative": False},
 }
 
 # a smoothed lifting keeps states of at most so many columns as they are
 NARROW = 8
-
-# what only one kind of latent-action network takes, and its value where a preset does not name it
-NETWORK_OPTIONS: dict[str, dict[str, Any]] = {
-    "fourier": {
-        "num_features": 256,
-        "curvature": 0.1,
-        "motion_scale": 1.0,
-        "position_scale": 4.0,
-        "position_weight": 0.0,
-    },
-    "smoothed": {"num_features": 256},
-    "lstm": {"relative": False},
-}
 
 
 def make_koopman_inverse_dynamics(
@@ -108,7 +91,7 @@ def make_koopman_inverse_dynamics(
 
     Keyword Args:
         preset (str): ``"default"``, ``"absolute"``, ``"semi_supervised"`` or ``"paper"``.
-        **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
+        **overrides: any entry of ``PRESETS[preset]`` but its network.
 
     Returns:
         KoopmanInverseDynamics: with fresh weights, drawn from torch's global generator.
@@ -122,13 +105,10 @@ def make_koopman_inverse_dynamics(
         >>> model.latent_action.reader.look_ahead, model.latent_action.latent_dim
         ((8,), 64)
     """
-    choice = lookup(PRESETS, preset, "preset")
-    network = overrides.get("network", choice["network"])
-    options = lookup(NETWORK_OPTIONS, network, "network")
-    foreign = {name for others in NETWORK_OPTIONS.values() for name in others} - set(options)
-    choice = {**options, **{name: value for name, value in choice.items() if name not in foreign}}
+    choice = {**lookup(PRESETS, preset, "preset")}
+    network = choice.pop("network")
     for name in overrides:
-        lookup(choice, name, f"option of the inverse dynamics with network {network!r}:")
+        lookup(choice, name, f"option of the inverse dynamics of preset {preset!r}:")
     choice.update(overrides)
 
     hidden = (choice["hidden_dim"],) * 2
@@ -138,22 +118,24 @@ def make_koopman_inverse_dynamics(
         latent_dim = state_dim if include_state else action_dim
     if "latent_dim" not in overrides and "include_state" not in overrides and latent_dim < state_dim:
         include_state = False  # a preset's size is too small for a wide state to be part of the lifting
-    settings = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options)}
+    own = set(choice) - set(_DEFAULT)  # what only this network takes
+    settings = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *own)}
     # networks are built in this order: their first weights are drawn one after the other
     latent_action = None
-    if network == "fourier":
+    if network is LatentActionFourier:
         latent_action = LatentActionFourier(state_dim, **settings)
-    elif network == "lstm":
+    elif network is LatentActionLSTM:
         latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden[0], **settings)
     lifting: KoopmanLifting | CompactLifting
-    if network == "smoothed" and not include_state:
+    if network is LatentActionSmoothed and not include_state:
         widths: dict[str, Any] = {"hidden_dims": hidden} if "hidden_dim" in overrides else {}
         lifting = CompactLifting(state_dim, latent_dim, **widths)
     else:
         lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=hidden, include_state=include_state)
     latent_action = LatentActionSmoothed(lifting, **settings) if latent_action is None else latent_action
-    has_input = network in ("fourier", "smoothed")
-    operator = KoopmanOperator(lifting.latent_dim, input_dim=latent_action.latent_dim if has_input else None)
+    operator = KoopmanOperator(
+        lifting.latent_dim, input_dim=None if network is LatentActionLSTM else latent_action.latent_dim
+    )
     return KoopmanInverseDynamics(
         latent_action,
         LinearActionDecoder(latent_action.latent_dim, action_dim),
