@@ -10,12 +10,13 @@ import math
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 
 import torchrl_koap
 from torchrl_koap.envs import mode_index_of, sorting
-from torchrl_koap.tasks import TASKS, WINDOW, Action, Task, aligning, get_task
+from torchrl_koap.tasks import TASKS, WINDOW, Action, Task, aligning, avoiding, get_task
 
 TOY = {
     "name": "toy",
@@ -144,6 +145,11 @@ def test_modes_are_numbered_and_named_as_the_environment_tells_them(name):
     assert mode_index_of(name)(leaves).tolist() == list(range(modes.number)) and TASKS[name].num_modes == modes.number
     assert [modes.name_of(mode) for mode in range(modes.number)] == [", ".join(each) for each in words]
     assert modes.name_of(modes.number) == modes.name_of(-1) == "no mode"
+
+
+def test_a_path_of_avoiding_tells_its_mode():
+    path = np.array([[0.55, -0.1], [0.5, 0.08], [0.6, 0.27]])
+    assert avoiding.mode_of_path(path) == 18 and avoiding.mode_of_path(path[:2]) == -1
 
 
 def test_the_planar_tolerance_of_aligning_leaves_room_for_the_height():

@@ -24,12 +24,6 @@ def mode_index(flags: torch.Tensor) -> torch.Tensor:
 
     Raises:
         ValueError: if the last axis does not hold nine flags.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs.avoiding import mode_index
-        >>> mode_index(torch.tensor([[0, 1, 0, 0, 1, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0, 0, 0]]))
-        tensor([23, -1])
     """
     if flags.shape[-1] != 9:
         raise ValueError(f"mode flags must have 9 entries on the last axis, got shape {list(flags.shape)}")

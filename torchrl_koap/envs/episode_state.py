@@ -14,20 +14,7 @@ from torchrl_koap.tasks import Task
 
 
 class EpisodeState(abc.ABC):
-    """Saves, restores and tries out episodes; base of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs import AvoidingEnv
-        >>> env = AvoidingEnv(num_envs=2)
-        >>> _ = env.rollout(3)
-        >>> env.set_state(1, env.get_state(0))
-        >>> bool((env.commands[0] == env.commands[1]).all())
-        True
-        >>> held, pushed = env.simulate_actions(np.array([np.zeros((2, 6, 2)), np.full((2, 6, 2), 0.01)]))
-        >>> held.shape, bool((pushed[:, -1, 2:] > held[:, -1, 2:] + 0.005).all())
-        ((2, 6, 4), True)
-    """
+    """Saves, restores and tries out episodes; base of :class:`~torchrl_koap.envs.base.ManipulationEnv`."""
 
     sims: Any
     task: Task

@@ -34,12 +34,6 @@ def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
 
     Raises:
         ValueError: if the last axis has not 3 entries or the number is not 1, 2 or 3.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs.stacking import mode_index
-        >>> mode_index(torch.tensor([[0, 1, 2], [2, 1, 0], [1, 2, -1]])).tolist()
-        [0, 5, -1]
     """
     _check_num_boxes(num_boxes)
     if mode.shape[-1] != 3:

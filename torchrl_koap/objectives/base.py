@@ -104,16 +104,6 @@ class WindowLoss(NetworkLoss):
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
-        >>> from torchrl_koap.objectives import KoopmanReconstructionLoss  # a subclass
-        >>> loss = KoopmanReconstructionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
-        >>> loss.set_keys(state="frames")
-        >>> loss.in_keys, loss(TensorDict({"frames": torch.randn(4, 16, 2)}, [4]))["loss_reconstruction"].shape
-        (['frames'], torch.Size([]))
     """
 
     @dataclass

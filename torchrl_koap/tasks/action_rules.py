@@ -58,13 +58,6 @@ class ActionRule:
         targets (sequence of int): for absolute actions the state column that each is the target of: the controller has
             decoded the distance to it.
         constants (mapping): what action columns always are, by number.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.tasks.action_rules import ActionRule
-        >>> states, decoded = torch.tensor([[[1.0, 5.0]]]), torch.tensor([[[0.25]]])
-        >>> ActionRule(targets=(1,))(states, decoded)
-        tensor([[[5.2500]]])
     """
 
     gripper: tuple[int, int] | None = None

@@ -39,12 +39,6 @@ def mode_of_path(path: np.ndarray) -> int:
 
     Args:
         path (np.ndarray): positions ``[T, 2]`` of the tool (m).
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.tasks.avoiding import mode_of_path
-        >>> mode_of_path(np.array([[0.55, -0.1], [0.5, 0.08], [0.6, 0.27]]))
-        18
     """
     mode = 0
     for y in ROW_Y:

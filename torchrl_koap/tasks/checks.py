@@ -20,14 +20,6 @@ def check_task(task: Task) -> None:
 
     Raises:
         ValueError: with all faults, one a line, each naming the field.
-
-    Examples:
-        >>> from torchrl_koap.tasks import Action, Task
-        >>> Task(name="toy", observation_parts={"xy": 2}, actions={"x": Action("m")}, position="yx")
-        Traceback (most recent call last):
-        ...
-        ValueError: 1 fault(s) in task 'toy':
-          - position: no part 'yx'; parts: xy
     """
     faults = [] if task.name and isinstance(task.name, str) else [f"name: wanted a name, got {task.name!r}"]
     if not faults and (set("/\\") & set(task.name) or task.name in (".", "..")):

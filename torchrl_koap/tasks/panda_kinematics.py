@@ -25,12 +25,6 @@ def tool_position(joints: Tensor) -> Tensor:
 
     Raises:
         ValueError: if there are not seven joints on the last axis.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.tasks.panda_kinematics import tool_position
-        >>> tool_position(torch.zeros(7))
-        tensor([0.0880, 0.0000, 0.8210])
     """
     if joints.shape[-1] != 7:
         raise ValueError(f"seven joints are needed on the last axis, got shape {list(joints.shape)}")

@@ -70,13 +70,7 @@ def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
 
 @functools.cache
 def arrival_orders(num_boxes: int) -> tuple[tuple[int, ...], ...]:
-    """Lists every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes.
-
-    Examples:
-        >>> from torchrl_koap.tasks.sorting import arrival_orders
-        >>> arrival_orders(2)
-        ((0, 1), (1, 0))
-    """
+    """Lists every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes."""
     each = num_boxes // 2
     return tuple(sorted(set(itertools.permutations((0,) * each + (1,) * each))))
 

@@ -9,24 +9,12 @@ _THOUSANDTHS = {"m": "mm", "rad": "mrad", "s": "ms", "N": "mN"}
 
 
 def thousandths(unit: str) -> tuple[str, float]:
-    """Returns the unit in which small values are shown, and the factor to it; metres become millimetres here.
-
-    Examples:
-        >>> from torchrl_koap.tasks.units import thousandths
-        >>> thousandths("m"), thousandths("rad"), thousandths("volt")
-        (('mm', 1000.0), ('mrad', 1000.0), ('volt', 1.0))
-    """
+    """Returns the unit in which small values are shown, and the factor to it; metres become millimetres here."""
     return (_THOUSANDTHS[unit], 1e3) if unit in _THOUSANDTHS else (unit, 1.0)
 
 
 def unit_groups(units: Sequence[str]) -> dict[str, list[int]]:
-    """Groups columns by their units, in the order in which the units come.
-
-    Examples:
-        >>> from torchrl_koap.tasks.units import unit_groups
-        >>> unit_groups(["m", "N", "m"])
-        {'m': [0, 2], 'N': [1]}
-    """
+    """Groups columns by their units, in the order in which the units come."""
     groups: dict[str, list[int]] = {}
     for column, unit in enumerate(units):
         groups.setdefault(unit, []).append(column)

@@ -170,6 +170,7 @@ def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path
     except RuntimeError as error:
         pytest.skip(f"no OpenGL library: {error}")
     assert seen == [1] and report.episodes == 1 and report.attempts >= 1
+    assert str(report).startswith(f"1 demonstrations by a robot, {report.frames} frames; ")
     with pytest.raises(KeyboardInterrupt):
         record(tmp_path / "parts", progress=interrupt)
     with pytest.raises(ValueError, match="holds no recordings that can be read"):

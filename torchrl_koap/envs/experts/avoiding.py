@@ -55,11 +55,6 @@ def mode_gaps(mode: int) -> tuple[int, int, int]:
 
     Raises:
         ValueError: if there is no such mode.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.avoiding import mode_gaps
-        >>> mode_gaps(0), mode_gaps(23)
-        ((0, 0, 0), (1, 2, 3))
     """
     if not 0 <= mode < 24:
         raise ValueError(f"mode must be 0 to 23, got {mode}")
@@ -81,17 +76,6 @@ class AvoidingExpert(Expert):
 
     Raises:
         ValueError: if a mode does not exist or the numbers of modes and seeds differ.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
-        >>> from torchrl_koap.envs.experts.avoiding import AvoidingExpert
-        >>> env, expert = AvoidingEnv(2, dtype=torch.float64), AvoidingExpert([0, 22], seeds=[1, 2])
-        >>> def policy(td):
-        ...     return td.set("action", torch.from_numpy(expert.act(td["observation"].numpy())))
-        >>> last = env.rollout(150, policy, break_when_any_done=False, break_when_all_done=True)["next"][:, -1]
-        >>> last["success"].squeeze(-1).tolist(), mode_index(last["mode"]).tolist()
-        ([True, True], [0, 22])
     """
 
     # the human demonstrations have at most 104 rows and pass the cylinders at 3 mm or more

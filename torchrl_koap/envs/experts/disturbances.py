@@ -59,16 +59,6 @@ class Disturbances:
         task (Task): tells which actions are changes of commands.
         seeds (sequence): per episode a tuple of integers.
         disturbed (array): bool per episode; the others are left as they are.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.disturbances import Disturbances
-        >>> from torchrl_koap.tasks import get_task
-        >>> hand = Disturbances(get_task("avoiding"), [(0, 0), (0, 1)], [True, False])
-        >>> wanted = np.tile([0.0, 0.01], (2, 1))
-        >>> done = np.stack([hand.disturb(wanted) for _ in range(150)], axis=1)
-        >>> (done != wanted[:, None]).any(-1).any(-1).tolist(), hand.spells[1]
-        ([True, False], [])
     """
 
     def __init__(self, task: Task, seeds: Sequence, disturbed: Sequence[bool]):

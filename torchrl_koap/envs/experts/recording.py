@@ -51,11 +51,6 @@ class RecordingRules:
         clearance (callable, optional): from the frames ``[T, obs]`` of a recording to its least distance to what must
             not be touched (m).
         least_clearance (float): nearer recordings are discarded (m).
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.recording import RecordingRules
-        >>> RecordingRules(most_rows=399).least_clearance
-        0.0
     """
 
     most_rows: int | None = None

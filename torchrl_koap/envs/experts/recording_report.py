@@ -16,14 +16,7 @@ from torchrl_koap.tasks import Task
 
 @dataclass(frozen=True)
 class Take:
-    """One demonstration and what it took.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.demonstrations import iterate_takes
-        >>> take = next(iterate_takes("avoiding", 1))
-        >>> take.index, take.attempts, take.failures, take.disturbed
-        (0, 1, {}, False)
-    """
+    """One demonstration and what it took."""
 
     index: int  # number of the demonstration
     frames: np.ndarray  # [T, obs]
@@ -52,12 +45,6 @@ class RecordingReport:
         takes (sequence of dict): :attr:`Take.account` of each demonstration, in their order.
         seconds (float): wall-clock time.
         disturbance (float): share of the demonstrations that was to be disturbed.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-        >>> data, report = record_demonstrations("avoiding", 2)
-        >>> str(report)[:39], len(report.modes)
-        ('2 demonstrations of avoiding in 2 modes', 2)
     """
 
     task: Task

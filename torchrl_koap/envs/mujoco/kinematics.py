@@ -279,14 +279,6 @@ def follow_pose(joints: np.ndarray, poses: np.ndarray, substeps: int = 30) -> np
 
     Raises:
         ValueError: if a shape is wrong.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
-        >>> from torchrl_koap.envs import StackingEnv
-        >>> joints = follow_pose([StackingEnv.START_JOINTS], [[0.53, 0.01, 0.29, 0, 1, 0, 0]])
-        >>> tcp_pose(joints)[0].round(4).tolist()
-        [[0.53, 0.01, 0.29]]
     """
     joints, poses = _rows(joints, "joints").copy(), _rows(poses, "poses")
     if len(joints) != len(poses):

@@ -66,13 +66,6 @@ class Renderer:
     Raises:
         RuntimeError: if no OpenGL library can be used; the message says what to install.
         ValueError: if a size is below 1.
-
-    Examples:
-        >>> from torchrl_koap.envs import AvoidingEnv
-        >>> from torchrl_koap.envs.mujoco.rendering import Renderer
-        >>> sims = AvoidingEnv().sims
-        >>> Renderer(sims.model, 320, 240).render(sims.data[0]).shape  # doctest: +SKIP
-        (240, 320, 3)
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, *, shadows: bool = True):

@@ -39,12 +39,6 @@ def scene(
 
     Returns:
         mjcf.RootElement: the scene.
-
-    Examples:
-        >>> from torchrl_koap.envs.mujoco.scene import compile_scene, scene
-        >>> model = compile_scene(scene(rod=True))
-        >>> model.nq, model.nu, model.opt.timestep
-        (9, 9, 0.001)
     """
     root = mjcf.RootElement(model="d3il")
     root.compiler.angle = "radian"

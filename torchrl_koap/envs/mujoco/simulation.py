@@ -90,16 +90,6 @@ class SimulationBatch(Simulations):
     Args:
         model (mujoco.MjModel): a scene that holds the arm, see :func:`~torchrl_koap.envs.mujoco.scene.scene`.
         num_sims (int): and ``num_threads``, see :class:`Simulations`.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.mujoco.scene import compile_scene, scene
-        >>> from torchrl_koap.envs.mujoco.simulation import SimulationBatch
-        >>> sims = SimulationBatch(compile_scene(scene()), num_sims=2)
-        >>> start = np.array([0, 0.17, 0, -0.87, 0, 1.22, 0.785])
-        >>> sims.reset(np.arange(2), start)
-        >>> sims.tcp_position.shape, round(sims.data[0].time, 6)
-        ((2, 3), 0.001)
     """
 
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):

@@ -44,16 +44,6 @@ class ScoopingExpert:
         row (int): which simulation.
         start (int): number of the start position.
         seed (int or sequence): of its variation.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.scooping.expert import ScoopingExpert
-        >>> from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
-        >>> sims = ScoopingSimulations("hand", 1)
-        >>> sims.reset(np.arange(1), np.array([[0.33, 0.0, 0.2, 0.0, 0.0, 0.0]]), [0.0])
-        >>> expert = ScoopingExpert(sims, 0, start=1, seed=0)
-        >>> expert.target().shape, expert.attempts, expert.finished
-        ((6,), 1, False)
     """
 
     embodiments = tuple(HABITS)

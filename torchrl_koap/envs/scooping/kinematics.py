@@ -25,16 +25,7 @@ def rotation_of(yaw: float, pitch: float, roll: float = 0.0) -> np.ndarray:
 
 
 class SpoonKinematics:
-    """Joints that bring the spoon to a pose, near to those it has now and to a rest pose.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.scooping.kinematics import SpoonKinematics, rotation_of
-        >>> arm = SpoonKinematics()
-        >>> joints = arm.solve(np.array([0.5, 0.1, 0.15]), rotation_of(0.3, 0.1))
-        >>> np.abs(arm.position(joints) - (0.5, 0.1, 0.15)).max() < 1e-3
-        np.True_
-    """
+    """Joints that bring the spoon to a pose, near to those it has now and to a rest pose."""
 
     def __init__(self):
         self._model = scooping_model("robot", pieces=False)

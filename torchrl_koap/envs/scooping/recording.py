@@ -34,13 +34,7 @@ class FilmedEpisode:
 
 @dataclass(frozen=True)
 class VideoReport:
-    """What a recording came to.
-
-    Examples:
-        >>> from torchrl_koap.envs.scooping.recording import VideoReport
-        >>> print(VideoReport("hand", episodes=2, attempts=3, frames=130, again=1))
-        2 demonstrations by a hand, 130 frames; 3 were played to get them, 1 scoop more than once
-    """
+    """What a recording came to."""
 
     embodiment: str  # who was recorded
     episodes: int  # demonstrations that were kept

@@ -38,11 +38,6 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
 
     Raises:
         ValueError: for another embodiment.
-
-    Examples:
-        >>> from torchrl_koap.envs.scooping.scene import scooping_model
-        >>> [scooping_model(name, pieces=False).nu for name in ("robot", "hand")]
-        [7, 6]
     """
     holder, actuators = lookup({"robot": (_arm, 7), "hand": (_hand, 6)}, embodiment, "embodiment")
     assert embodiment in EMBODIMENTS

@@ -27,16 +27,6 @@ class ScoopingSimulations(Simulations):
     Args:
         embodiment (str): ``"robot"`` or ``"hand"``.
         num_sims (int): and ``num_threads``, see :class:`~torchrl_koap.envs.mujoco.simulation.Simulations`.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
-        >>> sims = ScoopingSimulations("hand", 2)
-        >>> target = np.array([[0.45, 0.0, 0.2, 0.0, 0.0, 0.0]] * 2)
-        >>> sims.reset(np.arange(2), target, turns=[0.0, 1.0])
-        >>> sims.advance(np.arange(2), target)
-        >>> sims.spoon_position.round(2).tolist(), sims.pieces_on_spoon().tolist()
-        ([[0.45, 0.0, 0.2], [0.45, 0.0, 0.2]], [0, 0])
     """
 
     def __init__(self, embodiment: str, num_sims: int, num_threads: int = 1):

@@ -27,15 +27,6 @@ class LinearForecast(nn.Module):
     Args:
         condition_dim (int): number ``c`` of condition columns.
         width (int): number ``w`` of columns of the flat sequence.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.planning.forecast import LinearForecast
-        >>> condition, forecast = torch.randn(90, 3), LinearForecast(3, 2)
-        >>> sequence = condition[:, :2] - 0.5 * condition[:, 2:]
-        >>> penalty = forecast.fit(condition, sequence, torch.arange(90) // 30)
-        >>> torch.allclose(forecast.weight, torch.tensor([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5]]), atol=1e-3)
-        True
     """
 
     def __init__(self, condition_dim: int, width: int):
