@@ -41,7 +41,7 @@ A policy for the task `{task}` in this library's own simulation, trained on **sc
 | by noise seed | {by_seed} of 60 with {seeds} |
 | entropy of the modes | {entropy} |
 | mean steps | {mean_steps} ({mean_steps_won} where successful) |
-| evaluated | these compact weights, {contexts}, {candidates} candidate plan(s) |
+| evaluated | these compact weights, {contexts} |
 | data | {demonstrations} scripted demonstrations (`{recorded}`) |
 | labels | {labels}, method `{method}` |
 | planner | {denoiser}, {updates} updates of {batch} windows, training seed {training_seed} |
@@ -55,7 +55,7 @@ Roll it out, films and report included:
 Made by
 
     {command}
-    python benchmarks/publish_pretrained.py RUN {name} --candidates {candidates}
+    python benchmarks/publish_pretrained.py RUN {name}
 """
 
 
@@ -76,7 +76,7 @@ def compact(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return small
 
 
-def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int | None = None) -> Path:
+def publish(run: str | Path, folder: str | Path, card: str) -> Path:
     """Writes a trained policy as the repository holds it: compact weights, options, a model card.
 
     Of the places where the run, its data and a planner that it took over were, the last part of the path is kept: where
@@ -86,9 +86,6 @@ def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int |
         run (str or Path): run directory of ``koap train``.
         folder (str or Path): folder to write, new or that of an earlier policy; its name is that of the policy.
         card (str): text of the ``README.md``: data, updates, success, command.
-
-    Keyword Args:
-        candidates (int, optional): plans sampled whenever one is due, unless told otherwise. Default: as trained.
 
     Returns:
         Path: the folder.
@@ -101,8 +98,7 @@ def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int |
     places = {name: Path(config[name]).name for name in PLACES if config.get(name) is not None}
     source = config["planner"]["source"]
     planner = config["planner"] | {"source": None if source is None else Path(source).name}
-    execution = config["execution"] | ({"candidates": candidates} if candidates else {})
-    published.write_json("config.json", config | places | {"planner": planner, "execution": execution})
+    published.write_json("config.json", config | places | {"planner": planner})
     for name in WEIGHTS:
         if (folder / name).exists():
             tensors, about = load_tensors(folder / name)
@@ -171,18 +167,15 @@ def disturbance_of(dataset: Path) -> float:
     return 0.0
 
 
-def main(
-    run: Positional[Path], name: Positional[str], *, seeds: tuple[int, ...] = (100, 1100, 2100), candidates: int = 1
-) -> None:
+def main(run: Positional[Path], name: Positional[str], *, seeds: tuple[int, ...] = (100, 1100, 2100)) -> None:
     """Publishes a run, evaluates what was published, and writes its model card.
 
     Args:
         run: the run directory.
         name: of the folder below ``pretrained``.
         seeds: noise seeds, 60 episodes each.
-        candidates: plans of which one is taken.
     """
-    folder = publish(run, ROOT / name, "", candidates=candidates)
+    folder = publish(run, ROOT / name, "")
     metrics = (folder / "metrics.csv").read_text().splitlines(keepends=True)
     kept = [metrics[0], *metrics[1::5]]  # for the report's curves a fifth of the rows is enough
     (folder / "metrics.csv").write_text("".join(kept))
@@ -191,7 +184,7 @@ def main(
             evaluate(folder, EvalConfig(out=Path(out) / "run", episodes=60, seed=seed, threads=1)) for seed in seeds
         ]
     contexts = "the 60 fixed contexts with every seed" if "contexts" in results[0] else "all from the same start"
-    card = numbers_of(run, results) | {"name": name, "seeds": list(seeds), "candidates": candidates}
+    card = numbers_of(run, results) | {"name": name, "seeds": list(seeds)}
     (folder / "README.md").write_text(CARD.format(**card, contexts=contexts))
     size = sum(file.stat().st_size for file in folder.iterdir())
     print(f"{folder}: {card['successes']} of {card['n']}, {size / 1e6:.2f} MB")

@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """
-Planners: solvers, steps, candidates, modes
+Planners: solvers, steps, temperature, modes
 ===========================================
 
 **What you will learn**
 
 * how many solver steps a plan needs, and what is lost first when there are too few,
-* what sampling several candidates does to collisions and to the variety of modes,
+* what a lower temperature does to success and to the variety of modes,
 * how to ask a planner alone, without controller or simulator, whether it knows several ways.
 
 Run it with ``python tutorials/planners.py``; it leaves ``planners.png`` behind.
@@ -15,7 +15,7 @@ Run it with ``python tutorials/planners.py``; it leaves ``planners.png`` behind.
 # %%
 # A trained planner
 # -----------------
-# The repository holds a policy for Avoiding. Nothing is trained here: solver, steps and candidates are choices of the
+# The repository holds a policy for Avoiding. Nothing is trained here: solver, steps and temperature are choices of the
 # *evaluation*.
 
 import time
@@ -70,8 +70,8 @@ for solver in ("ddim", "dpm++2m"):
 seeds = list(range(24))
 
 
-def closed_loop(steps, candidates=1):
-    policy = load_policy(run, candidates=candidates)
+def closed_loop(steps, temperature=1.0):
+    policy = load_policy(run, temperature=temperature)
     policy.planner.num_steps = steps
     episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
     return score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index_of(task)), episodes
@@ -83,13 +83,13 @@ for name, options in {
     "1 step": (1,),
     "2 steps": (2,),
     "10 steps": (10,),
-    "10 steps, 8 candidates": (10, 8),
+    "10 steps, temperature 0.5": (10, 0.5),
 }.items():
     results[name], episodes = closed_loop(*options)
     result = results[name]
     rate, low, high = (100 * result["rates"]["success"][part] for part in ("rate", "low", "high"))
     print(
-        f"{name:24} success {rate:5.1f} % ({low:.0f}-{high:.0f}),"
+        f"{name:25} success {rate:5.1f} % ({low:.0f}-{high:.0f}),"
         f" entropy {result['mode_entropy'] or 0:.2f}, {result['distinct_modes']} modes"
     )
 
@@ -116,6 +116,5 @@ figure.savefig("planners.png", dpi=90)
 # ----------
 # A single step draws the *mean* of the ways, the same for all; with ten the plans fan out. In closed loop few steps
 # cost variety before they cost much success: the entropy of the modes is lower and fewer ways are taken, while most
-# rollouts still succeed. The two solvers hardly differ here. What candidates do to success cannot be told from 24
-# rollouts, whose intervals are 25 points wide; the committed study with 180 rollouts each is in the results. Times
-# are those of the machine that made this page, beside other work.
+# rollouts still succeed. The two solvers hardly differ here. What a temperature does to success cannot be told from 24
+# rollouts, whose intervals are 25 points wide. Times are those of the machine that made this page, beside other work.

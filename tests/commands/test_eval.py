@@ -58,7 +58,7 @@ def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstration
     ("options", "wanted"),
     [
         (("--strategy", "open_loop", "--blend", "0"), {"strategy": "open_loop", "blend": 0.0}),
-        (("--candidates", "2", "--gain", "1.5"), {"candidates": 2, "gain": 1.5}),
+        (("--temperature", "0.5", "--gain", "1.5"), {"temperature": 0.5, "gain": 1.5}),
         (("--replan-interval", "2"), {"replan_interval": 2}),
     ],
 )

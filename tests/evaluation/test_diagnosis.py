@@ -153,11 +153,11 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     assert len(draw_experiments(result, RunFacts(tmp_path, task)).axes) == 2
     inspection.inspect(copied_run, replace(asked, execution=ExecutionConfig(replan_interval=4)))
     assert policies[-1].execution == Execution(**own | {"replan_interval": 4})
-    config = replace(trained.config, execution=ExecutionConfig(candidates=3))
-    several = replace(trained, config=config)
-    monkeypatch.setattr(Trained, "load", lambda run: several)
+    config = replace(trained.config, execution=ExecutionConfig(temperature=0.5))
+    cold = replace(trained, config=config)
+    monkeypatch.setattr(Trained, "load", lambda run: cold)
     inspection.inspect(copied_run, asked)
-    assert [policy.execution.candidates for policy in policies[-2:]] == [3, 1]  # a recording is one plan
+    assert [policy.execution.temperature for policy in policies[-2:]] == [0.5, 1]  # recordings are no noise
 
 
 def test_recorded_futures_travel_in_an_entry_of_their_own():

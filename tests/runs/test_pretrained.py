@@ -75,10 +75,9 @@ def test_a_planner_is_taken_over_by_name(run, policies, capsys):
 
 
 def test_places_are_left_out_and_what_is_left_is_sealed(run, demonstrations, tmp_path):
-    folder = publish(run, tmp_path / "mine", "# mine\n", candidates=3)
+    folder = publish(run, tmp_path / "mine", "# mine\n")
     config = json.loads((folder / "config.json").read_text())
     assert (config["out"], config["dataset"]) == (run.name, demonstrations.name)
-    assert config["execution"]["candidates"] == 3
     assert Trained.load(folder).folder == folder
     (folder / "config.json").write_text(json.dumps(config | {"planner": config["planner"] | {"width": 16}}))
     with pytest.raises(CheckpointError, match="planner.safetensors was trained on planner.width 8, not on 16"):
@@ -89,9 +88,9 @@ def test_places_are_left_out_and_what_is_left_is_sealed(run, demonstrations, tmp
 def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
     out = tmp_path / "mine"
     rolled = ("--episodes", "1", "--threads", "1", "--no-animate")
-    assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--candidates", "3") == 0
+    assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--temperature", "0.5") == 0
     result = json.loads((out / "eval.json").read_text())
-    assert result["episodes"] == 1 and result["execution"]["candidates"] == 3
+    assert result["episodes"] == 1 and result["execution"]["temperature"] == 0.5
     assert (out / "index.html").exists() and not (policies / "avoiding" / "eval.json").exists()
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--no-report") == 0  # again, into the same folder
 

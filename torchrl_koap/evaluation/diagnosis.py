@@ -124,7 +124,7 @@ def follow_recordings(
         planner,
         policy.follower,
         state_of=policy.state_of,
-        execution=policy.execution.replaced(candidates=1),
+        execution=policy.execution.replaced(temperature=1.0),  # futures come as noise
         limits=policy.limits,
     )
     futures = recorded_futures([paths[index] for index in chosen], planner.horizon)

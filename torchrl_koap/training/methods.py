@@ -170,7 +170,7 @@ for _method in (
         _JOINT,
         presets=("paper",),
         columns="all",
-        execution={"strategy": "open_loop", "blend": 0.0, "candidates": 1},
+        execution={"strategy": "open_loop", "blend": 0.0, "temperature": 1.0},
     ),
     Method(
         "koap_labelled_only",

@@ -124,8 +124,6 @@ def test_another_rate_than_that_of_the_data_is_warned_of(recwarn):
 def test_refusals():
     with pytest.raises(ValueError, match="control_hz must be a positive number"):
         AsynchronousAgent(policy_of(), control_hz=0)
-    with pytest.raises(ValueError, match="one at a time, not of 4"):
-        AsynchronousAgent(policy_of(candidates=4), control_hz=30)
     with pytest.raises(ValueError, match="with strategy 'feedback', not 'open_loop'"):
         AsynchronousAgent(policy_of(strategy="open_loop"), control_hz=30)
     assert issubclass(AsynchronousAgent, Agent)

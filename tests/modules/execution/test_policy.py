@@ -150,10 +150,6 @@ def test_renamed_keys(kind):
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match=r"replan_interval must be in 1..6 \(the horizon\), got 7"):
         policy_of(interval=7)
-    with pytest.raises(ValueError, match="several candidates need strategy 'feedback'"):
-        make_policy(
-            CountingPlanner(), EchoController(), state_of=(0, 1), execution=Execution("open_loop", candidates=2)
-        )
     with pytest.raises(ValueError, match=r"must have at least 3 columns \(state_of\), got 2"):
         policy_of()(step_input(torch.zeros(1, 2, 2)))
 

@@ -38,8 +38,8 @@ def open_loop():
     return feedback(strategy="open_loop")
 
 
-def candidates():
-    return feedback(candidates=3)
+def cold():
+    return feedback(temperature=0.5)
 
 
 def chunks():
@@ -89,7 +89,7 @@ def test_the_seed_fixes_everything(make_policy, layout):
 
 
 @pytest.mark.parametrize("collected", [False, True])
-@pytest.mark.parametrize("make_policy", [feedback, open_loop, candidates, chunks])
+@pytest.mark.parametrize("make_policy", [feedback, open_loop, cold, chunks])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout, collected):
     env = LAYOUTS[layout](make_policy)
@@ -128,7 +128,7 @@ PARALLEL = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make_policy", [feedback, open_loop, candidates, chunks])
+@pytest.mark.parametrize("make_policy", [feedback, open_loop, cold, chunks])
 @pytest.mark.parametrize("layout", PARALLEL)
 def test_environments_in_processes_give_the_numbers_of_a_serial_one(make_policy, layout):
     _in_processes(make_policy, layout)

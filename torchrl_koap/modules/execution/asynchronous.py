@@ -41,7 +41,7 @@ class AsynchronousAgent(Agent):
         seed (int): as for :class:`Agent`.
 
     Raises:
-        ValueError: for another strategy, several candidates, or a rate that is not positive.
+        ValueError: for another strategy, or a rate that is not positive.
 
     Examples:
         >>> import numpy as np
@@ -62,8 +62,6 @@ class AsynchronousAgent(Agent):
             raise ValueError(
                 f"plans are made asynchronously with strategy 'feedback', not {policy.execution.strategy!r}"
             )
-        if policy.execution.candidates != 1:
-            raise ValueError(f"plans are made asynchronously one at a time, not of {policy.execution.candidates}")
         if not (math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz}")
         policy.check_rate(control_hz)
@@ -127,8 +125,7 @@ class AsynchronousAgent(Agent):
     @torch.no_grad()
     def _make(self, frames: Tensor, noise: Tensor, prefix: Tensor | None) -> tuple[Tensor, float]:
         began = time.perf_counter()
-        planner = self.policy.planner
-        plan = planner.sample(self.policy.state_of(frames)[..., -planner.history :, :], noise, prefix=prefix)
+        plan = self.policy.sample(self.policy.state_of(frames), noise, prefix=prefix)
         return plan, time.perf_counter() - began
 
     def _steps(self, seconds: float) -> int:

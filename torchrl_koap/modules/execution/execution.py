@@ -10,7 +10,6 @@ from typing import Any
 from torchrl_koap.lookup import lookup
 
 STRATEGIES = ("feedback", "open_loop", "oracle")
-MOST_CANDIDATES = 256
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Execution:
     Examples:
         >>> from torchrl_koap.modules import Execution
         >>> Execution().replaced(strategy="open_loop", blend=None)
-        Execution(strategy='open_loop', replan_interval=4, blend=0.8, lead=0.0, gain=1.0, candidates=1, limits=0.5)
+        Execution(strategy='open_loop', replan_interval=4, blend=0.8, lead=0.0, gain=1.0, temperature=1.0, limits=0.5)
     """
 
     strategy: str = "feedback"
@@ -43,12 +42,12 @@ class Execution:
     blend: float = 0.8
     lead: float = 0.0
     gain: float = 1.0
-    candidates: int = 1
+    temperature: float = 1.0
     limits: float = 0.5
 
     def __post_init__(self):
         lookup(STRATEGIES, self.strategy, "strategy")
-        if not _is_integer(self.replan_interval) or self.replan_interval < 1:
+        if type(self.replan_interval) is not int or self.replan_interval < 1:
             raise ValueError(f"replan_interval must be an integer >= 1, got {self.replan_interval!r}")
         if not 0 <= self.blend < 1:
             raise ValueError(f"blend must be in [0, 1), got {self.blend}")
@@ -56,8 +55,8 @@ class Execution:
             raise ValueError(f"lead must be a number >= 0, got {self.lead}")
         if not 0 < self.gain < math.inf:
             raise ValueError(f"gain must be a number above 0, got {self.gain}")
-        if not _is_integer(self.candidates) or not 1 <= self.candidates <= MOST_CANDIDATES:
-            raise ValueError(f"candidates must be an integer in 1..{MOST_CANDIDATES}, got {self.candidates!r}")
+        if not 0 <= self.temperature <= 1:
+            raise ValueError(f"temperature must be in 0..1, got {self.temperature}")
         if not self.limits >= 0:
             raise ValueError(f"limits must be a number >= 0, or infinity, got {self.limits}")
 
@@ -84,8 +83,8 @@ class ExecutionConfig:
         lead: farthest that the command may be ahead of the robot along each axis, in the units of the actions; 0: any
             distance.
         gain: factor of actions that are changes of a command: above 1 the robot is quicker than planned.
-        candidates: plans (of dp: action chunks) sampled whenever one is due, of which one that goes on with the current
-            one is taken.
+        temperature: factor of the noise that plans are sampled from. Below 1 they are nearer to the average plan: more
+            precise, and less varied.
         limits: commands stay in the range of the demonstrated ones, widened on both sides by this share of it; inf:
             anywhere.
 
@@ -103,7 +102,7 @@ class ExecutionConfig:
     blend: float | None = None
     lead: float | None = None
     gain: float | None = None
-    candidates: int | None = None
+    temperature: float | None = None
     limits: float | None = None
 
     def __post_init__(self):
@@ -112,7 +111,3 @@ class ExecutionConfig:
     def on(self, default: Execution) -> Execution:
         """A default with what is asked for."""
         return default.replaced(**asdict(self))
-
-
-def _is_integer(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)

@@ -15,7 +15,6 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION, PLAN
-from torchrl_koap.modules.execution.candidates import paths_apart, sample_coherent, steps_apart
 from torchrl_koap.modules.execution.command_limits import CommandLimits
 from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import Follower, remaining_plan
@@ -56,8 +55,8 @@ class PlanningPolicy(TensorDictModuleBase):
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
     Raises:
-        ValueError: for an interval longer than the horizon, several candidates of a plan that is decoded at once, or a
-            follower that cannot be executed so. At the first call for a history of another length.
+        ValueError: for an interval longer than the horizon, or a follower that cannot be executed so. At the first call
+            for a history of another length.
         KeyError: at the first call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
 
     Examples:
@@ -91,8 +90,6 @@ class PlanningPolicy(TensorDictModuleBase):
         if follower is None:  # what is sampled is executed
             execution = execution.replaced(strategy="open_loop")
         elif execution.strategy == "open_loop":
-            if execution.candidates > 1:
-                raise ValueError("several candidates need strategy 'feedback', which keeps its plan; got 'open_loop'")
             if follower.knows_command:
                 raise ValueError(f"{type(follower).__name__} looks at every step: strategy must not be 'open_loop'")
         if follower is not None and follower.knows_command and execution.gain != 1:
@@ -122,8 +119,7 @@ class PlanningPolicy(TensorDictModuleBase):
     @property
     def noise_shape(self) -> tuple[int, ...]:
         """Shape of everything that is drawn for one environment whenever a plan is due."""
-        candidates = self.execution.candidates
-        return (*((candidates,) if candidates > 1 else ()), *self.planner.noise_shape)
+        return self.planner.noise_shape
 
     def check_rate(self, control_hz: float) -> None:
         """Warns of a control rate (Hz) that differs by more than a fifth from that of the data."""
@@ -134,31 +130,32 @@ class PlanningPolicy(TensorDictModuleBase):
                 stacklevel=3,
             )
 
-    def plan(
-        self,
-        observations: Tensor,
-        noise: Tensor | None = None,
-        previous: Tensor | None = None,
-        started: Tensor | None = None,
-    ) -> Tensor:
+    def plan(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
         """Makes what is executed next: planned states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
 
         Args:
             observations (Tensor): ``[*B, history, obs]``, raw units.
             noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
-            previous (Tensor, optional): the earlier plan, which several candidates are compared with.
-            started (Tensor, optional): where an episode begins, bool ``[*B]``.
         """
         states = self.state_of(observations)
-        seen, candidates = states[..., -self.planner.history :, :], self.execution.candidates
-        if candidates == 1:
-            chunk = self.planner.sample(seen, noise)
-        else:
-            apart = None if previous is None else self._distance_from(previous)
-            chunk = sample_coherent(self.planner.sample, seen, noise, candidates, distance=apart, started=started)
+        chunk = self.sample(states, noise)
         if self._decodes or self.follower is None:
             return chunk
         return self.follower(observations, states, chunk, self.execution.replan_interval)
+
+    def sample(self, states: Tensor, noise: Tensor | None = None, **options: Any) -> Tensor:
+        """Samples what the planner plans, ``[*B, H, w]``, at the temperature of the execution.
+
+        Args:
+            states (Tensor): the last observed states ``[*B, history, d]``.
+            noise (Tensor, optional): as for :meth:`plan`.
+            **options: of the planner's ``sample``, such as the ``prefix``.
+        """
+        if noise is None:
+            shape = (*states.shape[:-2], *self.noise_shape)
+            noise = torch.randn(shape, dtype=states.dtype, device=states.device)
+        seen = states[..., -self.planner.history :, :]
+        return self.planner.sample(seen, self.execution.temperature * noise, **options)
 
     def act(self, observations: Tensor, plan: Tensor, age: Tensor | int) -> Tensor:
         """The action ``[*B, act]`` of a step, command limits included.
@@ -193,7 +190,7 @@ class PlanningPolicy(TensorDictModuleBase):
             ``[*B, replan_interval]``.
         """
         states, steps = self.state_of(observations), self.execution.replan_interval
-        actions = self.planner.sample(states[..., -self.planner.history :, :], noise)
+        actions = self.sample(states, noise)
         if self.follower is not None:
             actions = self.follower(observations, states, actions, steps)
         actions = actions[..., :steps, :]
@@ -243,14 +240,6 @@ class PlanningPolicy(TensorDictModuleBase):
         age = tensordict.get(self.receding.counter_key).squeeze(-1).long() - 1
         return tensordict.set(self.out_keys[0], self.act(observed, plan, age))
 
-    def _distance_from(self, previous: Tensor) -> Callable[[Tensor], Tensor] | None:
-        """How far candidates ``[*B, N, H, w]`` are from the earlier plan, every column in units of its spread."""
-        if self.follower is not None:
-            scale = self.planner.scale_columns
-            return lambda plans: paths_apart(scale(plans), scale(previous))
-        left, scale = previous[..., self.execution.replan_interval :, :], self.planner.action_normalizer
-        return (lambda chunks: steps_apart(scale(chunks), scale(left))) if left.shape[-2] else None
-
 
 class _Chunk(TensorDictModuleBase):
     """The part that runs only when a plan is due."""
@@ -262,8 +251,7 @@ class _Chunk(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
-        previous, started = tensordict.get(self.out_keys[0], None), tensordict.get(IS_INIT).squeeze(-1)
-        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise, previous, started))
+        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
 
 
 class _Columns(nn.Module):

@@ -107,10 +107,6 @@ class StatePlanner(ConditionalSampler):
         plan = self.plan_normalizer.inverse(sequence).unflatten(-1, self.noise_shape)
         return plan + history[..., -1:, :] if self.relative else plan
 
-    def scale_columns(self, plan: Tensor) -> Tensor:
-        """Raw plan ``[*B, H, d]`` in units of the columns' spread, the same for all its steps."""
-        return plan / self.plan_normalizer.scale.unflatten(-1, self.noise_shape).mean(0)
-
     def _displaced(self, history: Tensor, plan: Tensor) -> Tensor:
         """Raw plans as they are modelled, flat ``[*B, H * d]``."""
         return (plan - history[..., -1:, :] if self.relative else plan).flatten(-2)

@@ -1,0 +1,85 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Success in closed loop against training time, written to ``benchmarks/results/time_to_policy.csv``.
+
+    koap demos --task sorting --episodes 1000 --seed 0 --out runs/sorting-data
+    OMP_NUM_THREADS=1 python benchmarks/time_to_policy.py sorting runs/sorting-data --fraction 0.01 --steps 3000 8000
+
+Every number of updates is a training of its own, with its own schedule of the learning rate and the task's defaults
+for the rest. Seconds are those of one core, for planner and controller together. Rollouts are 60 fixed contexts with
+three seeds of noise each. What is in the table is not run again.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+import tyro
+from tables import open_table
+from tyro.conf import Positional
+
+from torchrl_koap import EvalConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, evaluate, train
+
+RESULTS = Path(__file__).resolve().parent / "results" / "time_to_policy.csv"
+KEYS = ("task", "method", "labels", "network", "held_out", "updates", "seed")
+COLUMNS = (*KEYS, "precision", "kept_update", "core_seconds", "successes", "n", "entropy")
+ROLLOUTS = {"episodes": 180, "rollouts_per_context": 3}
+
+
+def main(
+    task: Positional[str],
+    dataset: Positional[Path],
+    *,
+    steps: tuple[int, ...],
+    count: int | None = None,
+    fraction: float | None = None,
+    method: str | None = None,
+    network: str | None = None,
+    held_out: float | None = None,
+    seed: int = 0,
+    folder: Path = Path("runs/time_to_policy"),
+    results: Path = RESULTS,
+) -> None:
+    """Trains with each number of updates and rolls out.
+
+    Args:
+        task: name of the task.
+        dataset: its demonstrations.
+        steps: updates of the planner, at most.
+        count: trajectories whose labels may be seen.
+        fraction: share of the windows whose labels may be seen, instead.
+        method: what is trained (default: the task's).
+        network: network of the planner (default: the task's).
+        held_out: share of the trajectories that the weights are chosen by (default: the task's).
+        seed: of the training.
+        folder: where to train.
+        results: the table.
+    """
+    torch.set_num_threads(1)
+    done, write = open_table(results, COLUMNS, KEYS)
+    labels = LabelConfig(count=count, fraction=fraction, unit="trajectory" if fraction is None else "window")
+    for updates in steps:
+        planner = PlannerConfig(steps=updates, network=network, held_out=held_out)
+        asked = TrainConfig(dataset=str(dataset), task=task, method=method, labels=labels, planner=planner)
+        name = "-".join(map(str, (task, method, count or fraction, network, held_out, updates, seed)))
+        began = time.process_time()
+        trained = train(replace(asked, out=folder / name, run=RunConfig(seed=seed, resume=True)))
+        seconds = time.process_time() - began
+        used = trained.config
+        network_used = (used.planner.network, used.planner.held_out, used.planner.steps)
+        key = (task, used.method, count or fraction, *network_used, seed)
+        if tuple(map(str, key)) in done:
+            continue
+        score = evaluate(folder / name, EvalConfig(**ROLLOUTS))
+        success = score["rates"]["success"]
+        kept = trained.results["planner"].get("kept_update", "")
+        successes = round(success["rate"] * success["episodes"])
+        row = (*key, used.run.precision, kept, f"{seconds:.0f}", successes, success["episodes"], score["mode_entropy"])
+        write(row)
+        print(*row, flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
