@@ -28,6 +28,7 @@ COVERED_BY = {
     "envs/scooping/recording.py": "envs/scooping/test_env.py",
     "envs/scooping/scene.py": "envs/scooping/test_env.py",
     "envs/scooping/simulation.py": "envs/scooping/test_env.py",
+    "graphics.py": "envs/mujoco/test_rendering.py",
     "evaluation/closed_loop.py": "commands/test_eval.py",
     "evaluation/config.py": "commands/test_eval.py",
     "evaluation/inspection.py": "evaluation/test_diagnosis.py",

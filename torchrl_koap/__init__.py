@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+from torchrl_koap.graphics import import_mujoco
 from torchrl_koap.lookup import exports
 
 __version__ = "0.1.0"
+
+import_mujoco()
 
 # imported when first asked for: a network or a task costs no simulator, a version no torch
 _LAZY = {

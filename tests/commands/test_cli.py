@@ -94,7 +94,7 @@ def test_doctor_lists_versions(capsys):
     lines = dict(line.split("  ", 1) for line in capsys.readouterr().out.splitlines())
     assert lines["torch"].strip() == torch.__version__ and lines["torchrl_koap"].strip() == "0.1.0"
     assert "MISSING" not in str(lines)
-    assert {"python", "processors", "CUDA", "mujoco", "extra wandb"} <= lines.keys()
+    assert {"python", "processors", "CUDA", "mujoco", "extra wandb", "films are drawn with"} <= lines.keys()
 
 
 def test_demonstrations_are_recorded_once_and_are_sound(tmp_path, capsys):

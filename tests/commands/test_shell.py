@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 
 import pytest
 from tiny_runs import TINY, write_demonstrations
@@ -81,6 +82,17 @@ def test_a_fault_of_ours_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr(cli, "_run", wrong)
     with pytest.raises(TypeError, match="ours"):
         cli.main(["doctor"])
+
+
+def test_a_warning_is_one_line(monkeypatch, capsys):
+    def warn(arguments):
+        sys.stdout.write(warnings.formatwarning("a picture was left out", UserWarning, "somewhere.py", 3, "code"))
+        return 0
+
+    monkeypatch.setattr(cli, "_run", warn)
+    assert cli.main(["doctor"]) == 0
+    assert capsys.readouterr().out == "warning: a picture was left out\n"
+    assert "somewhere.py" in warnings.formatwarning("outside", UserWarning, "somewhere.py", 3)
 
 
 def test_options_that_can_mean_nothing():

@@ -24,6 +24,7 @@ from torchrl_koap.commands.shell import (
     discard_output,
     ending_at_once,
     ending_like_ctrl_c,
+    one_line_warnings,
     open_closed_streams,
     wide_enough,
     written_output,
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     open_closed_streams()
     try:
-        with ending_like_ctrl_c():
+        with ending_like_ctrl_c(), one_line_warnings():
             return _run(arguments)
     except ReadEnough:  # `koap ... | head`
         discard_output()

@@ -60,7 +60,7 @@ def machine_facts() -> dict[str, str]:
     quick = has_bfloat16_units()
     facts["bfloat16 (--run.precision)"] = "quick" if quick else "emulated, many times slower than float32"
     facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
-    facts["rendering (3-D pictures)"] = _rendering()
+    facts |= _rendering()
     for extra, module in {"wandb": "wandb", "video": "av", "lerobot": "pyarrow"}.items():
         found = importlib.util.find_spec(module) is not None
         facts[f"extra {extra}"] = "installed" if found else f"not installed (pip install 'torchrl_koap[{extra}]')"
@@ -100,8 +100,16 @@ def _problem(look: Callable[[], Any]) -> list[str]:
     return []
 
 
-def _rendering() -> str:
-    from torchrl_koap.envs.mujoco.rendering import backends
+def _rendering() -> dict[str, str]:
+    """What films are drawn with, and which back ends can draw; what does not draw needs none."""
+    from torchrl_koap.envs.mujoco.rendering import INSTALL, backends, try_backends
 
-    usable = backends()
-    return ", ".join(usable) if usable else "no OpenGL library (apt install libegl1, then MUJOCO_GL=egl)"
+    tried = try_backends()
+    usable = [name for name, reason in tried.items() if not reason]
+    advice = f"MUJOCO_GL={usable[0]} would do" if usable else INSTALL
+    try:
+        chosen = next((name for name in backends() if name in usable), f"nothing; {advice}")
+    except RuntimeError as error:
+        chosen = f"nothing: {error}; {advice}"
+    said = {f"OpenGL {name}": f"not usable ({reason})" if reason else "usable" for name, reason in tried.items()}
+    return {"films are drawn with": chosen} | said

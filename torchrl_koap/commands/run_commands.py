@@ -163,8 +163,7 @@ class Latency(Command):
 class Export(Command):
     """Write a policy for torch.export, ONNX Runtime or AOTInductor.
 
-    Policy, controller and denoiser are compared with the originals (1e-5, relative). Every file, and policy.json, say
-    what goes in and comes out: names, units, order of frames, noise, steps per plan.
+    Each part is compared with the original (1e-5); policy.json says how to call it.
 
     Example: `koap export runs/arm --format onnx`
 

@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
 
@@ -96,6 +97,17 @@ def wide_enough() -> Iterator[None]:
         os.environ.pop("COLUMNS")
         if earlier is not None:
             os.environ["COLUMNS"] = earlier
+
+
+@contextlib.contextmanager
+def one_line_warnings() -> Iterator[None]:
+    """Shows a warning inside the block as one line, without its place in the code."""
+    earlier = warnings.formatwarning
+    warnings.formatwarning = lambda message, *place: f"warning: {message}\n"
+    try:
+        yield
+    finally:
+        warnings.formatwarning = earlier
 
 
 def open_closed_streams() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shlex
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ _CONFIG_ELSEWHERE = ("versions", "command")
 def write_report(folder: str | Path, *, draw: bool = True, animation: bool = True) -> Path:
     """Writes ``index.html`` into a run directory; sections whose files are absent say which command makes them.
 
+    A picture that cannot be drawn is left out; page and warning say why.
+
     Args:
         folder (str or Path): the run directory. Read are ``config.json``, ``summary.json``, ``eval.json`` and the files
             behind the pictures, all optional.
@@ -41,6 +44,8 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
     """
     run = RunFacts.read(folder)
     problems = draw_pictures(run.folder, animation=animation) if draw else {}
+    for problem in problems.values():
+        warnings.warn(problem, stacklevel=2)
     config, summary, evaluation = run.config, run.summary, run.evaluation
     figures, missing = _figures(run, problems)
     commands = {"train": TRAIN, "eval": "koap eval {run}" if run.offline else EVAL}

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -93,15 +96,41 @@ def test_missing_library_says_what_to_install(monkeypatch):
         AvoidingEnv(1).render()
 
 
-def test_no_graphics_library_is_touched_without_a_picture():
+@pytest.mark.parametrize("chosen", ["n0nsense", "osmesa"])  # one that there is not, and one that may not be installed
+def test_what_draws_nothing_needs_no_back_end(chosen):
     code = (
         "import os, sys\n"
-        "import mujoco\n"  # it reads the variable itself and refuses unknown names, so it is set afterwards
-        "os.environ['MUJOCO_GL'] = 'disable-this'\n"
         "from torchrl_koap.envs import AvoidingEnv\n"
         "AvoidingEnv(1).rollout(2)\n"
-        "assert os.environ['MUJOCO_GL'] == 'disable-this', os.environ['MUJOCO_GL']\n"
-        "assert not [name for name in sys.modules if name.startswith('OpenGL')]\n"
+        f"assert os.environ['MUJOCO_GL'] == '{chosen}', os.environ['MUJOCO_GL']\n"
+        "assert os.environ.get('PYOPENGL_PLATFORM') != 'osmesa' or 'mujoco.osmesa' in sys.modules\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    settings = {**os.environ, "MUJOCO_GL": chosen}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=settings)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_context_without_a_window_is_no_back_end(monkeypatch):
+    class Blank:
+        def __init__(self, width, height): ...
+
+        def make_current(self): ...
+
+    monkeypatch.setitem(sys.modules, "mujoco.glfw", SimpleNamespace(GLContext=Blank))
+    with pytest.raises(RuntimeError, match="could be used to draw .glfw: FatalError: "):
+        rendering.open_context(["glfw"], mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("probe", "said"),
+    [
+        ("import os; assert os.environ['MUJOCO_GL'] == '{}'", ""),
+        ("raise ImportError('no {} here')", "ImportError: no egl here"),
+        ("import os; os.kill(os.getpid(), 9)", "it ended with status -9"),
+    ],
+)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="back ends of Linux")
+def test_a_back_end_is_tried_in_a_process_of_its_own(monkeypatch, probe, said):
+    monkeypatch.setattr(rendering, "_PROBE", probe)
+    found = rendering.try_backends()
+    assert list(found) == ["egl", "osmesa", "glfw"] and found["egl"] == said

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import os
 import sys
 import warnings
 from pathlib import Path
 
+from torchrl_koap.graphics import no_graphics
 from torchrl_koap.tasks.panda_kinematics import LINKS
 
 # Importing dm_control opens whatever OpenGL back end it finds (and fails if MUJOCO_GL names one that is not installed),
@@ -23,17 +23,9 @@ if "dm_control._render" in sys.modules:
 else:
     import mujoco  # noqa: F401  it reads MUJOCO_GL for itself, so before the variable is hidden
 
-    _chosen = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = "disable"
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            from dm_control import mjcf
-    finally:
-        if _chosen is None:
-            del os.environ["MUJOCO_GL"]
-        else:
-            os.environ["MUJOCO_GL"] = _chosen
+    with no_graphics(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from dm_control import mjcf
 
 TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
 FLANGE_OFFSET = 0.107  # link8 along the z axis of link7

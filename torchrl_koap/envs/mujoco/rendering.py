@@ -5,8 +5,11 @@ from __future__ import annotations
 
 import importlib
 import os
+import subprocess
 import sys
 import warnings
+from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,10 +17,18 @@ import numpy as np
 from torchrl_koap.lookup import lookup
 
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
-_INSTALL = (
+INSTALL = (
     "on a machine without display install EGL (apt-get install libegl1) and set MUJOCO_GL=egl, or software rendering"
     " (apt-get install libosmesa6) and set MUJOCO_GL=osmesa"
 )
+# opens a window and graphics memory; nothing but the simulator is imported
+_PROBE = """
+import importlib, mujoco, warnings
+warnings.simplefilter("ignore")
+context = importlib.import_module("mujoco.{}").GLContext(8, 8)
+context.make_current()
+mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100.value)
+"""
 
 
 def backends() -> list[str]:
@@ -40,18 +51,46 @@ def backends() -> list[str]:
     return ["glfw", "egl", "osmesa"] if sys.platform.startswith("linux") else ["glfw"]
 
 
-def _open_context(width: int, height: int):
+def open_context(names: Sequence[str], model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
+    """Opens the first back end of some that a model can be drawn with: its window, and its graphics memory.
+
+    Raises:
+        RuntimeError: if there is none; the message says why, and what to install.
+    """
     reasons = []
-    for name in backends():
+    for name in names:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
                 context.make_current()
-                return context
+                return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # the back ends raise whatever their libraries raise
-            reasons.append(f"{name}: {type(error).__name__}: {error}")
-    raise RuntimeError(f"no OpenGL library could be used to draw ({'; '.join(reasons)}); {_INSTALL}")
+            said = " ".join(str(error).split())
+            reasons.append(f"{name}: {type(error).__name__}: {said}")
+    raise RuntimeError(f"no OpenGL library could be used to draw ({'; '.join(reasons)}); {INSTALL}")
+
+
+def try_backends() -> dict[str, str]:
+    """Draws with every back end of this system in a process of its own, which a driver may end.
+
+    Returns:
+        dict: by name what went wrong, nothing where it can be used.
+    """
+    known = {"darwin": ("cgl", "glfw"), "linux": ("egl", "osmesa", "glfw")}.get(sys.platform, ("glfw",))
+    return {name: _try(name) for name in known}
+
+
+def _try(name: str) -> str:
+    words = [sys.executable, "-c", _PROBE.format(name)]
+    try:
+        done = subprocess.run(words, env={**os.environ, "MUJOCO_GL": name}, capture_output=True, text=True, timeout=60)
+    except subprocess.TimeoutExpired:
+        return "no answer in 60 s"
+    if done.returncode == 0:
+        return ""
+    said = done.stderr.strip().splitlines()
+    return said[-1] if said else f"it ended with status {done.returncode}"
 
 
 class Renderer:
@@ -74,13 +113,12 @@ class Renderer:
                 raise ValueError(f"{name} must be a positive number of pixels, got {size!r}")
         self.size = (width, height)
         self._model = model
-        self._context = _open_context(width, height)
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._context, self._gpu = open_context(backends(), model, width, height)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = shadows
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
-        self._gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
 
     def render(self, data: mujoco.MjData, camera: str = "cage") -> np.ndarray:
