@@ -17,7 +17,6 @@ from pathlib import Path
 import page_rows
 import paper_rows
 import pictures
-import scooping_rows
 import tables
 import tyro
 import unlabelled_rows
@@ -33,7 +32,7 @@ def pages() -> dict[Path, str]:
     environment = Environment(
         loader=FileSystemLoader(tables.SOURCE), undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
-    for module in (tables, paper_rows, unlabelled_rows, scooping_rows, page_rows):
+    for module in (tables, paper_rows, unlabelled_rows, page_rows):
         environment.globals.update(vars(module))
     made = {}
     for template in sorted(tables.SOURCE.rglob("*.md.jinja")):

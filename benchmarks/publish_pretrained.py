@@ -22,8 +22,7 @@ from tyro.conf import Positional
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
-from torchrl_koap.runs.pretrained import copy_run
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory, copy_run
 from torchrl_koap.runs.weights import ROW_SCALE, load_tensors, save_tensors
 from torchrl_koap.tasks import get_task
 

@@ -27,7 +27,7 @@ from tiny_runs import TINY, koap, write_demonstrations  # noqa: E402
 from torchrl_koap import load_policy
 from torchrl_koap.envs.registry import make_env_of
 from torchrl_koap.evaluation.rollouts import roll_out
-from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import get_task
 
 COLUMNS = ("process", "episodes", "seconds", "resident_mb", "largest_mb")

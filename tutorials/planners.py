@@ -27,7 +27,7 @@ from torchrl_koap import get_task, load_policy
 from torchrl_koap.envs import AvoidingEnv, mode_index_of
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import score
-from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.run_directory import find_run
 
 torch.set_num_threads(1)
 task, run = get_task("avoiding"), find_run("pretrained:avoiding")

@@ -15,24 +15,24 @@ from torchrl_koap.data import open_dataset
 
 
 def test_the_angle_of_the_block_becomes_cosine_and_sine(benchmark_script):
-    columns = benchmark_script("pusht").columns(np.array([[1.0, 2.0, 3.0, 4.0, np.pi / 2]]))
+    columns = benchmark_script("proving_grounds").six_columns(np.array([[1.0, 2.0, 3.0, 4.0, np.pi / 2]]))
     np.testing.assert_allclose(columns, [[1, 2, 3, 4, 0, 1]], atol=1e-6)
 
 
 def test_missing_demonstrations_are_named(benchmark_script, monkeypatch, tmp_path):
-    pusht = benchmark_script("pusht")
-    monkeypatch.setattr(pusht, "DATA", tmp_path / "pusht.npz")
+    script = benchmark_script("proving_grounds")
+    monkeypatch.setattr(script, "DATA", tmp_path / "pusht.npz")
     with pytest.raises(FileNotFoundError, match="pusht.npz is not there"):
-        pusht.write_data_set(tmp_path / "data")
+        script.write_data_set(tmp_path / "data")
 
 
 def test_push_t_becomes_a_data_set(benchmark_script, monkeypatch, tmp_path):
     data = SHARED / "proving_grounds" / "pusht_human_206.npz"
     if not data.is_file():
         pytest.skip(f"{data} is not there")
-    pusht = benchmark_script("pusht")
-    monkeypatch.setattr(pusht, "DATA", data)
-    pusht.write_data_set(tmp_path / "data")
+    script = benchmark_script("proving_grounds")
+    monkeypatch.setattr(script, "DATA", data)
+    script.write_data_set(tmp_path / "data")
     steps, task = open_dataset(str(tmp_path / "data"))
     assert len(steps["episode"].unique()) == 206 and len(steps) == 25_650 - 206
     assert task.targets == (0, 1) and task.robot == (0, 1) and task.state_dim == 6
@@ -49,7 +49,7 @@ def test_a_row_is_the_mean_largest_reward(benchmark_script, monkeypatch, tmp_pat
         rewards = torch.tensor([[0.1], [0.4 if seeds[0] % 2 else 1.0]])
         return [TensorDict({"next": {"reward": rewards}}, [2]) for _ in seeds]
 
-    monkeypatch.setattr(script.pusht, "write_data_set", lambda folder: folder.mkdir())
+    monkeypatch.setattr(script, "write_data_set", lambda folder: folder.mkdir())
     monkeypatch.setattr(script, "train", lambda config: asked.append(config) or Ran)
     monkeypatch.setattr(script, "load_policy", lambda *args, **options: None)
     monkeypatch.setattr(script, "roll_out", episodes)

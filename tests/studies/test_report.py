@@ -122,11 +122,11 @@ def test_table_and_comparisons_are_files_too(folder):
 
 def test_differences_are_those_of_the_cells(tmp_path):
     rows = make_cells(outcomes := {})
-    write_study_report(tmp_path, rows, outcomes, title="t", reference="vae")
+    write_study_report(tmp_path, rows, outcomes, title="t")
     found = {(row["labels"], row["method"]): float(row["difference"]) for row in read_comparisons(tmp_path)}
     pooled = {(item.labels, item.method): item.mean("success") for item in summarise(rows)}
     for (labels, method), difference in found.items():
-        assert difference == pytest.approx(pooled[float(labels), "vae"] - pooled[float(labels), method])
+        assert difference == pytest.approx(pooled[float(labels), "koap"] - pooled[float(labels), method])
     assert len(found) == 4
 
 

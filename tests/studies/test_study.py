@@ -11,8 +11,7 @@ from offline_runs import save_arm
 from tiny_runs import TINY, koap
 
 from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig, RunConfig
-from torchrl_koap.runs.pretrained import pretrained_folders
-from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectoryError, pretrained_folders
 from torchrl_koap.studies import Study, run_study
 from torchrl_koap.studies.study import PRESETS, check_study, complete
 from torchrl_koap.tasks import TASKS, get_task

@@ -29,9 +29,8 @@ from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, 
 from torchrl_koap.reports.pictures import draw_pictures
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.device import set_up_torch
-from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import check_logger, log_scores, open_logger, progress_bar
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.tasks import Task
 from torchrl_koap.training import TrainConfig, Trained, train

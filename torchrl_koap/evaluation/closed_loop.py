@@ -23,9 +23,8 @@ from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import load_plugins
-from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import count_up_to, progress_bar
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.trained import Trained

@@ -29,9 +29,8 @@ from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.modules import ExecutionConfig, KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
-from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import progress_bar
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.training.datasets import label_budget
 from torchrl_koap.training.trained import Trained
 

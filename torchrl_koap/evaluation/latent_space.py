@@ -20,6 +20,7 @@ from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.modules.ridge import ridge
 
+HORIZON = 10  # control steps that are predicted
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
 
@@ -58,7 +59,7 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
     return TensorDict(entries | {HAS_ACTION: here[HAS_ACTION].squeeze(-1)}, [len(latent)])
 
 
-def split_trajectories(episode: Tensor, labelled: Tensor, *, seed: int = 0) -> Tensor:
+def split_trajectories(episode: Tensor, labelled: Tensor) -> Tensor:
     """Draws the numbers of half of the trajectories, to fit on, those with a label in the budget first.
 
     The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many. Of every
@@ -70,7 +71,7 @@ def split_trajectories(episode: Tensor, labelled: Tensor, *, seed: int = 0) -> T
     names = episode.unique()
     if len(names) < 2:
         raise ValueError("to fit on half of the trajectories takes at least two, got 1")
-    order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))]
+    order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
     touched = torch.isin(order, episode[labelled].unique())
     return torch.cat([order[touched], order[~touched]])[: len(names) // 2]
 
@@ -184,8 +185,6 @@ def analyse_latent(
     data: TensorDictBase,
     labelled: Tensor,
     parts: Mapping[str, Sequence[int]],
-    *,
-    horizon: int = 10,
 ) -> dict[str, Any]:
     """Measures spectrum, multi-step errors (fewer steps where trajectories are short) and what a linear probe explains.
 
@@ -204,7 +203,7 @@ def analyse_latent(
     result: dict[str, Any] = {"eigenvalues": spectrum(controller.operator.eigenvalues())}
     fit_on = split_trajectories(data[EPISODE], labelled)
     reach = controller.num_window_frames - 1 - controller.num_past
-    horizon = min(horizon, max(1, int(trajectory_lengths(data).min()) - reach))
+    horizon = min(HORIZON, max(1, int(trajectory_lengths(data).min()) - reach))
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
     errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)
     sizes = {"steps": horizon, "fitted_trajectories": len(fit_on), "held_out_trajectories": held_out}

@@ -47,8 +47,7 @@ def plan_errors(
         dict: ``situations``, ``horizon``, ``samples``, ``unit``: a row per unit of the state columns with their names
         (``columns``) and, per model, ``energy_score`` and ``best_of`` as ``overall`` and ``per_step`` in that unit,
         distances over the columns of the unit together; ``relative``: the energy score as a share of that of standing
-        still, the mean over units; ``relative_of_velocity``: the same of constant velocity; ``trajectory``: the
-        relative score per trajectory.
+        still, the mean over units; ``trajectory``: the relative score per trajectory.
     """
     horizon, history = planner.horizon, max(planner.history, 2)  # constant velocity needs two frames
     windows = cut_windows(data, history + horizon, select=["state", "episode"], pad_before=history - 1)
@@ -65,7 +64,6 @@ def plan_errors(
         "horizon": horizon,
         "samples": samples,
         "relative": _relative(scores, "planner"),
-        "relative_of_velocity": _relative(scores, "constant_velocity"),
         "unit": rows,
         "trajectory": [
             {"episode": number, "relative_plan_error": _relative(scores, "planner", episode == number)}

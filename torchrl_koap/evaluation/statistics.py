@@ -54,11 +54,6 @@ def expected_entropy(episodes: int, num_modes: int) -> float:
     """Exact mean of the mode entropy of that many episodes whose modes are drawn uniformly.
 
     A few episodes cannot fill all modes evenly, so this is below 1: what a policy without preferences scores.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.statistics import expected_entropy
-        >>> expected_entropy(1, 24), round(expected_entropy(60, 24), 3), round(expected_entropy(10_000, 24), 3)
-        (0.0, 0.932, 1.0)
     """
     if episodes < 1 or num_modes < 2:
         return 0.0

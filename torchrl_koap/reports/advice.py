@@ -22,13 +22,7 @@ CONTROLS = ("koap_untrained", "linear_steps", "linear")
 
 @dataclass(frozen=True)
 class Advice:
-    """Something to try.
-
-    Args:
-        finding (str): what the numbers say.
-        proposal (str): what may help, or tell more.
-        command (str): the command line, with ``{run}`` for the run directory; empty if there is none.
-    """
+    """What the numbers say, what may help or tell more, and a command line with ``{run}``, if there is one."""
 
     finding: str
     proposal: str

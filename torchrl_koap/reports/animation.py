@@ -40,13 +40,10 @@ def _caption(run: RunFacts) -> str:
     order=20,
 )
 def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
-    """Shows all rollouts from above in real time; plans are thin lines ahead of the dots.
+    """Shows all rollouts from above in real time; plans, if there are any, are thin lines ahead of the dots.
 
-    The bodies of tasks that have them are squares in their colours with a thin path; tools then leave no path.
-
-    Args:
-        rollouts (mapping): the entries of :func:`~torchrl_koap.reports.rollout_plots.draw_rollouts`, ``plan`` and
-            ``plan_step`` if there are any.
+    The bodies of tasks that have them are squares in their colours with a thin path; tools then leave no path. Entries
+    as for :func:`~torchrl_koap.reports.rollout_plots.draw_plans`.
     """
     paths, mode, outcome = read_episodes(rollouts)
     longest = max(map(len, paths), default=0)
@@ -151,12 +148,9 @@ def _latest_plan(plan: np.ndarray, plan_step: np.ndarray, step: int) -> np.ndarr
 def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     """Plays the actions of the first successful rollout, or of the first one, again in the simulator and films them.
 
-    Nothing but the context is drawn at random and the simulator repeats itself exactly, so the film shows what
-    happened, as long as the context is the recorded one to the last digit (float64).
-
-    Args:
-        rollouts (mapping): ``action`` ``[E, T, act]`` (NaN after the end), ``outcome`` ``[E]``, ``context``
-            ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw (rad).
+    The simulator repeats itself exactly, so the film shows what happened, as long as the context is the recorded one to
+    the last digit (float64). Entries: ``action`` ``[E, T, act]`` (NaN after the end), ``outcome`` ``[E]``, and
+    ``context`` ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw (rad).
 
     Raises:
         NothingToDraw: if actions were not kept, or the task is not known.

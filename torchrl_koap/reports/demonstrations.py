@@ -40,10 +40,8 @@ def _caption(run: RunFacts) -> str:
 def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws the demonstrations; transitions with an action label are emphasised, the others grey.
 
-    Args:
-        demonstrations (mapping): ``episode`` ``[N]``, ``labelled`` ``[N]``; ``state`` ``[N, d]`` for tasks without an
-            environment, which are drawn over time, ``position`` ``[N, 2]`` (m) for others; optionally ``objects``
-            ``[N, bodies, 2]`` (m), which get a panel of their own.
+    Entries: ``episode``, ``labelled`` ``[N]``; without an environment ``state`` ``[N, d]``, drawn over time, else
+    ``position`` ``[N, 2]`` (m), and optionally ``objects`` ``[N, bodies, 2]`` (m), which get a panel.
     """
     episode = entry(demonstrations, "episode", [None])
     labelled = entry(demonstrations, "labelled", [len(episode)]).astype(bool)

@@ -21,28 +21,8 @@ _PLAIN = ("seed", "mode")
 _WORDS = {"labels_read_outside_budget": "labels read outside the budget, for evaluation only"}
 
 
-def duration(seconds: float) -> str:
-    """Returns a time in words.
-
-    Examples:
-        >>> from torchrl_koap.reports.html import duration
-        >>> duration(7.25), duration(132), duration(7322)
-        ('7.2 s', '2 min 12 s', '2 h 2 min')
-    """
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
-
-
 def show(value: Any, key: str = "") -> str:
-    """Returns a single value of a JSON file as text, by its key, which may be a seed's; the template escapes it.
-
-    Examples:
-        >>> from torchrl_koap.reports.html import show
-        >>> show(12345), show(0.123456), show("<b>"), show(None), show(12345, "seed")
-        ('12,345', '0.1235', '<b>', '–', '12345')
-    """
+    """Returns a single value of a JSON file as text, by its key, which may be a seed's; the template escapes it."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -57,13 +37,7 @@ def show(value: Any, key: str = "") -> str:
 
 
 def label(key: Any) -> str:
-    """Returns a key as words, with its unit.
-
-    Examples:
-        >>> from torchrl_koap.reports.html import label
-        >>> label("plan_ms"), label("planner_parameters")
-        ('plan (ms)', 'planner parameters')
-    """
+    """Returns a key as words, with its unit."""
     key = str(key)
     if key in _WORDS:
         return _WORDS[key]
@@ -89,7 +63,7 @@ def templates() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters.update(show=show, label=label, columns=columns, duration=duration)
+    environment.filters.update(show=show, label=label, columns=columns)
     return environment
 
 

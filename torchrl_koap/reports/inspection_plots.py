@@ -54,12 +54,7 @@ _MODELS = {
     order=60,
 )
 def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws eigenvalues, errors per horizon, and how much of the true actions lies in the latent ones.
-
-    Args:
-        result (mapping): ``inspect.json``, whose entry ``latent`` is of
-            :func:`~torchrl_koap.evaluation.latent_space.analyse_latent`.
-    """
+    """Draws eigenvalues, errors per horizon, and how much of the true actions lies in the latent ones."""
     latent = result.get("latent", {})
     if "multi_step" not in latent or run.task is None:
         raise NothingToDraw("no latent space was looked into")
@@ -90,11 +85,7 @@ def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
     order=70,
 )
 def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws success of planner, controller and both, and how far execution is from plans in each part of the state.
-
-    Args:
-        result (mapping): ``inspect.json``.
-    """
+    """Draws success of planner, controller and both, and how far execution is from plans in each part of the state."""
     if "both" not in result:
         raise NothingToDraw("the experiments in the simulator were left out")
     figure = Figure(figsize=(9.8, 4.1), layout="constrained")

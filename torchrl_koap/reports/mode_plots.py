@@ -33,11 +33,9 @@ _LISTED = 10  # modes of a single choice that have wide bars with their names be
     order=40,
 )
 def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws how often each mode occurred among the successes, with the entropy of the distribution.
+    """Draws how often each ``mode`` ``[E]`` occurred among the successes, with the entropy of the distribution.
 
-    Args:
-        rollouts (mapping): ``mode`` ``[E]`` (-1: no mode, counted in the title) and ``outcome`` ``[E]``.
-        run (RunFacts): the run; the modes of its demonstrations are drawn as ticks, scaled to the number of rollouts.
+    The title counts those without one (-1); modes of the demonstrations are ticks, scaled to the number of rollouts.
     """
     modes, number = run.modes, run.modes.number
     if number < 2:

@@ -37,10 +37,9 @@ HOLD_SECONDS = 1.5  # of the last frame of a film
 _BUILT_IN = (
     "rollout_plots",
     "demonstrations",
-    "offline_plots",
+    "error_plots",
     "animation",
     "mode_plots",
-    "training_plots",
     "inspection_plots",
 )
 EVAL = "koap eval {run} --episodes 60 --seed 100"
@@ -55,12 +54,7 @@ _COMMANDS = {
 
 @dataclass(frozen=True)
 class Film:
-    """A moving picture.
-
-    Args:
-        frames (iterable): images ``[height, width, 3]``, uint8, of equal size.
-        seconds (float): how long each is shown; the last one is held for longer.
-    """
+    """Images ``[height, width, 3]``, uint8, of equal size, each shown for some seconds, the last one for longer."""
 
     frames: Iterable[np.ndarray]
     seconds: float

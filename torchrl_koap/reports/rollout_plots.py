@@ -50,10 +50,9 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 
     A second panel shows the bodies of tasks that have them: where they start, their paths, where they end.
 
-    Args:
-        rollouts (mapping): ``position`` ``[E, T, 2]`` (m, NaN after the end), ``length`` ``[E]``, ``mode`` ``[E]`` (-1
-            none), ``outcome`` ``[E]`` (0 out of time, 1 success, 2 collision); optionally ``object_position``
-            ``[E, T, bodies, 2]`` (m) and ``context`` ``[E, bodies, 3]`` (x, y in m, yaw in rad).
+    Entries: ``position`` ``[E, T, 2]`` (m, NaN after the end), ``length``, ``mode`` (-1 none) and ``outcome`` (0 out of
+    time, 1 success, 2 collision) ``[E]``; optionally ``object_position`` ``[E, T, bodies, 2]`` (m) and ``context``
+    ``[E, bodies, 3]`` (x, y in m, yaw in rad).
     """
     paths, mode, outcome = read_episodes(rollouts)
     bodies, colors = body_paths(rollouts), mode_colors(run.modes)
@@ -113,11 +112,9 @@ def _plans_caption(run: RunFacts) -> str:
 def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws every plan of a few episodes over the path that was executed.
 
-    Shown are up to two failures, then successes of as many different modes as possible, six in all.
-
-    Args:
-        rollouts (mapping): the entries of :func:`draw_rollouts`, ``plan`` ``[E, P, H, 2]`` (m, NaN padded) and
-            ``plan_step`` ``[E, P]``, the control step at which each plan was made (-1 padding).
+    Shown are up to two failures, then successes of as many different modes as possible, six in all. Entries as for
+    :func:`draw_rollouts`, with ``plan`` ``[E, P, H, 2]`` (m, NaN padded) and ``plan_step`` ``[E, P]``, the control step
+    at which each plan was made (-1 padding).
     """
     paths, mode, outcome = read_episodes(rollouts)
     plan = entry(rollouts, "plan", [len(paths), None, None, 2])

@@ -16,13 +16,7 @@ from torchrl_koap.tasks import Modes, Task, task_from_config
 
 
 def number(value: Any) -> float | int | None:
-    """Returns the value if it is a finite number, else None.
-
-    Examples:
-        >>> from torchrl_koap.reports.run_facts import number
-        >>> number(0.5), number(True), number("0.5"), number(float("nan"))
-        (0.5, None, None, None)
-    """
+    """Returns the value if it is a finite number, else None."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         return None
     return value

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.reports.advice import advice
-from torchrl_koap.reports.html import duration, write_page
+from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, draw_pictures
 from torchrl_koap.reports.run_facts import RunFacts, number
 from torchrl_koap.tasks.units import thousandths
@@ -149,8 +149,8 @@ def _given(source: Mapping[str, Any], key: str) -> bool:
 
 def _tiles(run: RunFacts) -> list[dict[str, Any]]:
     """Returns name, value, note and bar (or None) of every headline number of a run."""
-    found = [*_offline_errors(run), *_rates(run), _entropy(run), _labels(run), _speed(run)]
-    return [item for item in (*found, _time(run)) if item is not None]
+    found = [*_offline_errors(run), *_rates(run), _entropy(run), _speed(run)]
+    return [item for item in found if item is not None]
 
 
 def _tile(name: str, value: str, note: str, interval: tuple[float, ...] | None = None) -> dict[str, Any]:
@@ -213,18 +213,6 @@ def _entropy(run: RunFacts) -> dict[str, Any] | None:
     return _tile(f"{_ENTROPIES[name]}, base {modes}", f"{value:.2f}", "; ".join(notes))
 
 
-def _labels(run: RunFacts) -> dict[str, Any] | None:
-    if run.labels is None:
-        return None
-    labels: Mapping[str, Any] = run.summary["labels"]
-    total, touched, trajectories = (
-        number(labels.get(key)) for key in ("total_transitions", "trajectories_touched", "total_trajectories")
-    )
-    notes = [f"{run.labels / total:.2%} of {total:,.0f} transitions".replace("%", " %")] if total else []
-    notes += [f"in {touched:g} of {trajectories:g} demonstrations"] if touched is not None and trajectories else []
-    return _tile("action labels", f"{run.labels:,.0f}", ", ".join(notes))
-
-
 def _speed(run: RunFacts) -> dict[str, Any] | None:
     rate = run.evaluated("control_hz")
     if rate is None:
@@ -232,13 +220,3 @@ def _speed(run: RunFacts) -> dict[str, Any] | None:
     parts = {"plan_ms": "ms per plan", "control_ms": "ms per control step"}
     notes = [f"{run.evaluated(key):.3g} {what}" for key, what in parts.items() if run.evaluated(key)]
     return _tile("control rate", f"{rate:.0f} Hz", ", ".join(notes))
-
-
-def _time(run: RunFacts) -> dict[str, Any] | None:
-    seconds = run.summary.get("train_seconds")
-    seconds = seconds if isinstance(seconds, Mapping) else {"": seconds}
-    spent = {key: value for key in seconds if (value := number(seconds[key])) is not None}
-    if not spent:
-        return None
-    note = ", ".join(f"{key} {duration(value)}" for key, value in spent.items() if key)
-    return _tile("training time", duration(sum(value for key, value in spent.items() if key != "total")), note)

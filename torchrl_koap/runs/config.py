@@ -12,8 +12,8 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.device import PRECISIONS, check_machine
 from torchrl_koap.runs.plugins import Plugins
-from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.runs.progress import LOGGERS
+from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import HISTORY
 
 COLUMNS = ("robot", "all")

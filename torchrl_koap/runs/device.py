@@ -28,11 +28,6 @@ def find_precision(precision: str, device: str | torch.device = "cpu") -> str:
 
     Warns:
         UserWarning: if bfloat16 was asked for by name where it is emulated.
-
-    Examples:
-        >>> from torchrl_koap.runs.device import find_precision
-        >>> find_precision("float32"), find_precision("auto") in ("float32", "bfloat16")
-        ('float32', True)
     """
     lookup(PRECISIONS, precision, "precision")
     if precision == "float32":

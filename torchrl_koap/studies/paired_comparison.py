@@ -25,6 +25,7 @@ COMPARISON_COLUMNS = (
     *("task", "label_unit", "demonstrations", "labels", "reference", "method"),
     *("difference", "low", "high", "p", "p_holm", "contexts", "seeds", "n"),
 )
+REFERENCE = "koap"  # that all other methods are compared with
 _FLIPS = 10_000
 _RESAMPLES = 4_000
 _CHUNK = 500
@@ -157,19 +158,16 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return adjusted
 
 
-def compare_cells(
-    rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome], *, reference: str = "koap"
-) -> list[dict[str, Any]]:
-    """Compares a method with every other one at every share of labels.
+def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> list[dict[str, Any]]:
+    """Compares KOAP with every other method at every share of labels.
 
     Args:
         rows (sequence of mapping): cells; those that are not done take no part.
         outcomes (mapping): by the ``run`` of a cell its successes, or of a task without an environment its relative
             action errors, by (context or trajectory, evaluation seed).
-        reference (str): the method that all others are compared with.
 
     Returns:
-        list: a row of :data:`COMPARISON_COLUMNS` per other method and share, where ``difference`` is the reference's
+        list: a row of :data:`COMPARISON_COLUMNS` per other method and share, where ``difference`` is KOAP's
         success minus the other's (or error, trajectory by trajectory in place of contexts), ``p_holm`` is corrected
         over all rows, ``n`` counts paired rollouts and what cannot be compared is None.
     """
@@ -185,9 +183,9 @@ def compare_cells(
     compared = []
     for key, methods in groups.items():
         for method in methods:
-            if reference in methods and method != reference:
-                result = compare(methods[reference], methods[method], errors=key in offline)
-                known = dict(zip(COMPARISON_COLUMNS, (*key, reference, method), strict=False))
+            if REFERENCE in methods and method != REFERENCE:
+                result = compare(methods[REFERENCE], methods[method], errors=key in offline)
+                known = dict(zip(COMPARISON_COLUMNS, (*key, REFERENCE, method), strict=False))
                 known |= {"n": 0} if result is None else asdict(result)
                 compared.append({name: _unless_nan(known.get(name)) for name in COMPARISON_COLUMNS})
     for row, adjusted in zip(compared, holm([row["p"] for row in compared]), strict=True):

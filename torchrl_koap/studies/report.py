@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.html import write_page
-from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, Outcome, compare_cells
+from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, REFERENCE, Outcome, compare_cells
 from torchrl_koap.studies.paper import paper_points, write_paper_layout
 from torchrl_koap.studies.plots import plot_measure
 from torchrl_koap.studies.table import (
@@ -69,7 +69,6 @@ def write_study_report(
     *,
     title: str,
     options: Mapping[str, Any] | None = None,
-    reference: str = "koap",
 ) -> Path:
     """Writes ``table.md``, ``comparisons.csv``, pictures and ``index.html`` into the folder of a study.
 
@@ -82,13 +81,12 @@ def write_study_report(
 
     Keyword Args:
         title, options: heading and options of the study.
-        reference (str): method that all others are compared with.
 
     Raises:
         ValueError: if a cell occurs twice.
     """
     folder, summaries = Path(folder), summarise(rows)
-    compared = compare_cells(rows, outcomes or {}, reference=reference)
+    compared = compare_cells(rows, outcomes or {})
     with replacing_file(folder / "table.md") as aside:
         aside.write_text(markdown_table(rows), encoding="utf-8")
     write_csv(folder / "comparisons.csv", COMPARISON_COLUMNS, compared)
@@ -106,8 +104,8 @@ def write_study_report(
         layout=write_paper_layout(folder, windows) if windows else None,
         offline=offline,
         figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows))),
-        compared=_comparison_rows(compared, reference, offline=offline),
-        reference=reference,
+        compared=_comparison_rows(compared, offline=offline),
+        reference=REFERENCE,
         not_done=not_done(rows),
     )
 
@@ -176,7 +174,7 @@ def _figure(name: str, kind: str, task: str, more: str = "") -> dict[str, Any]:
     return {"title": f"{head}, {task}", "caption": caption + more, "source": source, "beside": not wide}
 
 
-def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, offline: bool) -> list[dict[str, str]]:
+def _comparison_rows(compared: Sequence[Mapping[str, Any]], *, offline: bool) -> list[dict[str, str]]:
     factor, form, head, unit = 100, "+.1f", "difference (points)", "contexts"
     if offline:
         factor, form, head, unit = 1, "+.3f", "difference of the relative action error", "trajectories"
@@ -190,7 +188,7 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, o
         | ({"demonstrations used": percent(row["demonstrations"])} if several["demonstrations"] else {})
         | {
             "labels": percent(row["labels"]),
-            f"{reference} against": row["method"],
+            f"{REFERENCE} against": row["method"],
             head: "nothing in common" if row["difference"] is None else text(row["difference"]),
             "95 % interval": "–" if row["low"] is None else f"{text(row['low'])} to {text(row['high'])}",
             "p": _p_text(row["p"]),

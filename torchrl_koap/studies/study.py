@@ -17,7 +17,7 @@ from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.config import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.runs.config_files import fill_in
 from torchrl_koap.runs.plugins import load_plugins
-from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.studies.cells import NOISE_STEP, Cell
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of

@@ -231,13 +231,7 @@ def cell_name(row: Mapping[str, Any]) -> str:
 
 
 def percent(share: float | None, digits: int | None = None) -> str:
-    """A share in percent, with as few digits as it has if ``digits`` is not given; None gives a dash.
-
-    Examples:
-        >>> from torchrl_koap.studies.table import percent
-        >>> percent(0.02), percent(0.005), percent(2 / 3, 1), percent(None)
-        ('2 %', '0.5 %', '66.7 %', '–')
-    """
+    """A share in percent, with as few digits as it has if ``digits`` is not given; None gives a dash."""
     if share is None:
         return "–"
     return f"{100 * share:.6g} %" if digits is None else f"{100 * share:.{digits}f} %"

@@ -18,8 +18,7 @@ from torchrl_koap.modules import CommandDecoder, Execution, Follower, PlanningPo
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
 from torchrl_koap.runs.plugins import load_plugins
-from torchrl_koap.runs.pretrained import find_run
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, find_run
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task, get_task, task_from_config
 from torchrl_koap.tasks.registry import plain_task

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Charts of the training: losses, and predicted against recorded actions."""
+"""Charts of losses, and of errors of plans and actions."""
 
 from __future__ import annotations
 
@@ -10,11 +10,24 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from torchrl_koap.reports.pictures import picture
+from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, FAINT, MUTED, WARNING, entry, set_title, tidy
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAINT,
+    MUTED,
+    ORANGE,
+    PALE_BLUE,
+    RED,
+    WARNING,
+    entry,
+    legend_beside,
+    set_title,
+    tidy,
+)
 from torchrl_koap.tasks.units import thousandths
 
 _ROUND = (1, 2, 5, 10)
@@ -25,6 +38,21 @@ TERMS = {
     "loss_action": "action decoder (labelled steps)",
     "held_out_score": "plan error, held-out demonstrations",
 }
+_PLANS = {
+    "planner": ("planner", BLUE, "solid"),
+    "standing_still": ("standing still", MUTED, "dashed"),
+    "constant_velocity": ("constant velocity", ORANGE, "dashed"),
+}
+_ACTIONS = {
+    "controller": ("controller", BLUE),
+    "ridge": ("ridge on raw frames", PALE_BLUE),
+    "mean_action": ("always the mean action", MUTED),
+}
+_SPLITS = {
+    "outside_budget": "labels outside the budget, for evaluation only",
+    "left_out": "labels inside the budget, a trajectory left out at a time",
+}
+_MANY = 6  # from here on names of columns are turned
 
 
 @picture(
@@ -39,9 +67,7 @@ TERMS = {
 def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
     """Draws loss curves, a panel per term, logarithmic; raw values pale, a running mean on top.
 
-    Args:
-        rows (sequence): rows of ``metrics.csv`` with ``step`` and any number of ``loss_*``, empty where a term does not
-            belong to the row.
+    Rows have ``step`` and any number of ``loss_*``, empty where a term does not belong to the row.
     """
     if not rows:
         raise ValueError("no row has been logged yet")
@@ -110,14 +136,9 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     order=90,
 )
 def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws predicted against recorded actions, a panel per dimension.
+    """Draws ``predicted`` against ``true`` actions ``[N, d]``, a panel per column, in thousandths of their units.
 
-    The recorded actions are those of demonstrations outside the budget, read for evaluation only; the title says so.
-    Metres, radians, seconds and newtons are shown in thousandths.
-
-    Args:
-        data (mapping): ``predicted`` and ``true`` actions ``[N, d]``.
-        run (RunFacts): the run, whose task names the columns.
+    They are of demonstrations outside the budget, read for evaluation only; the title says so.
     """
     true = entry(data, "true", [None, None])
     predicted, width = entry(data, "predicted", true.shape), true.shape[1]
@@ -162,3 +183,99 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.square(values).mean()))
+
+
+@picture(
+    "plan_errors.png",
+    source="eval.json",
+    title="Errors of the plans",
+    caption="On trajectories that the planner has never seen, for each planned step. Left: energy score of the sampled"
+    " plans, which no second way of doing the task spoils; dashed, what needs no learning. Right: the best of the"
+    " samples, in which a planner is to have what was recorded among its plans. A row per unit; distances over all"
+    " columns of that unit together.",
+    order=15,
+    offline=True,
+)
+def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws errors of sampled plans over the horizon beside those of baselines that need no learning."""
+    plan = _part(result, "plan_errors")
+    if "unit" not in plan:
+        raise NothingToDraw("no plan was evaluated on recorded data")
+    rows = plan["unit"]
+    figure = Figure(figsize=(8.8, 0.9 + 2.9 * len(rows)), layout="constrained")
+    panels = figure.subplots(len(rows), 2, squeeze=False, sharex=True, sharey="row")
+    for row, pair in zip(rows, panels, strict=True):
+        shown, factor = thousandths(row["unit"])
+        for kind, axes in zip(("energy_score", "best_of"), pair, strict=True):
+            for name, (label, color, dash) in _PLANS.items():
+                values = factor * np.asarray(row[name][kind]["per_step"], dtype=float)
+                steps = np.arange(1, len(values) + 1)
+                axes.plot(steps, values, color=color, linestyle=dash, linewidth=1.6, label=label)
+            axes.set_ylim(bottom=0)
+            axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
+            tidy(axes, grid=True)
+        pair[0].set_ylabel(f"distance ({shown or 'units of the data'})")
+        set_title(pair[0], f"energy score: {_list_names(row['columns'])}")
+        set_title(pair[1], f"best of {plan['samples']} plans")
+    each = f", {1e3 / run.control_hz:.0f} ms each" if run.control_hz else ""
+    for axes in panels[-1]:
+        axes.set_xlabel(f"planned step{each}")
+    legend_beside(panels[0, 1])
+    return figure
+
+
+@picture(
+    "action_errors.png",
+    source="eval.json",
+    title="Errors of the actions",
+    caption="Root mean square error of the actions decoded from recorded states, a group of bars per action column."
+    " Red: the controller does no better there than always giving the mean action. Controllers see recorded states"
+    " here; planned ones are not as good.",
+    order=16,
+    offline=True,
+)
+def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws errors of decoded actions by column and unit, beside a ridge's and those of always the mean action."""
+    parts = [(name, part) for name, part in _part(result, "action_errors").items() if "column" in part]
+    if not parts:
+        raise NothingToDraw("no action was evaluated on recorded data")
+    units = list(dict.fromkeys(row["unit"] for _, part in parts for row in part["column"]))
+    counts = [sum(row["unit"] == unit for row in parts[0][1]["column"]) for unit in units]
+    figure = Figure(figsize=(3.6 + 0.62 * sum(counts) + 1.2 * len(units), 0.8 + 2.9 * len(parts)), layout="constrained")
+    widths = [1 + count for count in counts]
+    panels = figure.subplots(len(parts), len(units), squeeze=False, width_ratios=widths)
+    for (name, part), line in zip(parts, panels, strict=True):
+        for unit, axes in zip(units, line, strict=True):
+            _draw_bars(axes, [row for row in part["column"] if row["unit"] == unit], unit)
+        judged = f"{part['labels']:,} labels of {part['trajectories']} trajectories"
+        set_title(line[0], f"{_SPLITS.get(name, name)}\n{judged}")
+    handles = [Line2D([], [], color=color, linewidth=6, label=label) for label, color in _ACTIONS.values()]
+    if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
+        handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
+    legend_beside(panels[0, -1], handles=handles)
+    return figure
+
+
+def _draw_bars(axes: Axes, rows: Sequence[Mapping[str, Any]], unit: str) -> None:
+    shown, factor = thousandths(unit)
+    places = np.arange(len(rows))
+    for offset, (name, (_, color)) in zip((-0.27, 0.0, 0.27), _ACTIONS.items(), strict=True):
+        values = [factor * row.get(name, math.nan) for row in rows]
+        worse = [name == "controller" and row[name] >= row["mean_action"] for row in rows]
+        axes.bar(places + offset, values, width=0.25, color=[RED if bad else color for bad in worse])
+    axes.set_xticks(places, [row["name"] for row in rows], rotation=45 if len(rows) > _MANY else 0)
+    axes.set_xlim(-0.6, len(rows) - 0.4)
+    axes.set_ylabel(f"RMSE ({shown or 'units of the data'})")
+    axes.set_axisbelow(True)
+    tidy(axes, grid=True)
+
+
+def _part(result: Any, name: str) -> Mapping[str, Any]:
+    """An entry of ``eval.json``; empty where it is absent, as in that of rollouts, or the file is damaged."""
+    part = result.get(name) if isinstance(result, Mapping) else None
+    return part if isinstance(part, Mapping) else {}
+
+
+def _list_names(names: Sequence[str]) -> str:
+    """Names of columns in a title, the middle of many left out."""
+    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, {names[1]}, ... {names[-1]} ({len(names)} columns)"

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from run_files import run_of, titles
 
+from torchrl_koap.reports.error_plots import draw_actions, draw_losses, running_mean
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.training_plots import draw_actions, draw_losses, running_mean
 from torchrl_koap.tasks import Action, Task
 
 NOTHING = run_of(None)
