@@ -121,6 +121,82 @@ for _name in (CAMERA, STATE):
     }
 
 
+CONVERT = ("convert", "{filmed}", "--out", "{out}")
+SEEN = ("embed", "{seen}", "--out", "{out}", "--network", "tiny_network:random_layer", "--components", "3")
+TOP, WRIST = "1/top/000007.png", "1/wrist.npy"
+
+
+def of_array(change: Callable[[Any], Any]) -> Callable[[Path], None]:
+    """A change of the frames that the camera wrist saw."""
+
+    def do(folder: Path) -> None:
+        import numpy as np
+
+        np.save(folder / WRIST, change(np.load(folder / WRIST)))
+
+    return do
+
+
+def of_picture(size: int, channels: int) -> Callable[[Path], None]:
+    return lambda folder: (folder / TOP).write_bytes(_png(size, channels)) and None
+
+
+# frames beside own arrays: what is said where they are converted, and where they are embedded after it; the damage
+FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
+    "a frame missing": (
+        "1.npz.*'top': frame 7 is missing",
+        "'top' of 1.*frame 7 is missing",
+        lambda folder: (folder / TOP).unlink(),
+    ),
+    "frames without end": (
+        r"'wrist' has 18 frames for 20 rows.*drop_columns wrist",
+        "'wrist' of 1.*frame 18 is missing",
+        of_array(lambda frames: frames[:18]),
+    ),
+    "a camera absent": (
+        "'wrist' has no frames in 1.npz",
+        r"wrist.npy is not there \(any more\)",
+        lambda folder: (folder / WRIST).unlink(),
+    ),
+    "names without numbers": (
+        "must end in a number",
+        "must end in a number",
+        lambda folder: (folder / TOP).rename(folder / "1/top/last.png"),
+    ),
+    "no array": (*("wrist.npy holds no array of numbers",) * 2, lambda folder: (folder / WRIST).write_bytes(b"array")),
+    "a damaged picture": (
+        None,
+        "'top' of 1.*frame 7 .000007.png. is no picture",
+        lambda folder: (folder / TOP).write_bytes(b"PNG"),
+    ),
+    "another size": (None, "'top' of 1.*frame 7 is 16 x 16, the camera's others are 32 x 32", of_picture(16, 3)),
+    "alpha": (None, "'top' of 1.*frame 7 is RGBA", of_picture(32, 4)),
+    "greyscale": (None, "'wrist' of 1.*frame 0 is greyscale.*save it as RGB", of_array(lambda frames: frames[..., 0])),
+    "floats": (None, "'wrist' of 1.*frame 0 is float64, wanted uint8", of_array(lambda frames: frames / 255.0)),
+    "colours first": (
+        None,
+        "'wrist' of 1.*put the colours last",
+        of_array(lambda frames: frames.transpose(0, 3, 1, 2)),
+    ),
+}
+
+
+def filmed(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
+    return lambda place: damage(place.get("filmed")) and None
+
+
+def seen(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
+    """Damage after the frames were converted."""
+
+    def do(place: Place) -> None:
+        from torchrl_koap.data import read_recordings, save_demonstrations
+
+        save_demonstrations(place.get("seen"), read_recordings(place.get("filmed")))
+        damage(place.get("filmed"))
+
+    return do
+
+
 def in_projection() -> Iterator[tuple[str, str, Callable[[dict[str, Any], dict[str, str]], Any]]]:
     """What is wrong, what is said, and the change of tensors and description."""
     yield "of other weights", "other|fitted", lambda _, about: about.update(weights="0" * 64)
@@ -149,6 +225,14 @@ def faults() -> Iterator[Fault]:
         yield Fault(f"features {name}", EMBED, "camera|feature", info(put("features", value)))
     for name, (says, change) in EPISODE.items():
         yield Fault(name, EMBED, says, columns(change))
+    for name, (early, late, damage) in FILMED.items():
+        says = {} if early is None else {"says": early}
+        yield Fault(f"filmed {name}", CONVERT, damage=filmed(damage), accepted=early is None, **says)
+        yield Fault(f"seen {name}", SEEN, late, seen(damage))
+    yield Fault("seen nothing wrong", SEEN, damage=seen(lambda folder: None), accepted=True)
+    unharmed = seen(lambda folder: None)
+    yield Fault("another camera", (*SEEN, "--camera", "tip"), "unknown camera 'tip'; did you mean 'top'", unharmed)
+    yield Fault("too many components", (*SEEN[:-1], "99"), "99 components need more", unharmed)
     code = pickle.dumps(os.system)
     yield Fault("weights are code", OWN_WEIGHTS, "weights", lambda place: _write(place, WEIGHTS, code))
     for name, content in {"a list": [1], "a number": 3, "numbers by name": {"conv1.weight": 3}}.items():

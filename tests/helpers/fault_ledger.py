@@ -54,8 +54,8 @@ class Place:
 
     Args:
         root (Path): an empty folder.
-        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, camera ``frames``
-            and a ``network`` for them; not written to.
+        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, ``filmed`` arrays,
+            camera ``frames`` and a ``network`` for them; not written to.
     """
 
     root: Path
@@ -187,7 +187,7 @@ def make_camera_template(root: Path) -> None:
     import numpy as np
     import torch
 
-    from torchrl_koap.data.formats.writers import LeRobotWriter
+    from torchrl_koap.data.formats.writers import LeRobotWriter, encode_png
     from torchrl_koap.tasks import get_task
     from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
 
@@ -203,6 +203,14 @@ def make_camera_template(root: Path) -> None:
         action = generator.normal(size=(length, task.action_dim))
         writer.add(generator.normal(size=(length + 1, 3)), action, frames=frames)
     writer.close()
+    for number in range(2):  # recordings with two cameras beside them
+        states = generator.normal(size=(20, 2)).cumsum(0)
+        (root / "filmed" / str(number) / "top").mkdir(parents=True)
+        np.savez(root / "filmed" / f"{number}.npz", states=states, actions=np.diff(states, axis=0), control_hz=10.0)
+        frames = generator.integers(0, 256, (20, width, width, 3), dtype=np.uint8)
+        np.save(root / "filmed" / str(number) / "wrist.npy", frames)
+        for index, frame in enumerate(frames):
+            (root / "filmed" / str(number) / "top" / f"{index:06d}.png").write_bytes(encode_png(frame))
     fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
     fitted.about = FrozenImageEncoder(backbone, size=width).identity
     torch.save({"conv.weight": torch.zeros(3)}, network / "weights.pth")
@@ -237,7 +245,7 @@ def _in_time() -> Iterator[None]:
 
 
 def _filled(word: str, place: Place) -> str:
-    for name in ("run", "data", "ted", "arrays", "frames", "network", "out"):
+    for name in ("run", "data", "ted", "arrays", "filmed", "seen", "frames", "network", "out"):
         if f"{{{name}}}" in word:
             word = word.replace(f"{{{name}}}", str(place.get(name)))
     return word

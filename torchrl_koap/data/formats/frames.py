@@ -134,11 +134,22 @@ def _decode(content: bytes, what: object) -> np.ndarray:
 
 
 def _array(clip: Clip) -> Iterator[np.ndarray]:
-    frames = np.load(clip.file, mmap_mode="r", allow_pickle=False)
+    frames = _load(Path(clip.file))
     for number in clip.numbers:
         if number >= len(frames):
             raise ValueError(f"frame {number} is missing: {clip.file} has {len(frames)}")
         yield frames[number]
+
+
+def _load(file: Path) -> np.ndarray:
+    """An array ``[T, ...]``, whose frames are read when they are asked for."""
+    try:
+        array = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"{file} holds no array of numbers: save it by numpy.save") from error
+    if array.ndim == 0:
+        raise ValueError(f"{file} holds a single number, wanted one entry per frame")
+    return array
 
 
 def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
@@ -230,13 +241,12 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
         if path.is_dir() and _numbered(path):
             name, held = path.name, sorted(_numbered(path))
         elif path.suffix == ".npy" and not path.name.endswith(TIMES):
-            frames = np.load(path, mmap_mode="r", allow_pickle=False)
-            name, held = path.stem, list(range(len(frames)))
+            name, held = path.stem, list(range(len(_load(path))))
         else:
             continue
         times = folder / f"{name}{TIMES}"
         if times.is_file():
-            stamps = np.load(times, allow_pickle=False)
+            stamps = _load(times)
             if clock is None or stamps.shape != (len(held),):
                 lacks = "the table has no clock" if clock is None else f"it has {list(stamps.shape)} times"
                 raise ValueError(f"camera {name!r}: {times.name} is for {len(held)} frames and a clock, {lacks}")
