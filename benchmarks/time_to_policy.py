@@ -12,7 +12,6 @@ three seeds of noise each. What is in the table is not run again.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -25,7 +24,7 @@ from torchrl_koap import EvalConfig, LabelConfig, PlannerConfig, RunConfig, Trai
 RESULTS = Path(__file__).resolve().parent / "results" / "time_to_policy.csv"
 KEYS = ("task", "method", "labels", "network", "held_out", "updates", "seed")
 COLUMNS = (*KEYS, "precision", "kept_update", "core_seconds", "successes", "n", "entropy")
-ROLLOUTS = {"episodes": 180, "rollouts_per_context": 3}
+ROLLOUTS, PER_CONTEXT = 180, 3
 
 
 def main(
@@ -62,17 +61,28 @@ def main(
     labels = LabelConfig(count=count, fraction=fraction, unit="trajectory" if fraction is None else "window")
     for updates in steps:
         planner = PlannerConfig(steps=updates, network=network, held_out=held_out)
-        asked = TrainConfig(dataset=str(dataset), task=task, method=method, labels=labels, planner=planner)
         name = "-".join(map(str, (task, method, count or fraction, network, held_out, updates, seed)))
+        run = RunConfig(seed=seed, resume=True)
         began = time.process_time()
-        trained = train(replace(asked, out=folder / name, run=RunConfig(seed=seed, resume=True)))
+        trained = train(
+            TrainConfig(
+                dataset=str(dataset),
+                out=folder / name,
+                task=task,
+                method=method,
+                labels=labels,
+                planner=planner,
+                run=run,
+            )
+        )
         seconds = time.process_time() - began
         used = trained.config
         network_used = (used.planner.network, used.planner.held_out, used.planner.steps)
         key = (task, used.method, count or fraction, *network_used, seed)
         if tuple(map(str, key)) in done:
             continue
-        score = evaluate(folder / name, EvalConfig(**ROLLOUTS))
+        again = PER_CONTEXT if trained.task.objects else 1
+        score = evaluate(folder / name, EvalConfig(episodes=ROLLOUTS, rollouts_per_context=again))
         success = score["rates"]["success"]
         kept = trained.results["planner"].get("kept_update", "")
         successes = round(success["rate"] * success["episodes"])
