@@ -120,8 +120,6 @@ def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0)
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"MUJOCO_GL": "bogus"}, "MUJOCO_GL: bogus"),
-        ({"MUJOCO_GL": "osmesa"}, "MUJOCO_GL=osmesa"),
         ({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is no backend"),
         ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO"),
     ],
@@ -129,6 +127,19 @@ def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0)
 def test_settings_with_which_nothing_can_be_imported(settings, says):
     status, said = ended("doctor", settings=settings)
     assert status == 1 and says in said and len(said.splitlines()) == 1
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("chosen", ["bogus", "osmesa", "glfw", "egl", "off"])
+@pytest.mark.parametrize("command", ["doctor", "eval"])
+def test_a_back_end_that_may_not_be_there_costs_a_film_at_most(command, chosen, copied_run):
+    words = ("eval", str(copied_run), "--episodes", "1", "--threads", "1") if command == "eval" else ("doctor",)
+    status, said = ended(*words, "--quiet", settings={"MUJOCO_GL": chosen, "DISPLAY": "", "WAYLAND_DISPLAY": ""})
+    assert status == 0 and "Traceback" not in said
+    if command == "eval":
+        told = [line for line in said.splitlines() if line.startswith("warning: film.gif was not made")]
+        assert len(told) + (copied_run / "plots" / "film.gif").exists() == 1
+        assert (copied_run / "eval.json").exists() and (copied_run / "index.html").exists()
 
 
 @pytest.mark.faults

@@ -43,17 +43,15 @@ WRONG: dict[Any, tuple[str, ...]] = {
     str: ("n0nsense", ""),
     Path: ("", "/dev/null/below"),
 }
-# values that are right after all: names of one's own, and 0 where it means "none of it"
+# values that are right after all: names of one's own, 0 where it means "none of it", limits that hold nothing
 RIGHT = {
-    "convert": ("--name n0nsense", "--out /dev/null/below"),
+    "convert": ("--name n0nsense",),
     "demos": ("--seed 0",),
     "eval": ("--seed 0", "--limits inf"),
     "inspect": ("--seed 0", "--limits inf"),
-    "suggest": ("--seed 0",),
     "train": (
-        *("--run.seed 0", "--controller.steps 0", "--labels.episodes -1", "--labels.episodes 0"),
-        *("--planner.held-out 0", "--planner.octaves 0", "--execution.blend 0", "--execution.lead 0"),
-        "--execution.limits inf",
+        *("--run.seed 0", "--controller.steps 0", "--planner.held-out 0", "--planner.octaves 0"),
+        *("--execution.blend 0", "--execution.lead 0", "--execution.limits inf"),
     ),
 }
 RIGHT["curve"] = RIGHT["bench"] = (*RIGHT["train"], "--evaluation.seed 0")
@@ -110,6 +108,8 @@ def faults() -> Iterator[Fault]:
                 if kind is bool:
                     says = value
                 yield Fault(f"{option} {value or 'empty'}", words, says, status=(1, 2))
+        for call in RIGHT.get(name, ()):
+            yield Fault(f"right {call}", (name, *BASE[name], *call.split()), accepted=True)
 
 
 if __name__ != "__main__":

@@ -131,9 +131,7 @@ def _commands() -> tuple[Any, ...]:
             from torchrl_koap.commands import options, subcommands
             from torchrl_koap.runs.progress import without_progress_bars
         except (ImportError, AttributeError) as error:
-            graphics = os.environ.get("MUJOCO_GL")
-            hint = f"; is MUJOCO_GL={graphics} possible on this machine?" if graphics else ""
-            raise RuntimeError(f"a part of the installation cannot be imported: {error}{hint}") from error
+            raise RuntimeError(f"a part of the installation cannot be imported: {error}") from error
         except ValueError as error:
             backend = os.environ.get("MPLBACKEND")
             if backend and backend in str(error):
