@@ -14,6 +14,7 @@ from torchrl_koap.data import (
     make_demonstrations,
     open_dataset,
     read_about,
+    read_recordings,
     save_demonstrations,
 )
 from torchrl_koap.keys import validate
@@ -126,17 +127,41 @@ def test_an_action_that_never_changes_is_commanded_as_it_is():
     assert absolute.action_rule(torch.full((1, 3, 4), 2.0), decoded)[0].tolist() == [[3, 3, 0.5]] * 3
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda frames: np.column_stack([0 * frames[:, :2], frames[:, 2:]]), "robot: q1, q2 never move"),
-        (lambda frames: frames + 4e6, "'q1' moves by .* at up to 4e.06, and float32 holds it to .*subtract an offset"),
-    ],
-)
-def test_states_of_which_nothing_can_be_learnt(change, message):
-    with pytest.raises(DataError, match=message):
-        states = [change(frames) for frames in STATES]
-        make_demonstrations(states, ACTIONS, control_hz=20, state_names=NAMES, robot=["q1", "q2"])
+def test_a_robot_that_stands_where_there_are_labels():
+    still = [np.column_stack([0 * STATES[0][:, :2], STATES[0][:, 2:]]), *STATES[1:]]
+    with pytest.raises(DataError, match="robot: q1, q2 never move where there are labels"):
+        make_demonstrations(still, ACTIONS, control_hz=20, state_names=NAMES, robot=["q1", "q2"])
+
+
+@pytest.mark.parametrize("offset", [4e6, 1e8])
+def test_an_offset_is_subtracted_in_float64_and_stored(offset, tmp_path):
+    far = [frames + [offset, 0, 0, -offset] for frames in STATES]
+    targets = [far[0][1:, [0, 3]], None, None]
+    absolute = {"control_hz": 20, "action_kind": "absolute", "targets": [0, 3]}
+    data, task = make_demonstrations(far, targets, **absolute)
+    near, _ = make_demonstrations(
+        [frames - task.observation_origin for frames in far], None, control_hz=20, action_dim=2
+    )
+    torch.testing.assert_close(data["observation"], near["observation"], atol=0, rtol=0)
+    assert np.abs(np.array(task.observation_origin) - [offset, 0, 0, -offset]).max() < 20
+    assert task.origins[1] == (task.observation_origin[0], task.observation_origin[3])
+    torch.testing.assert_close(data["action"][:29], data["next", "observation"][:29, [0, 3]])
+    assert Task.from_json(task.to_json()) == task
+    again = read_recordings(save_demonstrations(tmp_path / "far", far, targets, **absolute))
+    np.testing.assert_allclose(again.states[0], far[0], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(again.actions[0], targets[0], rtol=0, atol=1e-5)
+
+
+def test_small_offsets_stay():
+    assert make_demonstrations([frames + 100 for frames in STATES], ACTIONS, control_hz=20)[1].origins is None
+
+
+def test_offsets_that_nothing_could_subtract():
+    far = [frames + 1e8 for frames in STATES]
+    with pytest.raises(DataError, match="command column 'cup_x' is at 1e.08: subtract that from it"):
+        make_demonstrations(far, ACTIONS, control_hz=20, state_names=NAMES, command=["cup_x"])
+    with pytest.raises(DataError, match="action column 'action_1' is at 1e.08: subtract that from it"):
+        make_demonstrations(STATES, [ACTIONS[0] + [0, 1e8], None, None], control_hz=20)
 
 
 def test_an_action_column_that_is_mostly_empty_is_named():

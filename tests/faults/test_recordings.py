@@ -36,7 +36,12 @@ KINDS: dict[str, tuple[Callable, str, tuple[str, ...]]] = {
     "stamps that stand": (put("timestamp", np.zeros_like), "time stamps do not increase", ()),
     "stamps in ms": (put("timestamp", lambda t: 1000 * t), "'timestamp' says .*timestamp_ms", ()),
     "a robot that stands": (put("q0", np.zeros_like), "robot: .*q0 never move", ("--robot", "q0")),
-    "an offset": (put("q0", lambda q: q + 4e6), "q0' moves by .*float32 .*subtract an offset", ()),
+    "an offset": (put("q0", lambda q: q + 4e6), "", ()),
+    "an offset of an action": (
+        put("v0", lambda v: v + 4e6, actions=True),
+        r"action column .* is at 4e\+06: subtract that",
+        (),
+    ),
     "a sparse action": (put("v0", sparse, actions=True), r"action column .*\(known in \d+\) is mostly empty", ()),
     "states that are NaN": (put("q0", sparse), "states are not finite at frame 1", ()),
     "an episode that comes back": (

@@ -27,7 +27,7 @@ from torchrl_koap.tasks.action_rules import ActionKind
 
 # what a user calls the kind of an action, and the kind that it is when its rate is settled
 ACTION_KINDS: dict[str, ActionKind] = {name: "absolute" if name == "absolute" else "delta" for name in ADDS_UP}
-_COARSE = 1e-3  # share of a column's range to which float32 must hold it
+_COARSE = 1e-5  # share of a column's range to which float32 has to hold it
 _SLACK = 1.5  # episodes may be that much longer than the longest demonstration
 
 
@@ -119,12 +119,13 @@ def make_demonstrations(
 
     Returns:
         tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the
-        :class:`~torchrl_koap.tasks.Task`.
+        :class:`~torchrl_koap.tasks.Task`. Where float32 would hold the movement of a column coarsely, its middle is
+        subtracted and stored as ``task.observation_origin``; an agent subtracts it too.
 
     Raises:
         DataError: with all faults: those of :func:`~torchrl_koap.data.make_recordings`, columns that
             do not exist or overlap, targets that do not fit, units of another number, a robot that never moves, a
-            column whose movement float32 cannot hold.
+            command or an action without a target whose movement float32 cannot hold.
         ValueError: for an unknown kind of action.
 
     Examples:
@@ -175,7 +176,19 @@ def make_demonstrations(
         problems += [f"column {names[column]!r} is a target and a command" for column in reached if column in commanded]
     units = _each(action_units, len(acting), "action_units", problems)
     own_units = _each(state_units, len(names), "state_units", problems)
-    problems += _coarse(np.concatenate(recordings.states), names)
+    origin = _origin(np.concatenate(recordings.states))
+    problems += [
+        f"command column {names[column]!r} is at {origin[column]:.3g}: subtract that from it, here and on the robot"
+        for column in commanded
+        if origin[column]
+    ]
+    added = origin[reached] if reached and len(reached) == len(acting) else np.zeros(len(acting))
+    actions = [steps - added for steps in recordings.actions]
+    problems += [
+        f"action column {acting[column]!r} is at {at:.3g}: subtract that from it, here and on the robot"
+        for column, at in enumerate(_origin(np.concatenate(actions)))
+        if at
+    ]
     labelled = [
         frames[:, own]
         for frames, steps in zip(recordings.states, recordings.actions, strict=True)
@@ -189,14 +202,15 @@ def make_demonstrations(
         )
     if problems:
         raise DataError(f"task {name!r}", problems)
-    constants = constant_columns(np.concatenate(recordings.actions))
-    data = flatten_trajectories(recordings.states, recordings.actions)
+    constants = constant_columns(np.concatenate(actions))
+    data = flatten_trajectories([frames - origin for frames in recordings.states], actions)
     moved = [others.index(column) for column in reached]
     parts = _parts(names, set(own), set(commanded))
     task = Task(
         name=name,
         observation_parts=parts,
         observation_units=own_units,
+        observation_origin=tuple(origin.tolist()) if origin.any() else (),
         actions={
             name: Action(*facts)
             for name, *facts in zip(acting, units, kinds, moved or (None,) * len(acting), constants, strict=True)
@@ -263,15 +277,14 @@ def _targets(
     return columns
 
 
-def _coarse(frames: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Columns of all frames ``[N, d]`` of which float32 keeps too few digits."""
-    spans, farthest = np.ptp(frames, axis=0), np.abs(frames).max(0)
-    kept = np.spacing(farthest.astype(np.float32))
-    return [
-        f"column {names[column]!r} moves by {spans[column]:.3g} at up to {farthest[column]:.3g}, and float32 holds it"
-        f" to {kept[column]:.2g}: subtract an offset from it, here and on the robot"
-        for column in np.flatnonzero((kept > _COARSE * spans) & (spans > 0))
-    ]
+def _origin(rows: np.ndarray) -> np.ndarray:
+    """The middle of every column of ``[N, d]`` of which float32 would keep too few digits, 0 of any other."""
+    known = rows[np.isfinite(rows).all(-1)]
+    if not len(known):
+        return np.zeros(rows.shape[1])
+    low, high = known.min(0), known.max(0)
+    kept = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(np.float32))
+    return np.where((kept > _COARSE * (high - low)) & (high > low), low + (high - low) / 2, 0.0)
 
 
 def _each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:

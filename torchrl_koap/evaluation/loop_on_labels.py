@@ -201,10 +201,11 @@ def _roll(
     now, change = observed[starts], observed[starts] - observed[starts - 1]
     agent, commands, visited = Agent(policy, seed=seed), [], []
     agent.reset()
+    origin, added = policy.origins or (0.0, 0.0)  # the agent reads and tells the robot's numbers
     for _ in range(steps):
         if not (now.abs() < 1e30).all():
             break
-        action = agent.act(now.float()).double().cpu()
+        action = agent.act(now + origin).double().cpu() - added
         change = response.step(now, change, action)
         now = now + change
         commands.append(action)

@@ -65,6 +65,8 @@ class Columns:
         observation_parts (dict): parts of the observation in the order of the columns: a number of columns, or their
             names. Numbered ones are called as the part, with a number if it has several.
         observation_units (tuple of str): unit of every observation column; empty: m for positions, rad for angles.
+        observation_origin (tuple of float): what was subtracted from every column of the data, so that float32 holds
+            them; robots report and take numbers with it (:class:`~torchrl_koap.modules.Agent`). Empty: nothing.
         command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
             never shown to planner or controller. None: the observation holds no command.
         state (dict): part of the observation to name of its feature (``FEATURES``) or its import
@@ -81,6 +83,7 @@ class Columns:
     name: str
     observation_parts: Mapping[str, int | tuple[str, ...]]
     observation_units: tuple[str, ...] = ()
+    observation_origin: tuple[float, ...] = ()
     command: str | None = None
     state: Mapping[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()

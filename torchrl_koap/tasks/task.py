@@ -177,6 +177,14 @@ class Task(Columns):
         known = tuple(column for column in columns if column is not None)
         return known if len(known) == self.action_dim else ()
 
+    @property
+    def origins(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """What was subtracted from every observation column and every action; None: nothing."""
+        if not self.observation_origin:
+            return None
+        columns = [self.state_columns[column] for column in self.targets] or [None] * self.action_dim
+        return self.observation_origin, tuple(0.0 if c is None else self.observation_origin[c] for c in columns)
+
     @cached_property
     def gripper(self) -> tuple[int, int] | None:
         """Action column of the gripper and state column of its width, None where no width commands one."""

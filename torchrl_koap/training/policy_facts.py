@@ -52,6 +52,7 @@ def policy_facts(
         "ranges": ranges,
         "max_steps": task.max_steps,
         "control_hz": task.control_hz,
+        "origins": task.origins,
     }
 
 

@@ -231,3 +231,23 @@ def test_a_compiled_policy_makes_every_plan_that_is_due(make, backend):
     assert torch.equal(collected({"backend": backend}), collected(None))
     policy.compile(backend=backend)
     np.testing.assert_allclose(acted(policy), plain, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("offset", [4e6, 1e8])
+def test_an_origin_is_subtracted_and_added_in_float64(offset):
+    path = np.random.default_rng(0).normal(size=(6, 2))
+    far = make_policy(
+        small_planner(),
+        make_koopman_inverse_dynamics(2, 2),
+        state_of=(0, 1),
+        origins=((offset, -offset), (0.0, offset)),
+    )
+    agents = Agent(policy_of()), Agent(far)
+    for agent in agents:
+        agent.reset()
+    for place in path:
+        near, moved = agents[0].act(place), agents[1].act(place + [offset, -offset])
+        assert moved.dtype == np.float64
+        np.testing.assert_allclose(moved - [0, offset], near, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="act with one"):
+        PolicyEnv(Drift(1), far)

@@ -87,6 +87,20 @@ def test_every_part_comes_back_from_its_file(part, tmp_path):
         torch.testing.assert_close(loaded(*other), what.module(*other), atol=1e-5, rtol=1e-5)
 
 
+def test_an_origin_is_exported(tmp_path):
+    origins = (4e6, 0.0, 4e6, 0.0), (0.0, 4e6, 0.0)
+    far = make_policy(policy().planner, policy().follower.controller, state_of=(2, 3), control_hz=30.0, origins=origins)
+    what = exportable(far, columns=COLUMNS)
+    observed, noise = what.inputs["observations"], what.inputs["noise"]
+    assert what.facts["inputs"]["observations"]["type"] == "float64" and observed.abs().max() > 1e6
+    actions, _ = export_part(what, tmp_path / "policy.pt2")(observed, noise)
+    near = (observed - torch.tensor(origins[0], dtype=torch.float64)).float()
+    expected, _ = far.decode_ahead(near, noise)
+    torch.testing.assert_close(
+        actions - torch.tensor(origins[1], dtype=torch.float64), expected.double(), atol=1e-5, rtol=0
+    )
+
+
 def test_a_diffusion_policy_is_exported_too(tmp_path):
     what = exportable(chunks(), columns=COLUMNS)
     assert export_part(what, tmp_path / "policy.pt2")(*what.inputs.values())[0].shape == (1, 4, 3)

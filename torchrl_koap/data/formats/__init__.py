@@ -49,8 +49,9 @@ def _read_stored(source: str) -> Recordings:
     """All observation columns of a data set of this library, the command included, and the labels that there are."""
     data, task = load_ted(stored_folder(source) or source)
     lengths = trajectory_lengths(data).tolist()
-    observed, behind = data[keys.OBSERVATION].double(), data[keys.NEXT_OBSERVATION].double()
-    actions = torch.where(data[keys.HAS_ACTION], data[keys.ACTION].double(), torch.nan)
+    origin, added = (torch.tensor(part, dtype=torch.float64) for part in task.origins or (0.0, 0.0))
+    observed, behind = (data[key].double() + origin for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION))
+    actions = torch.where(data[keys.HAS_ACTION], data[keys.ACTION].double() + added, torch.nan)
     pairs = zip(observed.split(lengths), behind.split(lengths), strict=True)
     return make_recordings(
         [torch.cat([frames, following[-1:]]) for frames, following in pairs],

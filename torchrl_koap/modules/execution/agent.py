@@ -70,6 +70,7 @@ class Agent:
 
         It is a tensor where the observation is one, else an array. A policy that was trained with cameras takes
         ``{"state": x, "top": frame}``: numbers ``[d]`` and a frame of every camera by its name, uint8 ``[H, W, 3]``.
+        It is float64 where the task has an origin.
         """
         began = time.perf_counter()
         newest = self._checked(observation).unsqueeze(-2)
@@ -77,7 +78,7 @@ class Agent:
             self._frames = newest.expand(-1, self.policy.history, -1).clone()
         else:
             self._frames = torch.cat([self._frames[:, 1:], newest], -2)
-        action = self._decide()
+        action = self.policy.to_robot(self._decide())
         action = action[0] if len(self._shape) == 1 else action
         result = action if isinstance(observation, Tensor) else action.cpu().numpy()
         self.latencies.append(time.perf_counter() - began)
@@ -142,4 +143,4 @@ class Agent:
             columns = bad.reshape(-1, shape[-1]).any(0).nonzero().flatten().tolist()
             raise ValueError(f"columns {columns} of the observation are NaN or infinite")
         self._shape = shape
-        return observed.to(self.device, self.dtype).reshape(-1, shape[-1])
+        return self.policy.from_robot(observed).to(self.device, self.dtype).reshape(-1, shape[-1])

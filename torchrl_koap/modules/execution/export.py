@@ -57,7 +57,8 @@ class _WholePolicy(nn.Module):
         self.policy = policy
 
     def forward(self, observations: Tensor, noise: Tensor) -> Outputs:
-        return self.policy.decode_ahead(observations, noise)
+        actions, held = self.policy.decode_ahead(self.policy.from_robot(observations).to(noise), noise)
+        return self.policy.to_robot(actions), held
 
 
 class _Controller(nn.Module):
@@ -131,6 +132,8 @@ def exportable(policy: PlanningPolicy, part: str = "policy", *, columns: Mapping
     if part == "policy":
         module: nn.Module = _WholePolicy(policy)
         seen = 0.1 * example(1, policy.history, len(columns["observations"]))
+        if policy.origins is not None:
+            seen = seen.double() + policy.origins[0].to(seen.device)
         inputs, outputs = {"observations": seen, "noise": example(1, *planner.noise_shape)}, ("actions", "limited")
     elif part == "controller":
         if not isinstance(follower, InverseDynamicsFollower):

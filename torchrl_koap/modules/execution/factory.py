@@ -32,6 +32,7 @@ def make_policy(
     max_steps: int = 400,
     control_hz: float | None = None,
     observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
+    origins: tuple[Sequence[float], Sequence[float]] | None = None,
     follower: Follower | None = None,
 ) -> PlanningPolicy:
     """Makes a policy of planner and controller: observations in, an action per control step out.
@@ -47,7 +48,7 @@ def make_policy(
 
     Keyword Args:
         state_of (callable, or sequence of int): as for :class:`~torchrl_koap.modules.PlanningPolicy`, like
-            ``execution``, ``max_steps``, ``control_hz`` and ``observe``.
+            ``execution``, ``max_steps``, ``control_hz``, ``observe`` and ``origins``.
         columns (sequence of int, optional): columns of the state that an inverse dynamics reads. Default: all.
         action_rule (callable, optional): as for :class:`~torchrl_koap.modules.Follower`.
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
@@ -97,6 +98,7 @@ def make_policy(
         max_steps=max_steps,
         control_hz=control_hz,
         observe=observe,
+        origins=origins,
     )
     return policy.eval()
 

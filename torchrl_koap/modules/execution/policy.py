@@ -51,6 +51,8 @@ class PlanningPolicy(TensorDictModuleBase):
         control_hz (float, optional): frames per second of the data. Default: not known.
         observe (callable, optional): from what a robot gives, a mapping with camera frames, to observations
             ``[*B, obs]`` (:class:`~torchrl_koap.vision.Observer`). Default: the robot gives observations.
+        origins (tuple, optional): what the data lack of the numbers that the robot reports ``[obs]`` and takes
+            ``[act]``; an :class:`~torchrl_koap.modules.Agent` and exported files subtract and add it.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -82,6 +84,7 @@ class PlanningPolicy(TensorDictModuleBase):
         max_steps: int = 400,
         control_hz: float | None = None,
         observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
+        origins: tuple[Sequence[float], Sequence[float]] | None = None,
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -103,6 +106,7 @@ class PlanningPolicy(TensorDictModuleBase):
         self.observe = observe
         self.register_buffer("limited", torch.zeros(2, dtype=torch.long), persistent=False)
         self.state_of = state_of if callable(state_of) else _Columns(state_of)
+        self.origins = None if origins is None else [torch.tensor(part, dtype=torch.float64) for part in origins]
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
         self._decodes = follower is not None and execution.strategy != "open_loop"  # at every step
         chunk_key = PLAN if self._decodes else ACTION_CHUNK
@@ -131,6 +135,23 @@ class PlanningPolicy(TensorDictModuleBase):
             )
 
     def plan(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
+    def from_robot(self, observations: Tensor) -> Tensor:
+        """Subtracts the origin from what the robot reports ``[*B, obs]``, in float64, where there is one."""
+        if self.origins is None or observations.shape[-1] != len(self.origins[0]):
+            return observations
+        return observations.double() - self.origins[0].to(observations.device)
+
+    def to_robot(self, actions: Tensor) -> Tensor:
+        """Adds the origin to actions ``[*B, act]``, in float64, where there is one."""
+        return actions if self.origins is None else actions.double() + self.origins[1].to(actions.device)
+
+    def plan(
+        self,
+        observations: Tensor,
+        noise: Tensor | None = None,
+        previous: Tensor | None = None,
+        started: Tensor | None = None,
+    ) -> Tensor:
         """Makes what is executed next: planned states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
 
         Args:

@@ -68,6 +68,8 @@ class PolicyEnv(TransformedEnv):
     """
 
     def __init__(self, env: EnvBase, policy: PlanningPolicy, *, observation_key: NestedKey = OBSERVATION):
+        if policy.origins is not None:
+            raise ValueError("the data of this policy lack an origin, which an Agent subtracts and adds: act with one")
         key = policy.planner.noise_key  # None: the planner draws by itself
         noise = [] if key is None else [NoiseTransform(policy.noise_shape, block=policy.max_steps, noise_key=key)]
         transforms = policy_transforms(policy.history, observation_key=observation_key, history_key=policy.in_keys[0])
