@@ -139,9 +139,8 @@ def test_an_offset_is_subtracted_in_float64_and_stored(offset, tmp_path):
     targets = [far[0][1:, [0, 3]], None, None]
     absolute = {"control_hz": 20, "action_kind": "absolute", "targets": [0, 3]}
     data, task = make_demonstrations(far, targets, **absolute)
-    near, _ = make_demonstrations(
-        [frames - task.observation_origin for frames in far], None, control_hz=20, action_dim=2
-    )
+    moved = [frames - task.observation_origin for frames in far]
+    near, _ = make_demonstrations(moved, control_hz=20, action_dim=2)
     torch.testing.assert_close(data["observation"], near["observation"], atol=0, rtol=0)
     assert np.abs(np.array(task.observation_origin) - [offset, 0, 0, -offset]).max() < 20
     assert task.origins[1] == (task.observation_origin[0], task.observation_origin[3])

@@ -188,12 +188,14 @@ class Convert(Command):
         recordings = self._read()
         folder = save_demonstrations(self.out, recordings, **self._given(_DESCRIBING))
         data, task = open_dataset(folder)
+        origin = zip(task.observation_names, task.observation_origin, strict=False)
         return {
             "data set": str(folder),
             "task": task.name,
             "steps": len(data),
             **_contents(recordings),
             "skipped": ", ".join(recordings.skipped) or "nothing",
+            "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],
             **_warnings(data, task, recordings.sources),
             "next": _next(folder, task, recordings),

@@ -92,10 +92,12 @@ def _column_faults(task: Task) -> list[str]:
             wrong = [column for column in columns if column is not None and not 0 <= column < task.state_dim]
             if wrong:
                 faults.append(f"{field}: the state has {task.state_dim} columns, got {wrong[0]}")
-    for field in ("observation_units", "observation_origin"):
-        if len(getattr(task, field)) not in (0, task.observation_dim):
-            wanted = f"one for each of {task.observation_dim} columns"
-            faults.append(f"{field}: wanted {wanted}, got {len(getattr(task, field))}")
+    said = {"observation_units": task.observation_units, "observation_origin": task.observation_origin}
+    faults += [
+        f"{field}: wanted one for each of {task.observation_dim} columns, got {len(values)}"
+        for field, values in said.items()
+        if len(values) not in (0, task.observation_dim)
+    ]
     missing = [name for group in task.relative_positions for name in group if name not in task.state_parts]
     missing += [name for name in task.planar_parts if name not in task.state_parts]
     faults += [f"relative_positions or planar_parts: {name!r} is no part of the state" for name in missing]

@@ -134,7 +134,6 @@ class PlanningPolicy(TensorDictModuleBase):
                 stacklevel=3,
             )
 
-    def plan(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
     def from_robot(self, observations: Tensor) -> Tensor:
         """Subtracts the origin from what the robot reports ``[*B, obs]``, in float64, where there is one."""
         if self.origins is None or observations.shape[-1] != len(self.origins[0]):
@@ -145,13 +144,7 @@ class PlanningPolicy(TensorDictModuleBase):
         """Adds the origin to actions ``[*B, act]``, in float64, where there is one."""
         return actions if self.origins is None else actions.double() + self.origins[1].to(actions.device)
 
-    def plan(
-        self,
-        observations: Tensor,
-        noise: Tensor | None = None,
-        previous: Tensor | None = None,
-        started: Tensor | None = None,
-    ) -> Tensor:
+    def plan(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
         """Makes what is executed next: planned states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
 
         Args:
