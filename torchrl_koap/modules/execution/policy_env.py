@@ -55,6 +55,9 @@ class PolicyEnv(TransformedEnv):
     Keyword Args:
         observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
 
+    Raises:
+        ValueError: if the data of the policy lack an origin, which only an Agent subtracts and adds.
+
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv
         >>> from torchrl_koap.modules import PolicyEnv, StatePlanner, TemporalUnet, make_policy
