@@ -72,7 +72,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    where = place_of(task, config, Observer.of(task, trained.cameras))
+    where = find_environment(task, config, Observer.of(task, trained.cameras))
     errors, actions = evaluate_actions(trained, config.dataset)
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -164,8 +164,8 @@ def _refuse_contexts(rollouts_per_context: int, contexts_file: Path | None, wher
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a run is rolled out."""
+class RolloutEnvironment:
+    """Environment that a run is rolled out in, with its modes and contexts."""
 
     make_env: Callable[[int], Any]  # of a number of parallel episodes
     max_steps: int
@@ -175,7 +175,7 @@ class Place:
     contexts: np.ndarray | None = None
 
 
-def place_of(task: Task, config: EvalConfig, observe: Observer | None = None) -> Place:
+def find_environment(task: Task, config: EvalConfig, observe: Observer | None = None) -> RolloutEnvironment:
     """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures ``observe`` embeds.
 
     Raises:
@@ -186,11 +186,11 @@ def place_of(task: Task, config: EvalConfig, observe: Observer | None = None) ->
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
         make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
-        return Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+        return RolloutEnvironment(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
     _refuse_contexts(config.rollouts_per_context, config.contexts_file, "an environment of Gymnasium")
     from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
 
     make_env = partial(GymnasiumBatch, config.env, task, observe=observe, success_key=config.success_key)
     probe = make_env(1)
     probe.close()
-    return Place(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)
+    return RolloutEnvironment(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.evaluation import EvalConfig
-from torchrl_koap.evaluation.closed_loop import place_of
+from torchrl_koap.evaluation.closed_loop import find_environment
 from torchrl_koap.evaluation.config import check_options
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
@@ -314,7 +314,7 @@ def check_study(study: Study) -> list[Cell]:
     if study.evaluation.env is not None:
         for task in study.tasks:
             observe = Observer.of(study.task(task), cameras_of(study.given_dataset(task)))
-            place_of(study.task(task), study.evaluation, observe)
+            find_environment(study.task(task), study.evaluation, observe)
     cells = study.cells()
     sampling = [name for name in study.methods if not get_method(name).plans]
     if study.execution.strategy == "open_loop" and sampling:
