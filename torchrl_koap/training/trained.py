@@ -124,7 +124,7 @@ class Trained:
         load_parts(path, tensors, {"planner": planner, "controller": controller})
         results = {"command_ranges": about.get("command_ranges")}
         cameras = {
-            name: Projection(*(tensors[f"{CAMERAS}.{name}.{part}"] for part in ("mean", "components")), facts)
+            name: Projection(tensors[f"{CAMERAS}.{name}.mean"], tensors[f"{CAMERAS}.{name}.components"], facts)
             for name, facts in about.get(CAMERAS, {}).items()
         }
         return cls(task, config, planner, controller, results, folder=path, cameras=cameras)

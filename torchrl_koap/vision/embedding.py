@@ -73,8 +73,8 @@ def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Reco
         stored = stored_folder(source)
         if stored is None and task is None and Path(source).exists():
             raise DataError(source, "it does not say what its columns are for: `koap convert` it, or name its --task")
-        asked = {} if stored is not None or task is None else {"action_dim": task.action_dim}
-        found.append(read_recordings(source, **asked))
+        width = None if stored is not None or task is None else task.action_dim
+        found.append(read_recordings(source, action_dim=width))
     return join_recordings(found), task or stored_task(stored_folder(sources[0]) or sources[0])
 
 

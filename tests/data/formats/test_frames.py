@@ -198,7 +198,7 @@ def test_videos_that_are_not_there_are_skipped(tmp_path):
     _, last = write_videos(tmp_path, "v3.0")
     last.unlink()
     recordings = read_recordings(tmp_path)
-    assert not recordings.cameras and "observation.images.front" in recordings.skipped
+    assert not recordings.cameras and "observation.images.front (its videos are not here)" in recordings.skipped
 
 
 def test_videos_need_an_extra(tmp_path, monkeypatch):

@@ -58,7 +58,7 @@ def write(root, *, actions="all", features=None, rows=6, change=None, version="v
 def test_names_rate_and_images(tmp_path):
     recordings = read_lerobot(write(tmp_path))
     assert recordings.state_names == (*JOINTS, "force") and recordings.action_names == tuple(JOINTS)
-    assert recordings.control_hz == 30 and recordings.skipped == ("observation.images.front",)
+    assert recordings.control_hz == 30 and recordings.skipped == ("observation.images.front (its videos are not here)",)
     assert [frames.shape for frames in recordings.states] == [(6, 8), (6, 8)] and recordings.num_labels == 10
 
 
@@ -98,7 +98,7 @@ def test_pictures_inside_the_tables_are_referred_to(version, tmp_path):
     pictures = pa.array([{"bytes": b"png", "path": None}] * 12)
     root = write(tmp_path, features=features, change={"observation.images.wrist": pictures}, version=version)
     recordings = read_lerobot(root)
-    assert recordings.skipped == ("observation.images.front",)  # a video that is not here
+    assert recordings.skipped == ("observation.images.front (its videos are not here)",)
     assert [len(clip) for clip in recordings.cameras["wrist"]] == [len(frames) for frames in recordings.states]
     assert recordings.state_names == (*JOINTS, "force")
 

@@ -81,7 +81,8 @@ def read_lerobot(
     stamped = TIME in first and all(np.isfinite(columns[TIME]).all() for columns in rows.values())
     cameras = [name for name in images if known[name].get("dtype") in IMAGES]
     clips, pieces = lerobot_clips(root, info, cameras, rows), []
-    absent = [name for name in images if name.split(".")[-1] not in clips[min(rows)]]
+    unseen = [name for name in images if name.split(".")[-1] not in clips[min(rows)]]
+    absent = [f"{name} (its videos are not here)" if name in cameras else name for name in unseen]
     for number, columns in rows.items():
         states = dict(zip(names, np.concatenate([columns[name] for name in chosen], 1).T, strict=True))
         steps = dict(zip(acting, columns[ACTION].T, strict=True)) if ACTION in columns else None
