@@ -13,7 +13,6 @@ FILES = sorted(str(file.relative_to(PACKAGE)) for file in PACKAGE.rglob("*.py") 
 COVERED_BY = {
     "commands/options.py": "commands/test_cli.py",
     "commands/doctor.py": "commands/test_cli.py",
-    "commands/embed.py": "faults/test_camera_data.py",
     "commands/run_commands.py": "commands/test_eval.py",
     "commands/subcommands.py": "commands/test_cli.py",
     "envs/base.py": "envs/test_avoiding.py",

@@ -61,3 +61,30 @@ for _id, _options in {
     "ToyReachLost-v0": {"terminates": "lost"},
 }.items():
     gymnasium.register(_id, entry_point=Reach, kwargs=_options)
+
+
+class Seen(gymnasium.Env):
+    """Gives numbers of two kinds and pictures by their names."""
+
+    def __init__(self, cameras=("top",)):
+        box, picture = gymnasium.spaces.Box(-9, 9, (2,)), gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+        pixels = dict.fromkeys(cameras, picture) if len(cameras) > 1 else picture
+        pixels = gymnasium.spaces.Dict(pixels) if len(cameras) > 1 else pixels
+        self.observation_space = gymnasium.spaces.Dict({"agent_pos": box, "pixels": pixels})
+        self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def _give(self):
+        pixels = self.observation_space["pixels"]
+        several = isinstance(pixels, gymnasium.spaces.Dict)
+        frames = {name: np.full((8, 8, 3), len(name), np.uint8) for name in (pixels if several else ["top"])}
+        return {"agent_pos": np.array([1.0, 2.0]), "pixels": frames if several else frames["top"]}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._give(), {}
+
+    def step(self, action):
+        return self._give(), 0.0, False, False, {}
+
+
+gymnasium.register("ToySeen-v0", Seen, max_episode_steps=5)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from camera_sets import episode
 from camera_sets import write_camera_set as write
+from filmed_data import write_filmed
 
 from torchrl_koap.data import load_ted, read_about, read_recordings, save_demonstrations
 from torchrl_koap.files import DataError
@@ -19,19 +20,9 @@ from torchrl_koap.vision.embedding import embed_recordings, read_sources
 OWN = "tiny_network:random_layer"
 
 
-def write_own(folder, cameras=("top", "wrist"), trajectories=12, size=(16, 24)):
-    """A data set of `koap convert`, whose cameras see a square where the robot is."""
-    generator = np.random.default_rng(0)
-    for number in range(trajectories):
-        path = np.clip(generator.normal(size=(20, 2)).cumsum(0) / 4 + 6, 0, 11)
-        (folder / "raw" / f"{number:02d}").mkdir(parents=True)
-        np.savez(folder / "raw" / f"{number:02d}.npz", states=path, actions=np.diff(path, axis=0), control_hz=10.0)
-        for camera in cameras:
-            frames = np.zeros((len(path), *size, 3), np.uint8)
-            for frame, (x, y) in zip(frames, path.astype(int), strict=True):
-                frame[y : y + 4, x : x + 4, len(camera) % 3] = 255
-            np.save(folder / "raw" / f"{number:02d}" / f"{camera}.npy", frames)
-    return save_demonstrations(folder / "own", read_recordings(folder / "raw"))
+def write_own(folder, **options):
+    """A data set of `koap convert`, with frames."""
+    return save_demonstrations(folder / "own", read_recordings(write_filmed(folder / "raw", **options)))
 
 
 def embed(folder, out, **options):

@@ -17,6 +17,7 @@ from torchrl_koap.lookup import lookup
 
 PREFIX = "pretrained:"
 # what a run is made of; evaluations, reports and checkpoints are made from it
+CAMERAS = "cameras"  # folder of what frames are embedded by
 FILES = ("config.json", "summary.json", "metrics.csv", "planner.safetensors", "controller.safetensors")
 
 
@@ -214,6 +215,8 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
     for name in FILES:
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
+    if (source / CAMERAS).is_dir():
+        shutil.copytree(source / CAMERAS, target / CAMERAS, dirs_exist_ok=True)
     return target
 
 

@@ -21,7 +21,7 @@ from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, progress_bar
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory
 from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
 from torchrl_koap.tasks import WINDOW, Task
 from torchrl_koap.training.command_model import with_label_commands
@@ -41,7 +41,6 @@ from torchrl_koap.training.networks import build_planner
 from torchrl_koap.training.planner import learn_planner
 from torchrl_koap.training.trained import Trained, build_networks, facts_of
 from torchrl_koap.vision import Projection, cameras_of
-from torchrl_koap.vision.projection import CAMERAS
 
 
 def train(config: TrainConfig, *, command: str | None = None, planner_only: bool = False) -> Trained:

@@ -14,11 +14,12 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import LabelReport
+from torchrl_koap.files import some
 from torchrl_koap.modules import CommandDecoder, Execution, Follower, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
 from torchrl_koap.runs.plugins import load_plugins
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, find_run
+from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryError, find_run
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task, get_task, task_from_config
 from torchrl_koap.tasks.registry import plain_task
@@ -29,7 +30,6 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
 from torchrl_koap.training.policy_facts import command_ranges, policy_facts
 from torchrl_koap.vision import Observer, Projection, load_cameras
-from torchrl_koap.vision.projection import CAMERAS
 
 FORMAT, VERSION = "torchrl_koap policy", 2
 
@@ -74,8 +74,8 @@ class Trained:
             where (str or Path): run directory, ``"pretrained:NAME"``, or a file.
 
         Keyword Args:
-            plugins (sequence of str): modules that register the task or method; a file cannot have them imported
-                itself.
+            plugins (sequence of str): modules that register the task or method, or hold the network that embeds frames;
+                a file cannot have them imported itself.
 
         Raises:
             RunDirectoryError: if the folder is no finished run.
@@ -122,6 +122,9 @@ class Trained:
             hint = f"; it was made with the plugins {', '.join(map(str, needs))}" if needs else ""
             raise CheckpointError(f"{path} cannot be built: {problem}{hint}") from error
         load_parts(path, tensors, {"planner": planner, "controller": controller})
+        code = {facts["network"].rpartition(":")[0] for facts in about.get(CAMERAS, {}).values()} - {"", *plugins}
+        if code:  # a file that somebody sent must not decide what is run
+            raise CheckpointError(f"{path} embeds frames by code of {some(sorted(code))}: name it in plugins")
         results = {"command_ranges": about.get("command_ranges")}
         cameras = {
             name: Projection(tensors[f"{CAMERAS}.{name}.mean"], tensors[f"{CAMERAS}.{name}.components"], facts)

@@ -1,0 +1,77 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""From frames beside recordings to actions: convert, embed, train, and what takes frames after it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from filmed_data import write_filmed
+from tiny_runs import TINY, koap
+
+from torchrl_koap import Agent, Trained, load_policy
+from torchrl_koap.data import load_ted
+from torchrl_koap.runs.run_directory import copy_run
+from torchrl_koap.runs.weights import CheckpointError
+
+EMBED = ("--network", "tiny_network:random_layer", "--components", "5", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("filmed")
+    write_filmed(folder / "raw", cameras=("top",), length=40)
+    assert koap("convert", folder / "raw", "--out", folder / "own", "--quiet") == 0
+    assert koap("embed", folder / "own", "--camera", "top", "--out", folder / "seen", *EMBED) == 0
+    assert koap("train", "--dataset", folder / "seen", "--out", folder / "run", *TINY, "--quiet") == 0
+    return folder / "run"
+
+
+def test_each_step_names_the_next_and_says_what_is_kept(tmp_path, capsys):
+    write_filmed(tmp_path / "raw")
+    assert koap("convert", tmp_path / "raw", "--out", tmp_path / "own") == 0
+    said = capsys.readouterr().out
+    next_call = f"koap embed {tmp_path}/own --camera top --camera wrist --out {tmp_path}/own_seen"
+    assert "top, wrist" in said and next_call in said
+    assert koap("embed", tmp_path / "own", "--out", tmp_path / "seen", *EMBED[:-1]) == 0
+    said = capsys.readouterr().out
+    for camera in ("top", "wrist"):
+        line = next(line for line in said.splitlines() if line.startswith(f"camera {camera}"))
+        assert "16 x 24, 5 components keep" in line and "reconstruction error" in line and "frames a second" in line
+    assert f"koap train --dataset {tmp_path}/seen --out runs/own" in said
+
+
+def test_a_robot_gives_numbers_and_frames_to_run_and_file(run, tmp_path):
+    data, _ = load_ted(run.parent / "seen" / "ted")
+    given = {
+        "state": np.load(run.parent / "raw" / "03.npz")["states"][0],
+        "top": np.load(run.parent / "raw" / "03" / "top.npy")[0],
+    }
+    wanted = Agent(load_policy(run), seed=1)
+    wanted.reset()
+    action = wanted.act(data["observation"][data["episode"] == 3][0].numpy())
+    file = Trained.load(run).save(tmp_path / "policy.safetensors")
+    for policy in (load_policy(run), Trained.load(file, plugins=["tiny_network"]).policy()):
+        agent = Agent(policy, seed=1)
+        agent.reset()
+        np.testing.assert_allclose(agent.act(given), action, rtol=1e-3, atol=1e-4)
+    with pytest.raises(CheckpointError, match="embeds frames by code of tiny_network: name it in plugins"):
+        Trained.load(file)
+
+
+def test_an_environment_gives_its_pictures(run, tmp_path):
+    """Its frames are smaller than those recorded."""
+    options = ("--env", "toy_gym:ToySeen-v0", "--episodes", "2", "--no-report", "--out", tmp_path / "eval", "--quiet")
+    with pytest.warns(UserWarning, match="frames are 8 x 8, recorded were 16 x 24: they are resized"):
+        assert koap("eval", run, *options) == 0
+    assert len(json.loads((tmp_path / "eval" / "eval.json").read_text())["episode"]) == 2
+
+
+def test_a_run_that_was_copied_takes_frames(run, tmp_path):
+    assert list(Trained.load(copy_run(run, tmp_path / "copy")).cameras) == ["top"]
+
+
+def test_latency_is_that_with_the_cameras(run, capsys):
+    assert koap("latency", run, "--steps", "3") == 0
+    assert "p99" in capsys.readouterr().out
