@@ -39,7 +39,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import Execution, InverseDynamics, Normalizer, blend_plan
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 

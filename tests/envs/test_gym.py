@@ -94,22 +94,6 @@ def test_same_episode_as_the_batched_environment():
     assert info["collision"] and terminated and not info["success"]
 
 
-def test_vector_environment():
-    envs = gymnasium.make_vec("torchrl_koap/Avoiding-v0", num_envs=2, vectorization_mode="sync")
-    observation, _ = envs.reset(seed=0)
-    assert observation.shape == (2, 4)
-    envs.close()
-
-
-def test_bad_action():
-    env = gymnasium.make("torchrl_koap/Avoiding-v0").unwrapped
-    env.reset()
-    with pytest.raises(ValueError, match="'action' must have shape"):
-        env.step(np.zeros(3))
-    with pytest.raises(ValueError, match="'action' must be finite"):
-        env.step(np.array([np.nan, 0]))
-
-
 def test_picture():
     env = gymnasium.make("torchrl_koap/Avoiding-v0", render_mode="rgb_array", width=64, height=48)
     env.reset()

@@ -91,15 +91,6 @@ def test_columns_of_the_observation():
         torch.testing.assert_close(after[:, 7], torch.full((2,), 0.007, dtype=torch.float64), **equal)
 
 
-def test_observation_is_one_step_old():
-    env = StackingEnv(1, dtype=torch.float64, seed=2)
-    env.reset()
-    for _ in range(4):
-        before = np.concatenate([env.sims.joint_positions[0], env.sims.gripper_width, env.sims.tcp_position[0]])
-        seen = act(env, [0.01] * 7 + [0.08])["observation"][0, 20:].numpy()
-        np.testing.assert_array_equal(seen, before)
-
-
 def test_gripper_threshold():
     env = StackingEnv(3, dtype=torch.float64, seed=0)
     env.reset()

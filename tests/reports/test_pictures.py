@@ -19,7 +19,7 @@ from torchrl_koap.reports import pictures
 from torchrl_koap.reports.pictures import NothingToDraw, all_pictures, draw_pictures, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 
 PLUGIN = """
 from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs.transforms import ObservationTransform
@@ -16,13 +16,12 @@ from torchrl_koap.tasks import Task, get_task
 
 
 class PartialObservation(ObservationTransform):
-    """Drops parts of the observation: by default what ``Task.state_of`` leaves out, the command and the hidden parts.
+    """Drops parts of the observations ``[*B, obs]``: by default what ``Task.state_of`` leaves out.
 
     Args:
         task (Task or str): the task whose parts are named.
         drop (sequence of str, optional): parts to drop, names of ``Task.observation``. Default: the command and
             ``Task.hidden``.
-        in_key (NestedKey): observations ``[*B, obs]``, replaced. Defaults to ``"observation"``.
 
     Raises:
         ValueError: for a part that the task does not have, or if nothing would remain. When applied, if the observation
@@ -37,30 +36,22 @@ class PartialObservation(ObservationTransform):
         torch.Size([3, 10])
     """
 
-    def __init__(self, task: Task | str, drop: Sequence[str] | None = None, *, in_key: NestedKey = OBSERVATION):
-        task = get_task(task)
-        if drop is None:
-            drop = [name for name in (task.command, *task.hidden) if name is not None]
-        unknown = [name for name in drop if name not in task.observation]
+    def __init__(self, task: Task | str, drop: Sequence[str] | None = None):
+        super().__init__(in_keys=[OBSERVATION], out_keys=[OBSERVATION])
+        self.task = get_task(task)
+        parts, drop = self.task.observation, (self.task.command, *self.task.hidden) if drop is None else drop
+        unknown = [name for name in drop if name not in (*parts, None)]
         if unknown:
-            raise ValueError(f"task {task.name!r} has no part {unknown[0]!r}; known: {', '.join(task.observation)}")
-        super().__init__(in_keys=[in_key], out_keys=[in_key])
-        kept = [
-            column
-            for name, part in task.observation.items()
-            if name not in drop
-            for column in range(part.start, part.stop)
-        ]
+            raise ValueError(f"task {self.task.name!r} has no part {unknown[0]!r}; known: {', '.join(parts)}")
+        kept = [column for name, part in parts.items() if name not in drop for column in range(part.start, part.stop)]
         if not kept:
-            raise ValueError(f"nothing of task {task.name!r} remains without {', '.join(drop)}")
-        self.task_name, self.width = task.name, task.observation_dim
+            raise ValueError(f"nothing of task {self.task.name!r} remains without {', '.join(drop)}")
         self.register_buffer("columns", torch.tensor(kept), persistent=False)
 
     def _apply_transform(self, observation: Tensor) -> Tensor:
-        if observation.shape[-1] != self.width:
-            raise ValueError(
-                f"{self.in_keys[0]!r} of task {self.task_name!r} has {self.width} columns, got {observation.shape[-1]}"
-            )
+        if observation.shape[-1] != self.task.observation_dim:
+            wanted = f"{OBSERVATION!r} of task {self.task.name!r} has {self.task.observation_dim} columns"
+            raise ValueError(f"{wanted}, got {observation.shape[-1]}")
         return observation[..., self.columns]
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -68,9 +59,9 @@ class PartialObservation(ObservationTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """The specification without the dropped columns."""
-        spec = observation_spec[self.in_keys[0]]
+        spec = observation_spec[OBSERVATION]
         shape = (*spec.shape[:-1], len(self.columns))
-        observation_spec[self.in_keys[0]] = Unbounded(shape, device=spec.device, dtype=spec.dtype)
+        observation_spec[OBSERVATION] = Unbounded(shape, device=spec.device, dtype=spec.dtype)
         return observation_spec
 
 
@@ -81,7 +72,6 @@ class EndEffectorNoise(ObservationTransform):
         task (Task or str): the task; its part ``Task.position`` is disturbed.
         sigma (float): standard deviation (m).
         seed (int): seed of the noise. After :meth:`seed_episodes` every environment has a generator of its own.
-        in_key (NestedKey): observations ``[n, obs]``, changed. Defaults to ``"observation"``.
 
     Raises:
         ValueError: if sigma is negative.
@@ -97,10 +87,10 @@ class EndEffectorNoise(ObservationTransform):
         [[False, False, True, True]]
     """
 
-    def __init__(self, task: Task | str, sigma: float, seed: int = 0, *, in_key: NestedKey = OBSERVATION):
+    def __init__(self, task: Task | str, sigma: float, seed: int = 0):
         if not sigma >= 0:
             raise ValueError(f"sigma must be >= 0, got {sigma}")
-        super().__init__(in_keys=[in_key], out_keys=[in_key])
+        super().__init__(in_keys=[OBSERVATION], out_keys=[OBSERVATION])
         task = get_task(task)
         self.sigma, self.part = sigma, task.observation[task.position]
         self._generators = [torch.Generator().manual_seed(seed)]

@@ -22,7 +22,7 @@ from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics
 from torchrl_koap.modules.planning.energy_score import sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.units import unit_groups
+from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 
 # frames around a decoded action: enough history and look-ahead for every controller compared

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 
 EXPERIMENTS = ("planner_alone", "controller_alone", "both")  # of ``koap inspect``, in the simulator
 MODELS = ("koopman", "reconstruction", "linear", "copy_last")  # whose multi-step errors are compared

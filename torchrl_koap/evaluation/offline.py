@@ -16,7 +16,7 @@ from torchrl_koap.evaluation.loop_on_labels import check_loop, describe_loop
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 
 if TYPE_CHECKING:
     from torchrl_koap.evaluation.config import EvalConfig

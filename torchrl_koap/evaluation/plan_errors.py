@@ -19,7 +19,7 @@ from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.planning.energy_score import energy_score, sample_sequences
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.units import unit_groups
+from torchrl_koap.tasks.columns import unit_groups
 
 SAMPLES = 16  # plans in each situation
 SITUATIONS = 500  # that are looked at, at most

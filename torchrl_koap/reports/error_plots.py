@@ -28,7 +28,7 @@ from torchrl_koap.reports.style import (
     set_title,
     tidy,
 )
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 
 _ROUND = (1, 2, 5, 10)
 TERMS = {

@@ -26,7 +26,7 @@ from torchrl_koap.reports.scenes import (
     read_episodes,
 )
 from torchrl_koap.reports.style import FAILURE_MARKS, INK, OUTCOMES, SUCCESS, entry, legend_beside, set_title
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 
 
 def _rollouts_caption(run: RunFacts) -> str:

@@ -13,7 +13,7 @@ from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, draw_pictures
 from torchrl_koap.reports.run_facts import RunFacts, number
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 
 _ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
 _PLAN_BASELINES = ("standing_still", "constant_velocity")

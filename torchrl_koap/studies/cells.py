@@ -18,7 +18,7 @@ from torchrl_koap.evaluation.offline import KIND
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import changed_options, from_json, to_json
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training import train
 
 ASKED, FOUND = "cell.json", "result.json"

@@ -23,7 +23,7 @@ from torchrl_koap.studies.table import (
     write_csv,
 )
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training.methods import METHODS
 
 FOLDER = "plots"

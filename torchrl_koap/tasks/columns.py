@@ -7,7 +7,7 @@ become a point on the unit circle; ``tan(yaw)`` tells the yaw up to half a turn 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -54,6 +54,8 @@ def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
 FEATURE_COLUMNS = {"plane": ("x", "y"), "tan_yaw": ("cos_2yaw", "sin_2yaw"), "quaternion": ("cos_yaw", "sin_yaw")}
 # a feature of one's own is named by its import string
 FEATURES = {"plain": plain, "plane": plane, "tan_yaw": double_yaw, "quaternion": yaw_of}
+
+_THOUSANDTHS = {"m": "mm", "rad": "mrad", "s": "ms", "N": "mN"}  # units in which small values are shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,3 +190,16 @@ def _slices(widths: Mapping[str, int]) -> dict[str, slice]:
         slices[part] = slice(start, start + width)
         start += width
     return slices
+
+
+def thousandths(unit: str) -> tuple[str, float]:
+    """Returns the unit in which small values are shown, and the factor to it; metres become millimetres here."""
+    return (_THOUSANDTHS[unit], 1e3) if unit in _THOUSANDTHS else (unit, 1.0)
+
+
+def unit_groups(units: Sequence[str]) -> dict[str, list[int]]:
+    """Groups columns by their units, in the order in which the units come."""
+    groups: dict[str, list[int]] = {}
+    for column, unit in enumerate(units):
+        groups.setdefault(unit, []).append(column)
+    return groups

@@ -31,7 +31,7 @@ from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, Task
-from torchrl_koap.tasks.units import unit_groups
+from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner

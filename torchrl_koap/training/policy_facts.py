@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionRule
-from torchrl_koap.tasks.units import unit_groups
+from torchrl_koap.tasks.columns import unit_groups
 
 
 def policy_facts(

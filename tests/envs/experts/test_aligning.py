@@ -68,18 +68,6 @@ def test_it_lets_go_when_the_tray_lies_there():
     assert steps >= 3 and np.abs(last).max() < 0.0025
 
 
-def test_bad_input():
-    contexts = draw_contexts("aligning", 2, 0)
-    with pytest.raises(ValueError, match=r"1 modes, 2 seeds and contexts of shape \[2, 2, 3\]"):
-        AligningExpert([0], contexts, [0, 1])
-    with pytest.raises(ValueError, match=r"got \[2\]"):
-        AligningExpert([0, 2], contexts, [0, 1])
-    with pytest.raises(ValueError, match=r"\[C, 2, 3\]"):
-        AligningExpert([0, 1], contexts[..., :2], [0, 1])
-    with pytest.raises(ValueError, match=r"shape \[2, 20\], got \[2, 17\]"):
-        AligningExpert([0, 1], contexts, [0, 1]).act(np.zeros((2, 17)))
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("mode", [0, 1])

@@ -12,7 +12,7 @@ from shared_data import HUMAN
 
 from torchrl_koap.data.d3il.conversion import CONVERTERS, read_raw
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
-from torchrl_koap.envs.experts.avoiding import _HAND, _HAND_REST, FULL_PUSH, GAPS, AvoidingExpert, mode_gaps
+from torchrl_koap.envs.experts.avoiding import FULL_PUSH, GAPS, AvoidingExpert, mode_gaps
 from torchrl_koap.envs.experts.demonstrations import iterate_takes
 
 
@@ -39,16 +39,6 @@ def test_most_first_attempts_take_the_asked_mode():
     assert (episodes.success & (mode_index(episodes.out["mode"]).numpy() == modes)).sum() >= 42
 
 
-def test_the_hand_ends_where_the_decision_wants():
-    """A push that is held moves the command by its own size per step; what is still to come adds up to all of it."""
-    assert _HAND.sum() == pytest.approx(1)
-    assert np.cumsum(_HAND) + _HAND_REST == pytest.approx(1)
-    response = np.cumsum(_HAND)
-    rise = np.argmax(response > 0.9) - np.argmax(response > 0.1)
-    assert 3 <= rise <= 5  # control steps from 10 to 90 %, as in the human recordings
-    assert 1.01 < response.max() < 1.08
-
-
 def test_it_stops_for_a_cylinder_ahead():
     """Shown that it stands right before the first cylinder, the player never decides to go on forwards."""
     expert = AvoidingExpert([0] * 8, range(8))
@@ -73,15 +63,6 @@ def test_it_lingers_behind_the_line_and_finishes():
         assert rows < 60
     assert rows >= 5
     assert not AvoidingExpert([1], [0]).finished.any()
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match="2 modes and 1 seeds"):
-        AvoidingExpert([0, 1], [0])
-    with pytest.raises(ValueError, match="at least one"):
-        AvoidingExpert([], [])
-    with pytest.raises(ValueError, match=r"shape \[1, 4\], got \[1, 2\]"):
-        AvoidingExpert([0], [0]).act(np.zeros((1, 2)))
 
 
 @pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")

@@ -144,20 +144,3 @@ def test_same_seed_same_data_whatever_threads_progress_and_batch(task):
     assert data["has_action"].all() and validate(data) is data and data["action"].dtype == torch.float32
     assert torch.equal(torch.random.get_rng_state(), state)
     assert int(data["episode"].max()) + 1 == len(report.modes) == 3
-
-
-def test_another_seed_gives_other_data():
-    first, other = (record_demonstrations(episodes=1, seed=seed)[0] for seed in (2, 3))
-    assert first.shape != other.shape or not torch.equal(first["action"], other["action"])
-
-
-def test_no_more_environments_than_the_batch_are_made(monkeypatch):
-    made, make = [], demonstrations.make_env
-
-    def make_env(task, count, **options):
-        made.append(count)
-        return make(task, count, **options)
-
-    monkeypatch.setattr(demonstrations, "make_env", make_env)
-    record_demonstrations("avoiding", 3, batch_size=2)
-    assert made == [2]

@@ -91,22 +91,6 @@ def test_inverse_kinematics_reaches_poses():
         follow_pose(joints, joints[:2])
 
 
-@pytest.mark.parametrize(
-    ("modes", "contexts", "seeds", "message"),
-    [
-        ([6], np.zeros((1, 3, 3)), [0], "mode must be 0 to 5, got 6"),
-        ([0, 1], np.zeros((2, 3, 3)), [0], "2 modes, 1 seeds"),
-        ([0], np.zeros((1, 2, 3)), [0], r"shape \[1, 2, 3\]"),
-        ([], np.zeros((0, 3, 3)), [], "at least one"),
-    ],
-)
-def test_bad_arguments_are_named(modes, contexts, seeds, message):
-    with pytest.raises(ValueError, match=message):
-        StackingExpert(modes, contexts, seeds)
-    with pytest.raises(ValueError, match=r"shape \[1, 31\], got \[1, 20\]"):
-        StackingExpert([0], np.zeros((1, 3, 3)), [0]).act(np.zeros((1, 20)))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("contexts", [evaluation_contexts("stacking"), draw_contexts("stacking", 60, 11)])
 def test_success_in_many_contexts(contexts):

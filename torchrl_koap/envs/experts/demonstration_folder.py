@@ -21,9 +21,8 @@ import numpy as np
 import torch
 
 from torchrl_koap.data import flatten_trajectories, save_ted
-from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, iterate_takes
+from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport, Take, iterate_takes
 from torchrl_koap.envs.experts.disturbances import share_disturbed
-from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.files import one_at_a_time, replacing_file
 from torchrl_koap.tasks import Task, get_task
 
