@@ -156,16 +156,6 @@ def test_gradients_reach_the_documented_frames_and_no_others(kind, num_past, loo
             assert (gradient[t + 1] == 0).all()
 
 
-@pytest.mark.parametrize("kind", [LatentActionMLP, LatentActionLSTM, LatentActionFourier])
-def test_gathering_some_frames_is_a_slice_of_gathering_all(kind):
-    network = kind(2, 6, num_past=2, look_ahead=(2, 5))
-    state = torch.randn(3, 4, T, 2)
-    every, some = network.gather(state), network.gather(state, range(3, 9))
-    assert every.shape == (3, 4, T, 5, 2)
-    assert torch.equal(every[..., 3:9, :, :], some)
-    torch.testing.assert_close(network.infer(every)[..., 3:9, :], network.infer(some))
-
-
 # replay: x_{t+1} = A x_t + B a_t with a state that holds the last k actions, so that x_{t+k} tells a_t apart
 
 

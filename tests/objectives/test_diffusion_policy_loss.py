@@ -7,9 +7,7 @@ import pytest
 import torch
 from denoising_test_base import DenoisingLossTestBase, noised
 from tensordict import TensorDict
-from torchrl.objectives import SoftUpdate
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
 from torchrl_koap.modules import DiffusionPolicy, MLPDenoiser
 from torchrl_koap.objectives import DiffusionPolicyLoss
 
@@ -141,45 +139,6 @@ def test_the_future_states_are_not_read():
     assert torch.equal(loss(data)["loss_policy"], loss(other)["loss_policy"])
     other["state"][:, 1] += 1
     assert not torch.equal(loss(data)["loss_policy"], loss(other)["loss_policy"])
-
-
-def test_training_recovers_a_linear_law_from_few_labels():
-    """Actions are ``A x``; with 10 of 60 trajectories labelled, each entry of a chunk belongs to its own step."""
-    torch.manual_seed(0)
-    law, turn = torch.tensor([[1.0, -2.0], [0.5, 1.0]]), torch.tensor([[0.98, 0.2], [-0.2, 0.98]])
-    states = [torch.rand(2) * 2 - 1 for _ in range(60)]
-    states = [torch.stack([torch.linalg.matrix_power(turn, t) @ start for t in range(31)]) for start in states]
-    data = flatten_trajectories(states, [frames[:-1] @ law.T for frames in states])
-    data, _ = LabelBudget(count=10, seed=1).apply(select_state(data, (0, 1)))
-    policy = DiffusionPolicy(
-        MLPDenoiser(2, 4, horizon=4, width=64, frequencies=0),
-        state_dim=2,
-        action_dim=2,
-        horizon=4,
-        num_steps=5,
-    )
-    buffer = make_window_buffer(
-        data, 6, 256, select=["state", "action", "has_action"], labelled_share=1.0, pad_before=1
-    )
-    policy.fit_normalizers(buffer.sample()["state"], data["action"][data["has_action"].squeeze(-1)])
-    loss = DiffusionPolicyLoss(policy)
-    average = SoftUpdate(loss, eps=0.98)
-    optimizer = torch.optim.Adam(loss.parameters())
-    for step in range(800):
-        optimizer.param_groups[0]["lr"] = 4e-3 * (1 - step / 800)
-        loss(buffer.sample())["loss_policy"].backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        average.step()
-    hidden = [frames for index, frames in enumerate(states) if not data["has_action"][data["episode"] == index].all()]
-    assert len(hidden) == 50
-    windows = torch.cat([frames[:30].unfold(0, 6, 1).transpose(1, 2) for frames in hidden])
-    with torch.no_grad(), loss.target_network_params.to_module(policy):
-        chunk = policy.sample(windows[:, :2])
-    expected = windows[:, 1:5] @ law.T
-    error = (chunk - expected).square().mean((0, 2)).sqrt()
-    off_by_one = (windows[:, 2:6] @ law.T - expected).square().mean().sqrt()
-    assert (error < 0.25 * off_by_one).all() and (error < 0.06 * expected.std()).all(), (error, off_by_one)
 
 
 def test_bad_input_is_explained():

@@ -16,7 +16,7 @@ import torch
 
 import torchrl_koap
 from torchrl_koap.envs import mode_index_of, sorting
-from torchrl_koap.tasks import TASKS, WINDOW, Action, Task, aligning, avoiding, get_task
+from torchrl_koap.tasks import TASKS, Action, Task, aligning, avoiding, get_task
 
 TOY = {
     "name": "toy",
@@ -30,18 +30,6 @@ TOY = {
 def test_tasks_cannot_be_changed():
     with pytest.raises(dataclasses.FrozenInstanceError):
         get_task("avoiding").max_steps = 3
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_facts_fit_each_other(name):
-    task = get_task(name)
-    assert {body.position for body in task.bodies} <= set(task.observation)
-    command = set() if task.command is None else {task.command}
-    assert {*task.state, *task.hidden, *command, task.position} <= set(task.observation)
-    assert all(0 <= column < task.state_dim for column in (*task.moved_columns(or_robot=True), *task.robot))
-    assert len(task.moved_columns()) in (0, task.action_dim)
-    assert get_task(task.source).observation == task.observation
-    assert WINDOW == 16
 
 
 def test_stacking_without_joints_shows_and_commands_what_the_paper_does():

@@ -22,36 +22,28 @@ JOINT_BOUND = 0.03  # rad per control step
 GRIPPER_BOUND = 0.08  # m
 
 
-def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
+def mode_index(mode: torch.Tensor) -> torch.Tensor:
     """Returns the number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5.
 
     Args:
         mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 ``[*B, 3]``: 0 red, 1 green, 2 blue, -1 none.
-        num_boxes (int): how many letters count: 1 tells the first box (0 to 2), 2 and 3 the order (0 to 5).
 
     Returns:
         torch.Tensor: int64 ``[*B]``; -1 while incomplete.
 
     Raises:
-        ValueError: if the last axis has not 3 entries or the number is not 1, 2 or 3.
+        ValueError: if the last axis has not 3 entries.
     """
-    _check_num_boxes(num_boxes)
     if mode.shape[-1] != 3:
         raise ValueError(f"mode must have 3 entries on the last axis, got shape {list(mode.shape)}")
     mode = mode.to(torch.int64)
     first, second = mode[..., 0], mode[..., 1]
-    index = first if num_boxes == 1 else 2 * first + (second > 3 - first - second)
-    return index.masked_fill((mode[..., :num_boxes] < 0).any(-1), -1)
+    return (2 * first + (second > 3 - first - second)).masked_fill((mode < 0).any(-1), -1)
 
 
 def first_box(mode: torch.Tensor) -> torch.Tensor:
     """Returns the mode of Stacking-1, the first box of a leaf ``mode`` ``[*B, 3]``; -1 while there is none."""
     return mode[..., 0].long()
-
-
-def _check_num_boxes(num_boxes: int) -> None:
-    if num_boxes not in (1, 2, 3):
-        raise ValueError(f"num_boxes must be 1, 2 or 3: how many boxes make a success; got {num_boxes!r}")
 
 
 class StackingEnv(ManipulationEnv):
@@ -78,6 +70,9 @@ class StackingEnv(ManipulationEnv):
 
     Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
+    Raises:
+        ValueError: for another number of boxes than 1, 2 or 3, too.
+
     Examples:
         >>> from torchrl_koap.envs import StackingEnv
         >>> env = StackingEnv(num_envs=2, seed=0)
@@ -100,7 +95,8 @@ class StackingEnv(ManipulationEnv):
     COMMAND_DIM, RESET_WIDTH = 8, controller.FINGER_OPEN
 
     def __init__(self, *args: Any, num_boxes: int = 3, **options: Any):
-        _check_num_boxes(num_boxes)
+        if num_boxes not in (1, 2, 3):
+            raise ValueError(f"num_boxes must be 1, 2 or 3: how many boxes make a success; got {num_boxes!r}")
         super().__init__(*args, task=get_task("stacking_1" if num_boxes == 1 else "stacking"), **options)
         self.num_boxes = num_boxes
 

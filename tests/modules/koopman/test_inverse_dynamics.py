@@ -93,16 +93,6 @@ def test_parts_with_other_keys_in_a_model_with_other_keys():
     assert other.fit_labels(data, torch.ones(4, 9, dtype=torch.bool))["labels_used"] == 4 * 5
 
 
-@pytest.mark.parametrize("normalizers", [True, False])
-def test_raw_entries_are_not_written_over(normalizers):
-    model, state = make_model(normalizers=normalizers), windows(4)
-    td = TensorDict({"state": state.clone()}, [4])
-    first = model(td)["action"].clone()
-    assert torch.equal(td["state"], state)
-    assert torch.equal(model(td)["action"], first)  # a second call reads the same state
-    assert set(td.keys()) == {"state", "latent_action", "action"}
-
-
 def test_part_of_a_longer_sequence():
     model = make_model()
     sequence = TensorDictSequential(

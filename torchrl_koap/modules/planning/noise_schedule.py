@@ -98,10 +98,9 @@ class NoiseSchedule(nn.Module):
         self.register_buffer("signal", signal.to(**default))
         self.register_buffer("noise", noise.to(**default))
 
-    def sample_time(self, like: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def sample_time(self, like: Tensor) -> Tensor:
         """Draws training times ``[*B]``, in training steps, of the type and device of sequences ``[*B, H, d]``."""
-        time = torch.randint(NUM_TRAIN_STEPS, like.shape[:-2], device=like.device, generator=generator)
-        return time.to(like.dtype)
+        return torch.randint(NUM_TRAIN_STEPS, like.shape[:-2], device=like.device).to(like.dtype)
 
     def add_noise(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
         """Mixes the noisy sequence ``signal(t) x_0 + noise(t) eps``, ``[*B, H, d]``, at times ``[*B]``."""
