@@ -22,7 +22,6 @@ COVERED_BY = {
     "envs/mujoco/simulation.py": "envs/mujoco/test_controller.py",
     "envs/registry.py": "plugins/test_plugins.py",
     "envs/scooping/expert.py": "envs/scooping/test_env.py",
-    "envs/scooping/kinematics.py": "envs/scooping/test_env.py",
     "envs/scooping/recording.py": "envs/scooping/test_env.py",
     "envs/scooping/scene.py": "envs/scooping/test_env.py",
     "envs/scooping/simulation.py": "envs/scooping/test_env.py",

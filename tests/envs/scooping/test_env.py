@@ -16,8 +16,7 @@ from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.registry import make_env
-from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints
-from torchrl_koap.envs.scooping.kinematics import SpoonKinematics, rotation_of
+from torchrl_koap.envs.scooping.expert import ScoopingExpert, SpoonKinematics, rotation_of, start_joints
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, settled_layouts
 from torchrl_koap.tasks import get_task

@@ -13,8 +13,7 @@ from torchrl.data import Unbounded
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.scooping.expert import start_joints
-from torchrl_koap.envs.scooping.kinematics import SpoonKinematics
+from torchrl_koap.envs.scooping.expert import SpoonKinematics, start_joints
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE

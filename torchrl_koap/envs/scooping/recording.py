@@ -12,8 +12,7 @@ import numpy as np
 from torchrl_koap.data.formats.writers import LeRobotWriter
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.scooping.expert import HABITS, ScoopingExpert, start_joints
-from torchrl_koap.envs.scooping.kinematics import SpoonKinematics
+from torchrl_koap.envs.scooping.expert import HABITS, ScoopingExpert, SpoonKinematics, start_joints
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task, get_task
