@@ -26,22 +26,29 @@ class Slider:
     action_space = gymnasium.spaces.Box(-1, 1, (1,))
 
 
+PLACES = [np.full(1, 0.5 * step, np.float32) for step in range(7)]
+
+
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
-    """Written through Minari's own storage: its collector needs packages that only recording needs."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    camera = [np.zeros((2, 2, 3), np.uint8)] * 7
+    return write(tmp_path, Slider.observation_space, {"place": PLACES, "camera": camera})
+
+
+def write(root, space, observations):
+    """Written through Minari's own storage: its collector needs packages that only recording needs."""
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 
-    folder = tmp_path / "slider" / "test-v0" / "data"
+    folder = root / "slider" / "test-v0" / "data"
     folder.mkdir(parents=True)
-    storage = MinariStorage.new(folder, Slider.observation_space, Slider.action_space)
-    places = [np.full(1, 0.5 * step, np.float32) for step in range(7)]
+    storage = MinariStorage.new(folder, space, Slider.action_space)
     episodes = [
         EpisodeBuffer(
             id=number,
             seed=0,
-            observations={"place": list(places), "camera": [np.zeros((2, 2, 3), np.uint8)] * 7},
+            observations=observations,
             actions=[np.full(1, 0.5, np.float32)] * 6,
             rewards=[0.0] * 6,
             terminations=[False] * 5 + [True],
@@ -68,3 +75,13 @@ def test_an_unknown_data_set_and_rate(dataset):
         read_minari("minari:slider/other-v0")
     with pytest.raises(DataError, match="pass control_hz"):
         read_minari(f"minari:{dataset}")
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_observations_that_are_a_tuple(width, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    spaces = [gymnasium.spaces.Box(-9, 9, (size,)) for size in (1, width)]
+    name = write(tmp_path, gymnasium.spaces.Tuple(spaces), (PLACES, [np.repeat(place, width) for place in PLACES]))
+    found = read_minari(f"minari:{name}", control_hz=25)
+    assert found.state_names == (("0", "1") if width == 1 else ("0", "1_0", "1_1"))
+    np.testing.assert_array_equal(found.states[0], np.repeat(PLACES, 1 + width, 1))

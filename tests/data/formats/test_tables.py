@@ -145,3 +145,24 @@ def test_columns_that_would_be_lost_are_refused(header, message, tmp_path):
     (tmp_path / "a.csv").write_text(header + "\n0,0.1,1,2\n1,0.2,1,2\n")
     with pytest.raises(DataError, match=message):
         read_tables(tmp_path)
+
+
+def test_dates_are_time_stamps(tmp_path):
+    times = np.datetime64("2024-01-01T00:00:00", "us") + np.arange(6) * np.timedelta64(50, "ms")
+    write_csv(tmp_path / "run.csv", columns_of(action=[0.0] * 6) | {"timestamp": times.tolist()})
+    assert read_tables(tmp_path).control_hz == pytest.approx(20)
+    parquet = pytest.importorskip("pyarrow.parquet")
+    (tmp_path / "run.csv").unlink()
+    for kind in ("datetime64[us]", "datetime64[ns]", "timedelta64[ms]"):
+        stamps = times - times[0] if kind[0] == "t" else times
+        table = pytest.importorskip("pyarrow").table(columns_of(action=[0.0] * 6) | {"timestamp": stamps.astype(kind)})
+        parquet.write_table(table, tmp_path / "run.parquet")
+        assert read_tables(tmp_path).control_hz == pytest.approx(20)
+
+
+def test_decimal_numbers_are_states(tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    exact = pyarrow.array([0.5 * row for row in range(6)]).cast(pyarrow.decimal128(9, 3))
+    parquet.write_table(pyarrow.table(columns_of(action=[0.0] * 6) | {"x": exact}), tmp_path / "run.parquet")
+    found = read_tables(tmp_path)
+    assert found.state_names == ("x", "y") and found.states[0][:, 0].tolist() == [0, 0.5, 1, 1.5, 2, 2.5]

@@ -36,7 +36,8 @@ def number_type(kind: Any) -> Any:
     types = pyarrow.types
     nested = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
     inner = kind.value_type if nested else kind
-    if not (types.is_floating(inner) or types.is_integer(inner) or types.is_boolean(inner)):
+    known = (types.is_floating, types.is_integer, types.is_boolean, types.is_decimal)
+    if not any(is_one(inner) for is_one in known):
         return None
     return pyarrow.list_(pyarrow.float64()) if nested else pyarrow.float64()
 

@@ -29,9 +29,9 @@ _KINDS = {
     "other": r"index|task_index|row|_*index_level_0_*|unnamed:_0|(.+_)?(rewards?|success)|returns?(_to_go)?|discounts?",
 }
 _KIND = {kind: re.compile(pattern) for kind, pattern in _KINDS.items()}
-_UNITS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6}
-_UNITS |= {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9}
-_UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(_UNITS)})[)\]]?")
+UNITS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6}
+UNITS |= {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9}
+_UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(UNITS)})[)\]]?")
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def kind_of(name: str) -> tuple[str | None, float]:
     plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.strip()).lower().removeprefix("next.")
     unit = _UNIT.fullmatch(plain)
     if unit and _KIND["clock"].fullmatch(_joined(unit[1])):
-        return "clock", _UNITS[unit[2]]
+        return "clock", UNITS[unit[2]]
     return next((kind for kind, pattern in _KIND.items() if pattern.fullmatch(_joined(plain))), None), 1.0
 
 

@@ -53,7 +53,8 @@ def read_lerobot(
     known = info["features"]
     observed = [name for name in known if name.startswith(PREFIX)]
     images = [name for name in observed if _is_image(known[name])]
-    chosen = [name for name in observed if name not in images] if observations is None else list(observations)
+    usable = [name for name in observed if name not in images and known[name].get("dtype") != "string"]
+    chosen = usable if observations is None else list(observations)
     problems = [
         f"feature {name!r} is an image ({known[name].get('dtype')}): embed it first, it cannot be part of the state"
         for name in chosen

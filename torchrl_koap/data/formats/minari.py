@@ -21,7 +21,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
 
     Args:
         source (str): ``minari:`` and the id of the data set, such as ``"minari:D4RL/door/human-v2"``. Dictionary
-            observations are laid side by side in the order of their names; images are skipped.
+            observations are laid side by side in the order of their names, tuples by number; images are skipped.
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the rate is declared by ``render_fps`` of the
             data set's environment.
     """
@@ -70,6 +70,8 @@ def read_minari(source: str, **options: Any) -> Recordings:
 
 def _leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
     """Arrays by name, those of dictionaries in the order of their names."""
+    if isinstance(observations, tuple):
+        observations = {str(index): part for index, part in enumerate(observations)}
     if not isinstance(observations, Mapping):
         yield name, np.asarray(observations)
         return

@@ -29,7 +29,7 @@ import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.clocks import UNEVEN
-from torchrl_koap.data.formats.columns import Piece, assemble, kind_of, numbered
+from torchrl_koap.data.formats.columns import UNITS, Piece, assemble, kind_of, numbered
 from torchrl_koap.data.formats.frames import clips_beside
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, some
@@ -236,8 +236,16 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
             values, odd = numbered(fields), []
         if 0 < len(odd) < len(values):
             raise ValueError(f"row {odd[0] + 2}, column {name!r}: {fields[odd[0]]!r} is no number")
-        columns[name] = None if odd else np.array(values)
+        columns[name] = (_dates(fields) if kind_of(name)[0] == "clock" else None) if odd else np.array(values)
     return _split(file, columns, action_columns)
+
+
+def _dates(fields: Sequence[object]) -> np.ndarray | None:
+    """Dates with times as seconds, None if one is none."""
+    try:
+        return (np.array(fields, dtype="datetime64[ns]") - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
+    except ValueError:
+        return None
 
 
 def _number(field: str, *, comma: bool) -> float | None:
@@ -260,6 +268,10 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
         values = table[name]
         if pyarrow.types.is_boolean(values.type):
             values = values.cast(pyarrow.int8())
+        dated = pyarrow.types.is_timestamp(values.type) or pyarrow.types.is_duration(values.type)
+        if dated and kind_of(name)[0] == "clock":
+            columns[name] = values.cast(pyarrow.int64()).to_numpy() * UNITS[values.type.unit]
+            continue
         kind = number_type(values.type)
         if kind is None:  # text, dates, pictures
             columns[name] = numbered(values.to_pylist()) if kind_of(name)[0] == "episode" else None
