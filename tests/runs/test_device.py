@@ -34,20 +34,6 @@ def test_bfloat16_by_name_is_obeyed_and_warns_where_it_is_emulated(units):
     assert units is not None or "'auto'" in str(caught[0].message)
 
 
-def test_another_precision_is_refused_by_name():
-    with pytest.raises(ValueError, match="precision 'bfloat61'"):
-        find_precision("bfloat61")
-
-
-@pytest.mark.parametrize(
-    ("threads", "device", "message"),
-    [(0, "cpu", "threads must be >= 1, got 0"), (1, "gpu", "device must be 'cpu' or 'cuda', got 'gpu'")],
-)
-def test_threads_and_device_are_checked(threads, device, message):
-    with pytest.raises(ValueError, match=message):
-        set_up_torch(threads, device)
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_missing_gpu_is_said():
     with pytest.raises(ValueError, match="'cuda:1' was asked for, but torch finds no CUDA here"):

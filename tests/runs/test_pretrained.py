@@ -107,16 +107,9 @@ def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd
     written = {path.name for path in (policies / "avoiding").iterdir()}
     assert not {"inspect.json", "exported", "plots"} & written
     capfd.readouterr()
-    for command in ("inspect", "export"):
+    for command in ("eval", "inspect", "export"):
         assert koap(command, "pretrained:avoiding") == 1
         assert "nothing is written into pretrained:avoiding: name a folder" in capfd.readouterr().err
-
-
-def test_wrong_calls(policies, tmp_path, capfd):
-    assert koap("eval", "pretrained:avoiding") == 1
-    assert "name a folder of your own with --out" in capfd.readouterr().err
-    assert koap("eval", "pretrained:evoiding", "--out", tmp_path / "a") == 1
-    assert "did you mean 'avoiding'?" in capfd.readouterr().err
 
 
 def test_another_run_is_not_overwritten(run, tmp_path):

@@ -184,8 +184,6 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
         ({"evaluation.episodes": 0}, "episodes must be >= 1, got 0"),
         ({"planner.steps": 0}, "planner.steps must be >= 1, got 0"),
         ({"workers": 0}, "workers must be >= 1, got 0"),
-        ({"launcher": "lokal"}, "unknown launcher 'lokal'; did you mean 'local'?"),
-        ({"address": "10.0.0.1:1"}, "launcher 'local' works on this machine alone"),
         ({"datasets": (), "record": 40, "labels": (0.01,)}, "selects none of the 40 trajectories"),
         (
             {"levels": (6,), "labels": ()},

@@ -68,13 +68,7 @@ def templates() -> Environment:
 
 
 def write_page(template: str, path: str | Path, **content: Any) -> Path:
-    """Fills a template of ``reports/templates``, writes the page aside first, and returns its file.
-
-    Args:
-        template (str): file name of the template.
-        path (str or Path): the page.
-        **content: what the template names.
-    """
+    """Fills a template of ``reports/templates`` with what it names, writes the page aside first, returns its file."""
     path, page = Path(path), templates().get_template(template).render(**content)
     with replacing_file(path) as aside:
         aside.write_text(page, encoding="utf-8")

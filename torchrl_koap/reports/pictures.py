@@ -147,14 +147,9 @@ def all_pictures() -> dict[str, Picture]:
 def draw_pictures(
     folder: str | Path, *, names: Collection[str] | None = None, animation: bool = True
 ) -> dict[str, str]:
-    """Draws every picture whose source is there into ``plots/``; one that fails does not stop the others.
+    """Draws every picture, or those named, into ``plots/`` whose source is there; one that fails stops no other.
 
-    Args:
-        folder (str or Path): the run directory.
-
-    Keyword Args:
-        names (collection of str, optional): the pictures to draw. Default: all.
-        animation (bool): draw the moving pictures too (a second from above, some more for the film).
+    Moving ones take some seconds more (``animation``).
 
     Returns:
         dict: what went wrong, a message per picture that could not be drawn although its source is there. A picture

@@ -24,16 +24,9 @@ def number(value: Any) -> float | int | None:
 
 @dataclass(frozen=True)
 class RunFacts:
-    """Holds what is known about a run; files that are absent or damaged are empty.
+    """Holds what is known about a run: its task, if anybody here knows it, and its JSON files.
 
-    Args:
-        folder (Path): the run directory.
-        task (Task, optional): its task; None if nobody here knows it.
-        summary (mapping): ``summary.json``.
-        evaluation (mapping): ``eval.json``.
-        inspection (mapping): ``inspect.json``.
-        config (mapping): ``config.json``.
-        damaged (tuple of str): what was wrong with which of them.
+    Those that are absent or damaged are empty; ``damaged`` says what was wrong with which.
     """
 
     folder: Path

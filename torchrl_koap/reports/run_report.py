@@ -26,18 +26,7 @@ _CONFIG_ELSEWHERE = ("versions", "command")
 def write_report(folder: str | Path, *, draw: bool = True, animation: bool = True) -> Path:
     """Writes ``index.html`` into a run directory; sections whose files are absent say which command makes them.
 
-    A picture that cannot be drawn is left out; page and warning say why.
-
-    Args:
-        folder (str or Path): the run directory. Read are ``config.json``, ``summary.json``, ``eval.json`` and the files
-            behind the pictures, all optional.
-
-    Keyword Args:
-        draw (bool): draw the pictures first. Otherwise those already there are shown.
-        animation (bool): draw the moving pictures too.
-
-    Returns:
-        Path: the page.
+    Pictures are drawn first (``draw``; otherwise those already there are shown), moving ones too (``animation``).
 
     Raises:
         FileNotFoundError: if there is no such directory.

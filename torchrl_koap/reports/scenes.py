@@ -101,9 +101,6 @@ def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
 def read_episodes(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Returns the positions ``[length, 2]`` (m) of each episode without the padding, and modes and outcomes ``[E]``.
 
-    Args:
-        rollouts (mapping): ``position`` ``[E, T, 2]`` (m), ``length``, ``mode`` and ``outcome`` ``[E]``.
-
     Raises:
         ValueError: if an entry is missing or has a wrong shape.
     """
@@ -137,11 +134,8 @@ def draw_bodies(
 ) -> None:
     """Draws the bodies of a task: start outlines (if there are contexts), paths in their colours, ends.
 
-    Args:
-        paths (sequence): positions ``[frames, bodies, 2]`` (m) of each episode.
-        task (Task, optional): the task.
-        good (sequence of bool): whether each episode succeeded: its bodies end in a dot, otherwise in a cross.
-        contexts (array, optional): starts ``[E, bodies, 3]``: x, y (m), yaw (rad).
+    Of each episode ``paths`` has positions ``[frames, bodies, 2]`` (m), ``contexts`` ``[E, bodies, 3]`` starts: x, y (m),
+    yaw (rad). Bodies end in a dot where it is ``good``, otherwise in a cross.
     """
     bodies = bodies_of(task, paths[0].shape[1] if len(paths) else 0)
     if contexts is not None:

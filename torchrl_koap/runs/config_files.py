@@ -45,12 +45,7 @@ def to_json(config: Any) -> dict[str, Any]:
 
 
 def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
-    """Makes a dataclass, and those that are its sections, of a JSON object.
-
-    Args:
-        kind (type): the dataclass.
-        content (mapping): its fields by name; those that are left out keep their defaults.
-        path (str or Path): the file, for the message.
+    """Makes a dataclass, and those that are its sections, of a JSON object; what is left out keeps its default.
 
     Raises:
         RunDirectoryError: naming the file and an option that is unknown, in another section, of another type or out of
@@ -123,10 +118,7 @@ def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
 def fill_in(asked: Config, known: Any) -> Config:
     """Puts known options in place of those that are at their defaults, likewise in every section.
 
-    Args:
-        asked (dataclass): what was asked for.
-        known (dataclass or mapping): options by name, those of sections in such mappings of their own; some may be
-            missing.
+    They are a dataclass, or by name, sections in mappings of their own; some may be missing.
     """
     known = known if isinstance(known, Mapping) else vars(known)
     found = {}

@@ -54,10 +54,6 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
 def set_up_torch(threads: int | None, device: str) -> None:
     """Sets the number of threads, None leaves it as it is, and checks that the device is there.
 
-    Args:
-        threads (int, optional): number of torch threads.
-        device (str): ``"cpu"`` or ``"cuda"``, with an index or not.
-
     Raises:
         ValueError: if the number is out of range, or this machine has no such device.
     """

@@ -22,13 +22,10 @@ class PluginError(ValueError):
 
 
 def load_plugins(names: Sequence[str]) -> None:
-    """Imports modules that register something when they are imported; a second time does nothing.
+    """Imports modules, by their dotted names, that register something when they are imported; later calls do nothing.
 
     The current directory is searched after the Python path, so that a file beside the data is found, as by ``python
     -m``.
-
-    Args:
-        names (sequence of str): dotted names of modules, ``"my_method"`` or ``"my_package.my_method"``.
 
     Raises:
         PluginError: if a module is not found, or fails when it is imported; the message names it, and where it was

@@ -65,15 +65,8 @@ def _is_on_disk(stream: TextIO) -> bool:
 def progress_bar(total: int | None, description: str, *, unit: str = "it", **options: Any) -> tqdm:
     """A bar on stderr that counts to ``total``; where stderr cannot be written to, there is none.
 
-    Where stderr is a file (the log of a cell, ``2> log.txt``), the bar is a line every half minute and at its end.
-
-    Args:
-        total (int, optional): where it ends.
-        description (str): what is counted.
-
-    Keyword Args:
-        unit (str): the name of one of them.
-        **options: of ``tqdm``.
+    Where stderr is a file (the log of a cell, ``2> log.txt``), the bar is a line every half minute and at its end. The
+    options are those of ``tqdm``.
     """
     disable = not _SHOWN.get() or sys.stderr is None
     stream: _Forgiving | None = None
@@ -128,10 +121,7 @@ def check_logger(name: str) -> None:
 def open_logger(name: str, out: Path) -> Iterator[Any | None]:
     """Yields a logger of TorchRL that writes into the run directory, and closes it at the end of the block.
 
-    Args:
-        name (str): a name in ``LOGGERS``; None is yielded for ``"csv"``. wandb stays offline unless ``WANDB_MODE`` says
-            otherwise.
-        out (Path): the run directory.
+    For ``"csv"`` it is None. wandb stays offline unless ``WANDB_MODE`` says otherwise.
     """
     check_logger(name)
     if name == "csv":

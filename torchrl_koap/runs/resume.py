@@ -53,9 +53,7 @@ def check_resume(run: RunDirectory, config: TrainConfig) -> None:
 def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
     """Refuses to go on with other demonstrations, or another version of this package, than a run was begun with.
 
-    Args:
-        run (RunDirectory): the folder.
-        content (mapping): what ``config.json`` is to hold, ``data`` and ``versions`` included.
+    ``content`` is what ``config.json`` is to hold, ``data`` and ``versions`` included.
 
     Raises:
         RunDirectoryError: naming what differs.

@@ -133,13 +133,9 @@ class RunDirectory:
 
     @contextlib.contextmanager
     def locked(self, what: str, name: str = ".lock") -> Iterator[None]:
-        """Keeps others out of the folder as long as the block lasts.
+        """Keeps others out of the folder as long as the block lasts; ``what`` works there, such as ``"koap train"``.
 
         What a process that was killed had half written of a checkpoint is taken away first.
-
-        Args:
-            what (str): what works in the folder, for the message: ``"koap train"``.
-            name (str): the lock file in the folder.
 
         Raises:
             RunDirectoryError: if somebody works in the folder already.

@@ -55,12 +55,7 @@ def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any
 
 
 def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[str, nn.Module | None]) -> None:
-    """Hands several modules, those that are not None, their weights, of names ``"PART.ENTRY"``.
-
-    Args:
-        path (str or Path): the file they are from, for the message.
-        tensors (mapping): all weights.
-        parts (mapping): modules by name.
+    """Hands several modules, those that are not None, their weights, of names ``"PART.ENTRY"`` in a file.
 
     Raises:
         CheckpointError: as :func:`load_weights`.

@@ -98,12 +98,8 @@ def launch(
 ) -> Generator[tuple[Job, str | None], None, None]:
     """Calls a function in every job's folder, each in a process of its own; yields jobs as they end.
 
-    A job whose need failed is not run and fails too. Closing the iterator stops what is running.
-
-    Args:
-        function (callable): a module-level function of a folder.
-        jobs (sequence of Job): those that come first are started first.
-        machines (Machines, optional): where.
+    The function is one of a module, of a folder. Jobs that come first are started first; one whose need failed is not
+    run and fails too. Closing the iterator stops what is running.
 
     Yields:
         tuple: a job, and why it failed, None if it did not.
@@ -266,10 +262,7 @@ def _die_with_parent() -> None:
 class RayPool:
     """Tasks of a Ray cluster; a task that dies is not tried again.
 
-    Args:
-        function (callable): what jobs do.
-        workers (int): jobs at a time, on a cluster of its own.
-        address (str, optional): of a cluster that runs, which decides how many by itself.
+    A cluster that runs, given by its address, decides by itself how many there are at a time.
     """
 
     def __init__(self, function: Callable[[str], None], workers: int, address: str | None):

@@ -77,19 +77,10 @@ def plot_measure(
 ) -> Path:
     """Draws a measure of every method with its ends, a panel per entry of ``by``.
 
-    Args:
-        summaries (sequence of Summary): of one task, see :func:`~torchrl_koap.studies.table.summarise`.
-        path (str or Path): png to write.
-        measure (str): of :data:`MEASURES`.
-
-    Keyword Args:
-        by (sequence of str): what the horizontal axes show, of :data:`AXES`. Along ``"demonstrations"`` there is a line
-            per method and share of labels that was run with several of them.
-        paper (mapping, optional): by method shares of the labels and successes of the paper: hollow and dashed, in the
-            colour of the method, along ``"labels"`` alone.
-        methods (sequence of str, optional): all methods in the order that gives the colours. Default: as they come.
-        unit (str): unit of the measure.
-        label_unit (str): what the labels are counted in, as in the label of the axis: ``"windows"``.
+    The measure is one of :data:`MEASURES`, in a ``unit``; the horizontal axes are of :data:`AXES`, labels counted in
+    ``label_unit``. Along ``"demonstrations"`` there is a line per method and share of labels that was run with several
+    of them. The ``paper`` has by method shares of the labels and successes: hollow and dashed, along ``"labels"``
+    alone. ``methods`` are all of them in the order that gives the colours.
 
     Raises:
         ValueError: if no cell has the measure, or an error is not above 0.
@@ -133,11 +124,7 @@ def plot_average(
 ) -> Path:
     """Draws success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
 
-    Args:
-        averages (mapping): by method level, mean and the ends of its interval, in 0..1.
-        paper (mapping): by method level and mean.
-        tasks (sequence of str): what it is the mean of.
-        path (str or Path): png to write.
+    By method ``averages`` has level, mean and the ends of its interval, the ``paper`` level and mean, all in 0..1.
 
     Raises:
         ValueError: if there is nothing to draw.

@@ -74,13 +74,8 @@ def write_study_report(
 
     Where windows are labelled, as in the paper, its figures stand beside those that were measured.
 
-    Args:
-        folder (str or Path): the folder; made if it is not there.
-        rows (sequence of mapping): cells, see :data:`~torchrl_koap.studies.table.CELL_COLUMNS`.
-        outcomes (mapping, optional): of :func:`~torchrl_koap.studies.paired_comparison.compare_cells`.
-
-    Keyword Args:
-        title, options: heading and options of the study.
+    Rows are cells of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`, outcomes those of
+    :func:`~torchrl_koap.studies.paired_comparison.compare_cells`; the page shows the options of the study.
 
     Raises:
         ValueError: if a cell occurs twice.
