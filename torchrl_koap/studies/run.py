@@ -151,7 +151,13 @@ def _check_folder(study: Study) -> None:
 def _report(study: Study, table: _Table) -> Path:
     named = study.tasks[0] if len(study.tasks) == 1 else f"{len(study.tasks)} tasks"
     rows, title = list(table.rows.values()), f"Label efficiency on {named}"
-    return write_study_report(study.out, rows, table.outcomes, title=title, options=to_json(study))
+    return write_study_report(study.out, rows, table.outcomes, title=title, options=_given(to_json(study)))
+
+
+def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of all sections that say something."""
+    known = {name: _given(value) if isinstance(value, Mapping) else value for name, value in options.items()}
+    return {name: value for name, value in known.items() if value not in (None, [], {})}
 
 
 def _first_look(study: Study, task: Task) -> TensorDictBase | None:
