@@ -60,7 +60,8 @@ def test_both_ways_of_a_fork_are_no_mistake_and_units_stay_apart():
     assert joint["planner"]["best_of"]["overall"] == pytest.approx(0)  # one of 16 went the right way
     # half of the samples are right: 0.5 * 2 k - 0.5 * (8 / 15) * 2 k
     assert joint["planner"]["energy_score"]["per_step"][3] == pytest.approx(4 * (1 - 8 / 15), rel=0.1)
-    assert found["relative"] < 0.6 and found["relative_of_velocity"] < 0.1
+    still, steady = (joint[name]["energy_score"]["overall"] for name in ("standing_still", "constant_velocity"))
+    assert found["relative"] < 0.6 and steady < 0.1 * still
     assert plan_errors(Planner(0.0), data(), TASK)["relative"] == pytest.approx(1)
     assert force["planner"]["energy_score"]["overall"] == 0 and found["situations"] == 500
     assert len(found["trajectory"]) == 20

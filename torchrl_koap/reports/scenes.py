@@ -134,8 +134,8 @@ def draw_bodies(
 ) -> None:
     """Draws the bodies of a task: start outlines (if there are contexts), paths in their colours, ends.
 
-    Paths are positions ``[frames, bodies, 2]`` (m) of each episode, contexts
-    ``[E, bodies, 3]`` starts: x, y (m), yaw (rad). Bodies end in a dot where an episode is ``good``, otherwise in a cross.
+    Paths are positions ``[frames, bodies, 2]`` (m) of each episode, contexts ``[E, bodies, 3]`` starts: x, y (m),
+    yaw (rad). Bodies end in a dot where an episode is ``good``, otherwise in a cross.
     """
     bodies = bodies_of(task, paths[0].shape[1] if len(paths) else 0)
     if contexts is not None:
