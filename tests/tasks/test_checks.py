@@ -6,16 +6,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from toy_task import TOY
 
 from torchrl_koap.tasks import Action, Body, Modes, Scene, Task
 
-TOY = {
-    "name": "toy",
-    "observation_parts": {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1},
-    "actions": {"x": Action("m"), "y": Action("m")},
-    "position": "tool",
-    "command": "command",
-}
 HERE = (((0.0, 0.1), (0.0, 0.1)),)
 BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE)
 

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import pytest
+from toy_task import TOY
 
-from torchrl_koap.tasks import TASKS, Action, Modes, Task, get_task, register_task
+from torchrl_koap.tasks import TASKS, Modes, Task, get_task, register_task
 from torchrl_koap.tasks import registry as registry_module
 
 
@@ -17,15 +18,6 @@ def test_unknown_names_suggest_the_nearest():
     for wrong in (None, 3, ["avoiding"]):
         with pytest.raises(ValueError, match="unknown task"):
             get_task(wrong)
-
-
-TOY = {
-    "name": "toy",
-    "observation_parts": {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1},
-    "actions": {"x": Action("m"), "y": Action("m")},
-    "position": "tool",
-    "command": "command",
-}
 
 
 @pytest.fixture

@@ -13,18 +13,11 @@ import sys
 import numpy as np
 import pytest
 import torch
+from toy_task import TOY
 
 import torchrl_koap
 from torchrl_koap.envs import mode_index_of, sorting
 from torchrl_koap.tasks import TASKS, Action, Task, aligning, avoiding, get_task
-
-TOY = {
-    "name": "toy",
-    "observation_parts": {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1},
-    "actions": {"x": Action("m"), "y": Action("m")},
-    "position": "tool",
-    "command": "command",
-}
 
 
 def test_tasks_cannot_be_changed():

@@ -94,13 +94,7 @@ class KoopmanLifting(TensorDictModuleBase):
         self.decoder_skip.weight.zero_()[:, :count] = (components * spread).to(self.decoder_skip.weight)
 
     def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
-        """Trains what is trained before the losses are, on windows ``[*B, T, d]`` without labels: here nothing.
-
-        Args:
-            windows (Tensor): in the networks' units.
-            updates (int): at most so many.
-            progress (callable, optional): called with the number of updates done, and of all.
-        """
+        """Trains before the losses do (:meth:`InverseDynamics.prepare`), on windows ``[*B, T, d]``: here nothing."""
 
     def finish(self, windows: Tensor) -> None:
         """Chooses after training, on windows ``[*B, T, d]`` without labels, what is kept: here everything."""
