@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, fit, load_policy
@@ -52,6 +53,18 @@ def test_a_run_that_stores_no_range_of_commands_finds_it_in_its_data(copied_run,
         Trained.load(copied_run).with_ranges(str(tmp_path / "gone too"))
     assert Trained.load(copied_run).with_ranges(str(demonstrations)).results["command_ranges"] == ranges
     assert load_policy(copied_run).limits.ends.shape == (2, 2)
+
+
+def test_a_default_of_float64_changes_no_loaded_policy(trained_run, tmp_path):
+    file = Trained.load(trained_run).save(tmp_path / "policy.safetensors")
+    expected = actions(load_policy(trained_run))
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = [actions(load_policy(where)) for where in (trained_run, file)]
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for one in found:
+        np.testing.assert_array_equal(one, expected)
 
 
 def test_a_run_as_one_file(trained_run, tmp_path):

@@ -67,6 +67,9 @@ def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[s
 
 
 def _load(path: str | Path, module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    kinds = {value.dtype for value in tensors.values() if value.is_floating_point()}
+    if len(kinds) == 1:
+        module.to(kinds.pop())  # as it was trained, whatever torch's default is
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
