@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 from fault_ledger import Fault, Place, check, meet, table
 from recording_writers import LENGTH, WRITERS, columns
+from tiny_runs import koap
 
 
 def put(name: str, make: Callable[[np.ndarray], np.ndarray], *, actions: bool = False):
@@ -49,10 +51,22 @@ KINDS: dict[str, tuple[Callable, str, tuple[str, ...]]] = {
         "episode_id 0 comes back|frames are 0.05 to 0.55 s apart",
         (),
     ),
+    "an end of text": (
+        put("done", lambda d: np.array(["no"] * LENGTH)),
+        "'done' .*no numbers|'done' must be numbers",
+        (),
+    ),
+    "an end of halves": (put("done", lambda d: d + 0.5), "'done' of the ends of episodes must be 0 or 1", ()),
+    "names of episodes": (put("episode", lambda e: np.array(["reach", "push"]).repeat(LENGTH // 2)), "", ()),
+    "a start that is flagged": (put("is_first", lambda f: 1.0 * (np.arange(LENGTH) % 20 == 0)), "", ()),
+    "whole numbers": (put("q0", lambda q: np.round(9 * q).astype(int)), "", ()),
     "an action of text": (put("v0", lambda v: v.astype(str) + "!", actions=True), "action", ()),
     "an unknown column": (lambda episode: None, "unknown column in drop_columns", ("--drop-columns", "q9")),
 }
-ELSEWHERE = {  # an HDF5 file and a LeRobot set have their own ends of episodes; LeRobot's names have another form
+# an HDF5 file, a LeRobot set and Minari have their own ends of episodes, and no text; LeRobot's names have another form
+OWN = ("an end of text", "an end of halves", "names of episodes", "a start that is flagged")
+ELSEWHERE = {
+    *((form, kind) for form in ("lerobot", "hdf5", "minari") for kind in OWN),
     ("lerobot", "an episode that comes back"),
     ("lerobot", "stamps in ms"),
     ("hdf5", "an episode that comes back"),
@@ -63,6 +77,36 @@ ELSEWHERE = {  # an HDF5 file and a LeRobot set have their own ends of episodes;
 }
 
 
+def still(values: np.ndarray) -> np.ndarray:
+    return values[np.maximum(np.arange(LENGTH) - 20, 0)]
+
+
+def stand(episode) -> None:
+    for table in episode:
+        table.update({name: still(values) for name, values in table.items() if name != "timestamp"})
+
+
+# what is done to every episode, and what `koap convert` and `koap validate` say of it, though they accept it
+WARNED: dict[str, tuple[Callable, str]] = {
+    "a wrapped angle": (put("q0", lambda q: (np.arange(LENGTH) / 4) % (2 * np.pi) - np.pi), "angles that were wrapped"),
+    "a failed measurement": (
+        put("q0", lambda q: np.where(np.arange(LENGTH) == 9, 1e3, q)),
+        "a measurement that failed",
+    ),
+    "still frames": (stand, "nothing moves in 5.% of all frames at the start"),
+    "a constant state": (put("q1", lambda q: 0 * q + 3), "'?q1'? is 3 in all"),
+    "a constant action": (put("v1", lambda v: 0 * v + 2, actions=True), "is 2 in all labels: a policy always"),
+    "an action that leaps": (
+        put("v0", lambda v: np.sin(np.arange(LENGTH) / 9) - 6.28 * (np.arange(LENGTH) == 7), actions=True),
+        "far from that before and behind",
+    ),
+    "single labels": (
+        lambda episode: [put(name, sparse, actions=True)(episode) for name in ("v0", "v1")],
+        "labels stand alone",
+    ),
+}
+
+
 def damage(kind: str, form: str) -> Callable[[Place], None]:
     def do(place: Place) -> None:
         folder = place.get("arrays")
@@ -70,15 +114,19 @@ def damage(kind: str, form: str) -> Callable[[Place], None]:
             file.unlink()
         episodes = [columns(seed) for seed in range(2)]
         for episode in episodes:
-            KINDS[kind][0](episode)
+            (KINDS | WARNED)[kind][0](episode)
         WRITERS[form](folder, episodes)
 
     return do
 
 
+def source_of(form: str) -> str:
+    return {"hdf5": "{arrays}/all.hdf5", "minari": "minari:arm/all-v0"}.get(form, "{arrays}")
+
+
 def faults() -> Iterator[Fault]:
     for form in WRITERS:
-        source = {"hdf5": "{arrays}/all.hdf5", "minari": "minari:arm/all-v0"}.get(form, "{arrays}")
+        source = source_of(form)
         for kind, (_, says, words) in KINDS.items():
             if (form, kind) not in ELSEWHERE:
                 words = ("convert", source, "--out", "{out}", *words)
@@ -92,3 +140,15 @@ def faults() -> Iterator[Fault]:
 def test_what_would_mislead_is_told(fault, place, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(place.root / "arrays"))
     check(fault, meet(fault, place))
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("form", WRITERS)
+@pytest.mark.parametrize("kind", WARNED)
+def test_what_is_unlikely_is_told(kind, form, place, monkeypatch, capsys):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(place.root / "arrays"))
+    damage(kind, form)(place)
+    words = ["convert", source_of(form).format(arrays=place.root / "arrays"), "--out", place.root / "out"]
+    for call in (words if form != "minari" else [*words, "--control-hz", "20"], ["validate", place.root / "out"]):
+        assert koap(*call) == 0
+        assert re.search(WARNED[kind][1], " ".join(capsys.readouterr().out.split()))
