@@ -82,8 +82,8 @@ def still(values: np.ndarray) -> np.ndarray:
 
 
 def stand(episode) -> None:
-    for table in episode:
-        table.update({name: still(values) for name, values in table.items() if name != "timestamp"})
+    for part in episode:
+        part.update({name: still(values) for name, values in part.items() if name != "timestamp"})
 
 
 # what is done to every episode, and what `koap convert` and `koap validate` say of it, though they accept it
@@ -95,7 +95,7 @@ WARNED: dict[str, tuple[Callable, str]] = {
     ),
     "still frames": (stand, "nothing moves in 5.% of all frames at the start"),
     "a constant state": (put("q1", lambda q: 0 * q + 3), "'?q1'? is 3 in all"),
-    "a constant action": (put("v1", lambda v: 0 * v + 2, actions=True), "is 2 in all labels: a policy always"),
+    "a constant action": (put("v1", lambda v: 0 * v + 2, actions=True), "is 2 in all labels"),
     "an action that leaps": (
         put("v0", lambda v: np.sin(np.arange(LENGTH) / 9) - 6.28 * (np.arange(LENGTH) == 7), actions=True),
         "far from that before and behind",
