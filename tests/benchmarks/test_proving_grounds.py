@@ -12,6 +12,9 @@ from shared_data import SHARED
 from tensordict import TensorDict
 
 from torchrl_koap.data import open_dataset
+from torchrl_koap.vision import Observer, cameras_of, load_backbone
+
+OWN = "tiny_network:random_layer"
 
 
 def test_the_angle_of_the_block_becomes_cosine_and_sine(benchmark_script):
@@ -36,6 +39,27 @@ def test_push_t_becomes_a_data_set(benchmark_script, monkeypatch, tmp_path):
     steps, task = open_dataset(str(tmp_path / "data"))
     assert len(steps["episode"].unique()) == 206 and len(steps) == 25_650 - 206
     assert task.targets == (0, 1) and task.robot == (0, 1) and task.state_dim == 6
+
+
+def test_frames_of_recorded_states_become_columns(benchmark_script, monkeypatch, tmp_path):
+    pytest.importorskip("gym_pusht")
+    script = benchmark_script("proving_grounds")
+    states = np.random.default_rng(0).uniform(150, 350, (3, 30, 5))
+    monkeypatch.setattr(script, "read_episodes", lambda: (list(states), [frames[:, :2] for frames in states]))
+    monkeypatch.setattr("torchrl_koap.vision.embedding.load_backbone", lambda network: load_backbone(OWN))
+    script.write_pixels(tmp_path / "data")
+    steps, task = open_dataset(str(tmp_path / "data"))
+    assert len(steps) == 87 and task.robot == (0, 1) and task.targets == (0, 1) and task.state_dim == 2 + 64
+    env, other = script.make_pixels(), script.make_pixels()
+    env.reset(seed=3), other.reset(seed=1)
+    for step in range(40):  # the agent runs into the block
+        seen, *_ = env.step(np.array(env.unwrapped.block.position))
+        agent, block = env.unwrapped.agent, env.unwrapped.block
+        drawn = script.draw(other.unwrapped, np.array([*agent.position, *block.position, block.angle]))
+        np.testing.assert_array_equal(drawn, seen["pixels"], str(step))
+    frame = script.draw(other.unwrapped, states[1, 4])
+    seen = Observer(task, cameras_of(tmp_path / "data"))({"state": states[1, 4, :2].astype(np.float32), "top": frame})
+    torch.testing.assert_close(seen, steps["observation"][29 + 4], rtol=1e-4, atol=1e-4)
 
 
 def test_a_row_is_the_mean_largest_reward(benchmark_script, monkeypatch, tmp_path):
