@@ -241,7 +241,11 @@ def main(
     lookup([name for name in METHODS if get_method(name).plans], methods[0], "first method, which plans")
     torch.set_num_threads(1)
     done, write = open_table(results, COLUMNS, KEYS)
-    executions = {"default": ExecutionConfig(), "open_loop_8": ExecutionConfig(strategy="open_loop", replan_interval=8)}
+    executions = {
+        "default": ExecutionConfig(),
+        "open_loop_8": ExecutionConfig(strategy="open_loop", replan_interval=8),
+        "temperature_1": ExecutionConfig(temperature=1.0),
+    }
     for seed in range(seeds):
         for method in methods:
             cell = (ground, method, labels, seed)

@@ -80,9 +80,9 @@ def test_a_row_is_the_mean_largest_reward(benchmark_script, monkeypatch, tmp_pat
     table = tmp_path / "table.csv"
     for _ in range(2):  # the second finds everything done
         script.main(seeds=1, n=2, methods=("koap",), folder=tmp_path, results=table)
-    assert [type(each).__name__ for each in asked] == ["TrainConfig", "list", "list"]
+    assert [type(each).__name__ for each in asked] == ["TrainConfig", "list", "list", "list"]
     assert asked[0].labels.count == 10 and asked[1] == [100_000, 100_001]
     with table.open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["execution"] for row in rows] == ["default", "open_loop_8"]
+    assert [row["execution"] for row in rows] == ["default", "open_loop_8", "temperature_1"]
     assert {(row["largest_reward"], row["successes"], row["kept_update"]) for row in rows} == {("1.0000", "2", "700")}
