@@ -25,7 +25,9 @@ from torchrl_koap.vision.projection import Projection, projection_of
 class Embed(Command):
     """Embed camera frames with a frozen network.
 
-    The result is for `koap train`. Nothing is downloaded. The same command goes on with an interrupted embedding.
+    The result is for `koap train`. Nothing is downloaded.
+
+    The same command goes on with an interrupted embedding.
 
     Example: `koap embed arm --camera top --camera wrist --out arm_seen`
 
