@@ -148,7 +148,7 @@ def embed_recordings(
     backbone = load_backbone(network) if given is None else given.backbone
     total, done = len(chosen) * sum(map(len, recordings.states)), 0
     embedded: dict[str, list[Tensor]] = {}
-    reports, projections = {}, {}
+    reports = {}
     for name in chosen:
         size = next(_read(recordings, name, 0)).shape[:2]
         encoder = FrozenImageEncoder(backbone, size=size) if given is None else given
@@ -160,7 +160,7 @@ def embed_recordings(
         width = task.observation[name].stop - task.observation[name].start if name in task.observation else components
         fitted = film.fit(width) if projection is None else projection
         fitted.save(out / CAMERAS / f"{name}.safetensors")
-        projections[name] = fitted = Projection.load(out / CAMERAS / f"{name}.safetensors")  # as it is used
+        fitted = Projection.load(out / CAMERAS / f"{name}.safetensors")  # as it is used
         reports[name] = film.report(fitted)
         embedded[name] = [fitted(features) for features in film.features()]
     task, states = _with_columns(task, recordings, embedded)
