@@ -59,3 +59,20 @@ def test_labels_that_say_little_are_named():
     noisy["next", "observation"] = noisy["observation"] + torch.randn(noisy["observation"].shape)
     found = check_loop(fit(data, task, **TINY, progress=False), noisy, noisy)
     assert "of how states follow actions, linearly" in describe_loop(found) and found["faults"] == []
+
+
+def test_an_expert_that_knew_the_states_without_noise_is_no_alarm():
+    """Actions then tell the noise of the states, and a model that reads both turns them against the robot."""
+    random, states, actions = np.random.default_rng(1), [], []
+    for _ in range(12):
+        joints, goal, velocity = random.uniform(-1, 1, 2), random.uniform(-1, 1, 2), np.zeros(2)
+        frames, steps = [], []
+        for _ in range(80):
+            frames.append(np.r_[joints + 1e-3 * random.normal(size=2), goal])
+            steps.append(0.1 * (goal - joints))
+            velocity = 0.5 * velocity + 0.5 * steps[-1]
+            joints = joints + velocity
+        states.append(np.array(frames)), actions.append(np.array(steps))
+    data, task = make_demonstrations(states, actions[:6] + [None] * 6, control_hz=30, robot=range(2))
+    found = check_loop(fit(data, task, **TINY, progress=False), data, data)
+    assert found["largest_command_late"] < 1 and found["faults"] == [] and found["explained"] > 0.9
