@@ -45,8 +45,9 @@ def study(benchmark_script, monkeypatch, tmp_path):
 
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)
-    monkeypatch.setattr(module, "embed_demonstrations", lambda out, *_, **__: (out / "ted").mkdir(parents=True))
-    monkeypatch.setattr(module, "load_encoder", lambda projection: None)
+    monkeypatch.setattr(module, "read_recordings", lambda folder, episodes=(), **_: (folder.name, len(episodes)))
+    monkeypatch.setattr(module, "join_recordings", list)
+    monkeypatch.setattr(module, "embed_recordings", lambda parts, task, out, **_: (out / "ted").mkdir(parents=True))
     for who in ("robot", "hand"):  # recorded before
         (tmp_path / who / "meta").mkdir(parents=True)
         (tmp_path / who / "meta" / "info.json").touch()
@@ -83,21 +84,19 @@ def test_hand_alone_has_a_planner_per_number_of_labels_and_dp_none(study, tmp_pa
 @pytest.mark.parametrize(
     ("unlabelled", "whose"),
     [
-        ("both", [("robot", None), ("hand", None)]),
-        ("robot", [("robot", None)]),
-        ("hand", [("robot", 2), ("hand", None)]),
+        ("both", [("robot", 0), ("hand", 0)]),  # all
+        ("robot", [("robot", 0)]),
+        ("hand", [("robot", 2), ("hand", 0)]),
         ("none", [("robot", 2)]),
     ],
 )
 def test_a_data_set_holds_the_demonstrations_it_is_called_after(study, monkeypatch, tmp_path, unlabelled, whose):
     asked = []
-    monkeypatch.setattr(
-        study, "embed_demonstrations", lambda out, sources, encoder, **how: asked.append((sources, how))
-    )
+    monkeypatch.setattr(study, "embed_recordings", lambda *given, **how: asked.append((given, how)))
     study.data_set(tmp_path, unlabelled, 2)
-    ((sources, how),) = asked
-    assert [(source.folder.name, source.episodes) for source in sources] == whose
-    assert how == {"mixed": len(whose) > 1, "task": "scooping"}
+    (((parts, task, out), how),) = asked
+    assert parts == whose and task.name == "scooping" and out.parent == tmp_path
+    assert how["projection"].dim == 96
 
 
 def test_cells_pool_seeds_and_take_the_longest_row_of_each(benchmark_script):
