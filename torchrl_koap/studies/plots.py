@@ -184,7 +184,7 @@ def _lines(
     methods = list(methods or dict.fromkeys(item.method for item in summaries))
     shares = sorted({item.labels for item in summaries})
     several = by == "demonstrations" and len(shares) > 1
-    styles, lines = method_styles(methods), {}
+    styles, lines = method_styles(methods), dict[str, _Line]()
     for item in sorted(summaries, key=lambda item: (methods.index(item.method), item.mean(by) or 0)):
         place, found = item.mean(by), item.measures.get(measure)
         if place is None or found is None:

@@ -252,8 +252,11 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     )
     datasets = {task: os.path.abspath(path) for task, path in _by_task("datasets", study.datasets, study.tasks)}
     planners = {task: find_run(run).absolute() for task, run in _by_task("planners", study.planners, study.tasks)}
-    datasets, planners = (tuple(f"{task}={path}" for task, path in to.items()) for to in (datasets, planners))
-    study = replace(study, datasets=datasets, planners=planners)
+    study = replace(
+        study,
+        datasets=tuple(f"{task}={path}" for task, path in datasets.items()),
+        planners=tuple(f"{task}={run}" for task, run in planners.items()),
+    )
     for name in study.tasks:
         study.task(name)  # there must be one
     return study

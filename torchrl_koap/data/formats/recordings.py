@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from numbers import Real
 
 import numpy as np
 import torch
@@ -134,7 +133,7 @@ def make_recordings(
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
     problems += _sparse([array for array in known if array is not None and array.shape[1] == wide], given_actions)
-    if control_hz is not None and not (isinstance(control_hz, Real) and 0 < control_hz < math.inf):
+    if control_hz is not None and not (isinstance(control_hz, (int, float, np.number)) and 0 < control_hz < math.inf):
         problems.append(f"control_hz must be a positive number of frames per second, got {control_hz!r}")
     if problems:
         raise DataError(source, problems)
