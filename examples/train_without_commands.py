@@ -9,7 +9,7 @@ from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
 from torchrl_koap import modules as koap
-from torchrl_koap.data import LabelBudget, make_window_buffer, select_state
+from torchrl_koap.data import LabelBudget, cut_windows, extrapolate_ends, make_window_buffer, select_state
 from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
@@ -39,8 +39,9 @@ controller = koap.KoopmanInverseDynamics(
 planner = koap.StatePlanner(koap.TemporalUnet(2, 4), state_dim=2)
 entries = ["state", "action", "has_action"]
 labelled = make_window_buffer(data, 16, 128, select=entries, pad_before=1, labelled_share=0.25)
-states = make_window_buffer(data, 16, 128, select=["state"], pad_before=1, pad_after=13)
-windows = make_window_buffer(data, 16, len(data), select=["state"], pad_before=1).sample()
+extended = extrapolate_ends(data, 13)  # plans made near the end of a demonstration have a future too
+states = make_window_buffer(extended, 16, 128, select=["state"], pad_before=1)
+windows = cut_windows(extended, 16, select=["state"], pad_before=1)  # statistics of what is trained on
 planner.fit_normalizers(windows["state"])
 controller.prepare(windows["state"])
 planner_loss = PlannerLoss(planner)

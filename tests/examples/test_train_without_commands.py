@@ -7,6 +7,8 @@ import runpy
 import sys
 from pathlib import Path
 
+import torch
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "train_without_commands.py"
 
 
@@ -26,7 +28,11 @@ def test_the_example_has_sixty_lines_of_code():
 
 def test_the_example_runs(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--demonstrations", "4", "--updates", "2"])
-    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    names = runpy.run_path(str(EXAMPLE), run_name="__main__")
     labels, controller, planner, rollouts = capsys.readouterr().out.splitlines()
     assert "transitions have labels" in labels and "loss_koopman" in controller and "loss_planner" in planner
     assert rollouts.startswith("(8, 120): ") and "nan" not in controller + planner
+    planner, buffer = names["planner"], names["states"]
+    trained_on = torch.cat([buffer.sample()["state"] for _ in range(100)])
+    plans = planner.encode(*planner.split_window(trained_on))  # statistics are those of the windows trained on
+    assert (plans.mean(0).abs() < 0.06).all() and ((plans.std(0) - 1).abs() < 0.06).all()

@@ -138,7 +138,8 @@ class StatePlanner(ConditionalSampler):
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
 
         Args:
-            windows (Tensor): raw states ``[*N, history + horizon, d]``.
+            windows (Tensor): raw states ``[*N, history + horizon, d]``, padded as those that are trained on: where ends
+                stand still in training alone, their plans are far out of the range of the network.
 
         Keyword Args:
             seen (Tensor, optional): the windows as training augments them, which the forecast is fitted to. Default:
