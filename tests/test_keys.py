@@ -8,6 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.keys import REQUIRED, LayoutError, validate
+from torchrl_koap.modules import KoopmanLifting, KoopmanOperator, LatentActionMLP, LinearActionDecoder
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 
 
 def flat(lengths=(3, 1, 4), obs=4, act=2, dtype=torch.float32):
@@ -128,3 +130,20 @@ def test_blanked_commands():
     data["observation"][6, 1] = float("nan")  # half a command is a fault
     data["observation"][7, 3] = float("nan")
     assert "in 2 steps, first at step 6" in problems(data, command=slice(0, 2))[0]
+
+
+@pytest.mark.parametrize(
+    ("part", "entry"),
+    [
+        (KoopmanLifting(2, 4), "state"),
+        (CompactLifting(2, 2, num_components=2), "state"),
+        (KoopmanOperator(4), "lifted_state"),
+        (LatentActionMLP(2, 4), "state"),
+        (LinearActionDecoder(4, 2), "latent_action"),
+    ],
+)
+def test_every_part_names_the_entry_that_it_lacks(part, entry):
+    with pytest.raises(
+        KeyError, match=rf"{type(part).__name__} reads '{entry}'; there are .*'robot', 'window'.*in_key"
+    ):
+        part(TensorDict({"robot": {"window": torch.zeros(3, 16, 2)}}, [3]))

@@ -28,7 +28,8 @@ transition from ``x_t`` to ``x_{t+1}``.
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
 
 from torchrl_koap.files import DataError
 
@@ -68,6 +69,19 @@ class LayoutError(DataError):
 
     def __init__(self, problems: list[str]):
         super().__init__("data that do not follow the storage layout", problems)
+
+
+def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, rename: str = "in_key=...") -> Tensor:
+    """Reads an entry for a module.
+
+    Raises:
+        KeyError: if it is not there; names those that are, and how the module is told of another name (``rename``).
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        there = sorted(tensordict.keys(True, True), key=str)
+        raise KeyError(f"{type(module).__name__} reads {key!r}; there are {there}; rename with {rename}")
+    return value
 
 
 def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDictBase:

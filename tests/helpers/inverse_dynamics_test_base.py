@@ -132,6 +132,11 @@ class InverseDynamicsTestBase:
         torch.testing.assert_close(action, distance + state[..., [1, 3]])
         torch.testing.assert_close(network.normalize_action(action, state), network.predict(state))
 
+    def test_a_missing_entry_is_named(self):
+        network = self.make_network(in_key=("in", "x"))
+        with pytest.raises(KeyError, match=r"reads \('in', 'x'\); there are .*'y'.*; rename with set_keys\(state="):
+            network(TensorDict({"y": torch.randn(2, T, 3)}, [2]))
+
     def test_states_of_another_width_are_refused(self):
         with pytest.raises(ValueError, match="columns, got shape"):
             self.make_network()(TensorDict({"state": torch.randn(2, T, 4)}, [2]))

@@ -107,6 +107,8 @@ class SamplerTestBase:
         with pytest.raises(ValueError, match="horizon must be at least 1"):
             self.make(horizon=0)
         sampler = self.make(num_steps=3)
+        with pytest.raises(KeyError, match=rf"{type(sampler).__name__} reads 'history'; there are \['past'\]"):
+            sampler(TensorDict({"past": torch.zeros(5, 2, 2)}, [5]))
         for length in (1, 3):
             with pytest.raises(ValueError, match=rf"'history' must be \[\*B, 2, 2\].* got \[5, {length}, 2\]"):
                 sampler(TensorDict({"history": torch.zeros(5, length, 2)}, [5]))

@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE
+from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE, read_entry
 from torchrl_koap.modules.windows import WindowReader
 
 BATCH = 4096  # windows that are read at once
@@ -211,7 +211,7 @@ class InverseDynamics(TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of every frame."""
-        state = tensordict.get(self.in_key)
+        state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
         return tensordict.set(self.out_key, self.raw_action(self.predict(state), state))
 
 
@@ -262,7 +262,7 @@ class LatentInverseDynamics(InverseDynamics):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes latent and action of every frame."""
-        state = tensordict.get(self.in_key)
+        state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
         latent = self.infer(state)
         tensordict.set(self.out_keys[0], latent)
         return tensordict.set(self.out_key, self.raw_action(self.decode(latent), state))

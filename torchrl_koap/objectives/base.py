@@ -11,26 +11,8 @@ from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from torchrl_koap.keys import ACTION, HAS_ACTION, PADDED, STATE
+from torchrl_koap.keys import ACTION, HAS_ACTION, PADDED, STATE, read_entry
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
-
-
-def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Reads an entry; a KeyError names those that are there if it is not."""
-    value = tensordict.get(key, None)
-    if value is None:
-        raise KeyError(f"the loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
-    return value
-
-
-def read_mask(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
-    """Reads a mask ``[*B, T]`` of the frames of windows ``[*B, T, d]``, stored with a trailing 1 or not."""
-    mask = read_entry(tensordict, key)
-    if mask.shape == (*state.shape[:-1], 1):
-        mask = mask.squeeze(-1)
-    if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
-        raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
-    return mask
 
 
 class NetworkLoss(LossModule):
@@ -79,11 +61,24 @@ class NetworkLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """There is no value estimator."""
 
+    def _read(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        """Reads the entry of a name of ``set_keys``."""
+        return read_entry(self, tensordict, getattr(self.tensor_keys, name), f"set_keys({name}=...)")
+
+    def _read_mask(self, tensordict: TensorDictBase, name: str, state: Tensor) -> Tensor:
+        """Reads a mask ``[*B, T]`` of the frames of windows ``[*B, T, d]``, stored with a trailing 1 or not."""
+        key, mask = getattr(self.tensor_keys, name), self._read(tensordict, name)
+        if mask.shape == (*state.shape[:-1], 1):
+            mask = mask.squeeze(-1)
+        if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
+            raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
+        return mask
+
     def _recorded(self, tensordict: TensorDictBase, state: Tensor) -> Tensor:
         """Transitions between two recorded frames, bool ``[*B, T - 1]``."""
         if tensordict.get(self.tensor_keys.padded, None) is None:
             return torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
-        padded = read_mask(tensordict, self.tensor_keys.padded, state)
+        padded = self._read_mask(tensordict, "padded", state)
         return ~(padded[..., 1:] | padded[..., :-1])
 
     def _reduce(self, error: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -100,7 +95,8 @@ class WindowLoss(NetworkLoss):
     """Base class of the losses on windows of states of which some frames have an action label.
 
     Args:
-        network (InverseDynamics): the controller; its entries of states and actions are those of the loss.
+        network (InverseDynamics): the controller; the loss reads batches under its entries of states and actions,
+            until ``set_keys`` renames those of the loss.
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
@@ -133,16 +129,9 @@ class WindowLoss(NetworkLoss):
         super().__init__(network, reduction=reduction)
         super().set_keys(state=network.in_key, action=network.out_key)
 
-    def set_keys(self, **kwargs) -> None:
-        """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too."""
-        super().set_keys(**kwargs)
-        self.network.set_keys(
-            **{name: getattr(self.tensor_keys, name) for name in ("state", "action") if name in kwargs}
-        )
-
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
-        state = read_entry(tensordict, self.tensor_keys.state)
+        state = self._read(tensordict, "state")
         return state, self._recorded(tensordict, state)
 
     def _targets(
@@ -150,8 +139,8 @@ class WindowLoss(NetworkLoss):
     ) -> tuple[Tensor, Tensor]:
         """Normalised actions ``[*B, frames, act]`` of a span, 0 where they do not count; and where they do."""
         frames = slice(span.start, span.stop)
-        action = read_entry(tensordict, self.tensor_keys.action)[..., frames, :]
-        counts = read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
+        action = self._read(tensordict, "action")[..., frames, :]
+        counts = self._read_mask(tensordict, "has_action", state)[..., frames] & recorded[..., frames]
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         action = torch.where(counts.unsqueeze(-1), action, 0.0)
         return self.network.normalize_action(action, state[..., frames, :]), counts

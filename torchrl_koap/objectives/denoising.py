@@ -16,7 +16,7 @@ from torchrl_koap import keys
 from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
 from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
-from torchrl_koap.objectives.base import NetworkLoss, WindowLoss, read_entry, read_mask
+from torchrl_koap.objectives.base import NetworkLoss, WindowLoss
 
 
 class DenoisingLoss(NetworkLoss):
@@ -134,7 +134,7 @@ class PlannerLoss(DenoisingLoss):
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads histories and recorded futures, of which all steps count (:meth:`DenoisingLoss.read`)."""
-        return *self.network.split_window(read_entry(tensordict, self.tensor_keys.state)), None
+        return *self.network.split_window(self._read(tensordict, "state")), None
 
 
 class DiffusionPolicyLoss(DenoisingLoss):
@@ -178,14 +178,12 @@ class DiffusionPolicyLoss(DenoisingLoss):
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads histories, actions from now on and which of them are labelled (:meth:`DenoisingLoss.read`)."""
         names, now = self.tensor_keys, self.network.history - 1
-        state, action = read_entry(tensordict, names.state), read_entry(tensordict, names.action)
+        state, action = self._read(tensordict, "state"), self._read(tensordict, "action")
         history, _ = self.network.split_window(state)
         wanted = (*state.shape[:-1], self.network.action_dim)
         if action.shape != wanted:
             raise ValueError(f"{names.action!r} must be {list(wanted)} ([*B, T, act]), got {list(action.shape)}")
-        counts = (
-            read_mask(tensordict, names.has_action, state)[..., now:-1] & self._recorded(tensordict, state)[..., now:]
-        )
-        counts = counts.unsqueeze(-1)
+        labelled = self._read_mask(tensordict, "has_action", state)[..., now:-1]
+        counts = (labelled & self._recorded(tensordict, state)[..., now:]).unsqueeze(-1)
         # zeroed before the network and the residual: masking afterwards would leave NaN in the gradient
         return history, torch.where(counts, action[..., now:-1, :], 0.0), counts

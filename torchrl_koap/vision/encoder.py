@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import ObservationTransform
 
+from torchrl_koap.keys import read_entry
 from torchrl_koap.vision.backbones import Backbone, load_backbone
 
 BATCH = 32  # frames that go through the network at once
@@ -124,7 +125,7 @@ class FrozenImageEncoder(ObservationTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sets the embeddings of the frames of a tensordict."""
-        return tensordict.set(self.out_keys[0], self.embed(tensordict.get(self.in_keys[0])))
+        return tensordict.set(self.out_keys[0], self.embed(read_entry(self, tensordict, self.in_keys[0])))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self.forward(tensordict_reset)

@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torchrl_koap.keys import LIFTED_STATE, STATE
+from torchrl_koap.keys import LIFTED_STATE, STATE, read_entry
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.koopman.smoothing import noise_covariance
 
@@ -283,4 +283,4 @@ class CompactLifting(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the lifted states."""
-        return tensordict.set(self.out_keys[0], self.encode(tensordict.get(self.in_keys[0])))
+        return tensordict.set(self.out_keys[0], self.encode(read_entry(self, tensordict, self.in_keys[0])))

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import LSTM, MLP
 
-from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE
+from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE, read_entry
 from torchrl_koap.modules.ridge import RidgeFit
 from torchrl_koap.modules.windows import WindowReader
 
@@ -98,7 +98,7 @@ class LatentActionModule(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the latent action of every frame of the window."""
-        return tensordict.set(self.out_keys[0], self.infer(self.gather(tensordict.get(self.in_keys[0]))))
+        return tensordict.set(self.out_keys[0], self.infer(self.gather(read_entry(self, tensordict, self.in_keys[0]))))
 
 
 class LatentActionLSTM(LatentActionModule):
@@ -275,7 +275,7 @@ class LinearActionDecoder(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the decoded actions."""
-        return tensordict.set(self.out_keys[0], self.linear(tensordict.get(self.in_keys[0])))
+        return tensordict.set(self.out_keys[0], self.linear(read_entry(self, tensordict, self.in_keys[0])))
 
     @torch.no_grad()
     def assign(self, fit: RidgeFit) -> None:

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_koap.keys import LATENT_ACTION, LIFTED_STATE, STATE
+from torchrl_koap.keys import LATENT_ACTION, LIFTED_STATE, STATE, read_entry
 
 
 class KoopmanLifting(TensorDictModuleBase):
@@ -121,7 +121,7 @@ class KoopmanLifting(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the lifted states."""
-        return tensordict.set(self.out_keys[0], self.encode(tensordict.get(self.in_keys[0])))
+        return tensordict.set(self.out_keys[0], self.encode(read_entry(self, tensordict, self.in_keys[0])))
 
 
 class KoopmanOperator(TensorDictModuleBase):
@@ -185,5 +185,5 @@ class KoopmanOperator(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the predicted next lifted state."""
-        lifted, latent_action = (tensordict.get(key) for key in self.in_keys)
+        lifted, latent_action = (read_entry(self, tensordict, key, "in_keys=...") for key in self.in_keys)
         return tensordict.set(self.out_keys[0], self.step(lifted, latent_action))

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from torchrl_koap.keys import HISTORY
+from torchrl_koap.keys import HISTORY, read_entry
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.noise_schedule import SOLVERS, NoiseSchedule
@@ -205,7 +205,8 @@ class ConditionalSampler(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the sampled sequence into the tensordict."""
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
-        return tensordict.set(self.out_keys[0], self.sample(tensordict.get(self.in_keys[0]), noise))
+        history = read_entry(self, tensordict, self.in_keys[0], "in_keys=[...]")
+        return tensordict.set(self.out_keys[0], self.sample(history, noise))
 
     def _encode_prefix(self, history: Tensor, prefix: Tensor) -> Tensor:
         """Normalised first frames; each has statistics of its own, so the rest is filled up before."""
