@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import partial
 
 import numpy as np
@@ -50,7 +51,7 @@ def test_resume_goes_on_with_the_labels_of_before(run, capsys):
     assert "was started with another labels.fraction" in capsys.readouterr().err
 
 
-def test_absolute_targets(arrays, tmp_path):
+def test_absolute_targets(arrays, tmp_path, capsys):
     (tmp_path / "arrays").mkdir()
     for file in arrays.iterdir():
         content = dict(np.load(file))
@@ -58,7 +59,13 @@ def test_absolute_targets(arrays, tmp_path):
             content["actions"] = content["states"][:, :2] + content["actions"]
         np.savez(tmp_path / "arrays" / file.name, **content)
     command = ("convert", tmp_path / "arrays", "--out", tmp_path / "arm", "--name", "reach", "--robot", "q1", "q2")
+    assert koap(*command, "--out", tmp_path / "wrong") == 0
+    assert koap("validate", tmp_path / "wrong") == 0
+    printed = capsys.readouterr().out
+    assert re.search("^action kind +delta .default.$", printed, re.MULTILINE)
+    assert printed.count("look like absolute targets; convert again with --action-kind absolute --targets q1 q2") == 2
     assert koap(*command, "--action-kind", "absolute") == 0
+    assert "absolute targets" not in capsys.readouterr().out
     assert koap("train", "--dataset", tmp_path / "arm", "--out", tmp_path / "run", "--method", "linear", *TINY) == 0
     data, _ = load_ted(tmp_path / "arm" / "ted")
     agent = Agent(load_policy(tmp_path / "run", limits=float("inf")))

@@ -193,6 +193,7 @@ class Convert(Command):
             "task": task.name,
             "steps": len(data),
             **_contents(recordings),
+            "action kind": ", ".join(self.action_kind) or "delta (default)",
             "skipped": ", ".join(recordings.skipped) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],

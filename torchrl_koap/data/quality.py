@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap import keys
+from torchrl_koap.data.action_kinds import kind_warnings
 from torchrl_koap.data.formats.clocks import FASTEST, SLOWEST, rises_evenly
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds
@@ -30,8 +31,8 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, or reach a
     place beyond 100 m or rad; state columns that never change, equal another one, leap, or are clocks; frames at both
-    ends in which nothing moves; actions that never change or leap for one frame; labels that stand alone; an unlikely
-    rate; plans that are short against the motion.
+    ends in which nothing moves; actions of another kind than declared, that never change or leap for one frame; labels
+    that stand alone; an unlikely rate; plans that are short against the motion.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout, with ``state``.
@@ -60,6 +61,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         )
     ]
     return [
+        *kind_warnings(data, task),
         *_trajectory_warnings(data, task, lengths, called),
         *_short(lengths, called),
         *_column_warnings(state, task.state_names),
