@@ -212,7 +212,7 @@ def test_a_policy_is_evaluated_without_a_planner(policy_run, tmp_path, capsys):
 def test_a_policy_spends_the_labels_it_was_given(policy_run):
     summary = RunDirectory(policy_run).read_json("summary.json")
     assert summary["labels"]["selected_units"] == 2 and summary["planner_parameters"] == 0
-    teacher = METHODS[RunDirectory(policy_run).read_entry("config.json", "method")].teacher
+    teacher = METHODS[RunDirectory(policy_run).read_json("config.json")["method"]].teacher
     assert summary["controller_updates"] == (8 if teacher else 4)
 
 
