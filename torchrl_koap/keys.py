@@ -76,12 +76,41 @@ def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, re
 
     Raises:
         KeyError: if it is not there; names those that are, and how the module is told of another name (``rename``).
+        ValueError: if it is of another floating type than the weights of the module.
     """
     value = tensordict.get(key, None)
     if value is None:
         there = sorted(tensordict.keys(True, True), key=str)
         raise KeyError(f"{type(module).__name__} reads {key!r}; there are {there}; rename with {rename}")
+    weight = next(module.parameters(), None)
+    if weight is not None and value.is_floating_point() and value.dtype != weight.dtype:
+        name = type(module).__name__
+        raise ValueError(
+            f"{key!r} is {value.dtype}, {name} {weight.dtype}: cast one of them, as with .to({weight.dtype})"
+        )
     return value
+
+
+def frame_mask(mask: Tensor | None, name: object, state: Tensor) -> Tensor:
+    """Checks a mask of the frames of windows ``[*B, T, d]``, which may have a trailing 1, and returns ``[*B, T]``.
+
+    Raises:
+        ValueError: for another shape or type; says what it is and what it is of (``name``).
+    """
+    frames = state.shape[:-1]
+    if mask is None or mask.shape not in (frames, (*frames, 1)) or mask.dtype != torch.bool:
+        got = "None: hand in 'has_action'" if mask is None else f"{mask.dtype} {list(mask.shape)}"
+        cast = "" if mask is None or mask.dtype == torch.bool else "; cast it with .bool()"
+        raise ValueError(f"{name} must be bool {[*frames, 1]} or {list(frames)}, got {got}{cast}")
+    return mask.reshape(frames)
+
+
+def check_actions(action: Tensor, key: NestedKey, state: Tensor) -> Tensor:
+    """Returns actions ``[*B, T, act]`` of windows ``[*B, T, d]``; a ValueError refuses other batches and frames."""
+    if action.shape[:-1] != state.shape[:-1]:
+        frames = f"the batch and frames {list(state.shape[:-1])} of the states, then columns"
+        raise ValueError(f"{key!r} must have {frames}, got {list(action.shape)}")
+    return action
 
 
 def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDictBase:

@@ -38,6 +38,8 @@ def test_no_actions_at_all_need_their_size():
 
 def test_wrong_shapes_and_numbers_are_named():
     frames = [torch.rand(4, 2)] * 2
+    with pytest.raises(ValueError, match=r"trajectory 0: wanted .* actions \[T - 1, act\] .* got \[4, 2\] and \[3\]"):
+        flatten_trajectories(frames, [torch.rand(3)] * 2)
     with pytest.raises(ValueError, match="2 trajectories of observations, 1 of actions"):
         flatten_trajectories(frames, [None])
     with pytest.raises(ValueError, match=r"trajectory 1: wanted .* got \[4, 2\] and \[4, 3\]"):

@@ -136,6 +136,9 @@ class InverseDynamicsTestBase:
         network = self.make_network(in_key=("in", "x"))
         with pytest.raises(KeyError, match=r"reads \('in', 'x'\); there are .*'y'.*; rename with set_keys\(state="):
             network(TensorDict({"y": torch.randn(2, T, 3)}, [2]))
+        if any(True for _ in network.parameters()):
+            with pytest.raises(ValueError, match="is torch.float64, .* torch.float32: cast one of them"):
+                network(TensorDict({"in": {"x": torch.randn(2, T, 3).double()}}, [2]))
 
     def test_states_of_another_width_are_refused(self):
         with pytest.raises(ValueError, match="columns, got shape"):

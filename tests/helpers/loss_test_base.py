@@ -143,6 +143,14 @@ class LossTestBase:
             with pytest.raises(KeyError, match=f"{name}.*there are"):
                 loss(self.make_batch(4).exclude(self.entry(name)))
 
+    def test_a_network_of_another_kind_is_refused(self):
+        loss = self.make_loss()
+        wanted = f"{type(loss).__name__} trains a .*, got Sequential; pass the module inside it"
+        with pytest.raises(TypeError, match=wanted):
+            type(loss)(torch.nn.Sequential(loss.network))
+        with pytest.raises(TypeError, match="got Linear$"):
+            type(loss)(torch.nn.Linear(2, 2))
+
     # labels
 
     @property

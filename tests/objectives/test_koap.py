@@ -218,6 +218,18 @@ def test_a_mask_of_another_shape_or_type_is_refused(entry, bad):
         KOAPLoss(make_network())(TensorDict({**make_batch(3), entry: bad}, [3]))
 
 
+@pytest.mark.parametrize("bad", [torch.ones(3, T - 1, 2), torch.ones(3, T + 4, 2), torch.ones(3, T)])
+def test_actions_of_other_frames_are_refused(bad):
+    with pytest.raises(ValueError, match=rf"'action' must have the batch and frames \[3, {T}\] .*, got \[3, "):
+        KOAPLoss(make_network())(TensorDict({**make_batch(3), "action": bad}, [3]))
+
+
+def test_a_float_mask_is_told_its_shape_and_the_cure():
+    batch = make_batch(3)
+    with pytest.raises(ValueError, match=rf"got torch.float32 \[3, {T}, 1\]; cast it with .bool\(\)"):
+        KOAPLoss(make_network())(batch.set("has_action", batch["has_action"].float()))
+
+
 def test_a_window_too_short_is_explained():
     batch = make_batch(3, num_frames=HISTORY + K)
     message = f"a window of {HISTORY + K} frames is too short .* at least {HISTORY + K + 1} frames are needed"

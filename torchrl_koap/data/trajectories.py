@@ -54,10 +54,10 @@ def flatten_trajectories(
     actions = [None if steps is None else torch.as_tensor(steps) for steps in actions]
     if not observations or len(observations) != len(actions):
         raise ValueError(f"{len(observations)} trajectories of observations, {len(actions)} of actions")
-    given = next((steps for steps in actions if steps is not None and steps.ndim == 2), None)
+    given = next((steps for steps in actions if steps is not None), None)
     if given is None and action_dim is None:
         raise ValueError("no trajectory has actions: action_dim is needed")
-    width = given.shape[1] if action_dim is None else action_dim
+    width = (1, *given.shape)[-1] if action_dim is None else action_dim
     for index, (frames, steps) in enumerate(zip(observations, actions, strict=True), first):
         if frames.ndim == 2 and steps is None:
             actions[index - first] = steps = torch.full((max(len(frames) - 1, 0), width), torch.nan, dtype=dtype)

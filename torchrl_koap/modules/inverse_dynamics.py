@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE, read_entry
+from torchrl_koap.keys import ACTION, EPISODE, LATENT_ACTION, STATE, check_actions, frame_mask, read_entry
 from torchrl_koap.modules.windows import WindowReader
 
 BATCH = 4096  # windows that are read at once
@@ -160,11 +160,13 @@ class InverseDynamics(TensorDictModuleBase):
 
         Args:
             windows (TensorDictBase): raw states ``[*B, T, d]`` and actions ``[*B, T, act]``.
-            mask (Tensor): labelled frames to use, bool ``[*B, T]``; no action outside of it is read. Frames that do not
-                count in the losses (:meth:`valid_frames`) are left out.
+            mask (Tensor): labelled frames to use, bool ``[*B, T]`` or ``[*B, T, 1]``; no action outside of it is read.
+                Frames that do not count in the losses (:meth:`valid_frames`) are left out.
 
         Keyword Args:
-            groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, left out together.
+            groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, left out together. Default: the
+                entry ``episode`` of the windows; without one, every frame is left out alone, and windows that overlap
+                hide that a decoder overfits.
             axes (sequence of int): the state column, of those read, that each action entry moves.
             guessed (bool): the axes are only likely.
 
@@ -192,9 +194,11 @@ class InverseDynamics(TensorDictModuleBase):
         Returns:
             tuple of Tensor: inputs ``[n, m]``, normalised actions ``[n, act]``, and groups ``[n]`` if they were given.
         """
-        shape = windows.get(self.in_key).shape[:-1]
-        if mask.shape != shape or mask.dtype != torch.bool:
-            raise ValueError(f"mask must be bool {list(shape)} ([*B, T]), got {mask.dtype} {list(mask.shape)}")
+        states = read_entry(self, windows, self.in_key, "set_keys(state=...)")
+        action = check_actions(read_entry(self, windows, self.out_key, "set_keys(action=...)"), self.out_key, states)
+        mask, shape = frame_mask(mask, "mask", states), states.shape[:-1]
+        if groups is None and EPISODE in windows.keys():
+            groups = windows.get(EPISODE).reshape(*shape[:-1], -1)[..., -1]
         if groups is not None and groups.shape != shape[:-1]:
             raise ValueError(f"groups must be {list(shape[:-1])} ([*B]), got {list(groups.shape)}")
         frames = self.valid_frames(mask.shape[-1])
@@ -203,7 +207,7 @@ class InverseDynamics(TensorDictModuleBase):
         rows = mask.any(-1)
         if not rows.any():
             raise ValueError(f"no labelled frame lies in frames {frames.start}..{frames.stop - 1} of any window")
-        states, action, mask = windows.get(self.in_key)[rows], windows.get(self.out_key)[rows], mask[rows]
+        states, action, mask = states[rows], action[rows], mask[rows]
         inputs = torch.cat([read(some, frames) for some in states.split(BATCH)])[mask]
         action = self.normalize_action(action[:, part][mask], states[:, part][mask])
         return inputs, action, None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)[mask]

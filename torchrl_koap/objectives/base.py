@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from torchrl_koap.keys import ACTION, HAS_ACTION, PADDED, STATE, read_entry
+from torchrl_koap.keys import ACTION, HAS_ACTION, PADDED, STATE, check_actions, frame_mask, read_entry
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 
@@ -29,8 +29,10 @@ class NetworkLoss(LossModule):
 
     Raises:
         ValueError: for an unknown reduction.
+        TypeError: for a network of another kind than :attr:`trains`.
     """
 
+    trains: tuple[type[nn.Module], ...] = (nn.Module,)
     network: nn.Module
     network_params: TensorDictParams
     target_network_params: TensorDictParams
@@ -39,6 +41,11 @@ class NetworkLoss(LossModule):
     def __init__(self, network: nn.Module, *, create_target_params: bool = False, reduction: str = "mean"):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        if not isinstance(network, self.trains):
+            wanted, got = " or ".join(kind.__name__ for kind in self.trains), type(network).__name__
+            inside = isinstance(network, nn.Module) and any(isinstance(part, self.trains) for part in network.modules())
+            cure = "; pass the module inside it" if inside else ""
+            raise TypeError(f"{type(self).__name__} trains a {wanted}, got {got}{cure}")
         super().__init__()
         self.convert_to_functional(network, "network", create_target_params=create_target_params)
         self.reduction = reduction
@@ -67,12 +74,7 @@ class NetworkLoss(LossModule):
 
     def _read_mask(self, tensordict: TensorDictBase, name: str, state: Tensor) -> Tensor:
         """Reads a mask ``[*B, T]`` of the frames of windows ``[*B, T, d]``, stored with a trailing 1 or not."""
-        key, mask = getattr(self.tensor_keys, name), self._read(tensordict, name)
-        if mask.shape == (*state.shape[:-1], 1):
-            mask = mask.squeeze(-1)
-        if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
-            raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
-        return mask
+        return frame_mask(self._read(tensordict, name), repr(getattr(self.tensor_keys, name)), state)
 
     def _recorded(self, tensordict: TensorDictBase, state: Tensor) -> Tensor:
         """Transitions between two recorded frames, bool ``[*B, T - 1]``."""
@@ -123,6 +125,7 @@ class WindowLoss(NetworkLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    trains = (InverseDynamics,)
     network: InverseDynamics
 
     def __init__(self, network: InverseDynamics, *, reduction: str = "mean"):
@@ -139,7 +142,7 @@ class WindowLoss(NetworkLoss):
     ) -> tuple[Tensor, Tensor]:
         """Normalised actions ``[*B, frames, act]`` of a span, 0 where they do not count; and where they do."""
         frames = slice(span.start, span.stop)
-        action = self._read(tensordict, "action")[..., frames, :]
+        action = check_actions(self._read(tensordict, "action"), self.tensor_keys.action, state)[..., frames, :]
         counts = self._read_mask(tensordict, "has_action", state)[..., frames] & recorded[..., frames]
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         action = torch.where(counts.unsqueeze(-1), action, 0.0)

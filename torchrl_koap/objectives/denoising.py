@@ -130,6 +130,7 @@ class PlannerLoss(DenoisingLoss):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     out_keys = ["loss_planner"]
+    trains = (StatePlanner,)
     network: StatePlanner
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -173,6 +174,7 @@ class DiffusionPolicyLoss(DenoisingLoss):
     default_keys = _AcceptedKeys
     out_keys = ["loss_policy"]
     required = ("state", "action", "has_action")
+    trains = (DiffusionPolicy,)
     network: DiffusionPolicy
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:

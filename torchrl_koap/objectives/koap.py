@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 
-from torchrl_koap.modules.koopman.inverse_dynamics import LiftedInverseDynamics
+from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics, LiftedInverseDynamics
 from torchrl_koap.objectives.base import WindowLoss
 
 RECONSTRUCTION, KOOPMAN, ACTION = "loss_reconstruction", "loss_koopman", "loss_action"
@@ -28,6 +28,7 @@ class _KoopmanLoss(WindowLoss):
     """Computes those of the three terms that :attr:`terms` names, from one pass through the networks."""
 
     terms: tuple[str, ...]
+    trains = (KoopmanInverseDynamics, LiftedInverseDynamics)
     network: LiftedInverseDynamics
 
     def _terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:

@@ -33,6 +33,7 @@ class QuantizedDynamicsLoss(WindowLoss):
         torch.Size([])
     """
 
+    trains = (QuantizedInverseDynamics,)
     network: QuantizedInverseDynamics
     out_keys = ["loss_dynamics"]
 
@@ -90,6 +91,7 @@ class VariationalLoss(WindowLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    trains = (VariationalInverseDynamics,)
     network: VariationalInverseDynamics
     out_keys = ["loss_reconstruction", "loss_kl"]
     _schedulable_buffers = frozenset({"kl_coeff"})

@@ -38,11 +38,10 @@ def fit_closed_form(
     mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
     # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again
     mask[:, : controller.num_past], mask[:, controller.num_past + 1 :] = False, False
-    groups = windows["episode"][:, -1]
     for name, own in (("state", controller.in_key), ("action", controller.out_key)):
         if own != name:
             windows.rename_key_(name, own)
-    return controller.fit_labels(windows, mask, groups=groups, axes=axes, guessed=guessed)
+    return controller.fit_labels(windows, mask, axes=axes, guessed=guessed)
 
 
 def axes_of(task: Task, columns: Sequence[int]) -> dict[str, Any]:

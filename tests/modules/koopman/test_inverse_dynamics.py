@@ -169,6 +169,11 @@ def test_fitting_takes_any_batch_and_leaves_the_mode_alone():
     for name, value in flat.state_dict().items():
         assert torch.equal(value, nested.state_dict()[name]) and torch.equal(value, windowed.state_dict()[name])
     assert nested.training and nested.latent_action.training
+    named = make_model()  # trajectories are those of the entry episode, and a mask may have a trailing 1
+    named.fit_labels(
+        data.reshape(-1).set("episode", (torch.arange(24) // 6)[:, None].expand(24, 9)), mask.reshape(24, 9, 1)
+    )
+    assert torch.equal(named.action_decoder.linear.weight, flat.action_decoder.linear.weight)
     nested.eval().fit_labels(data, mask)
     assert not nested.latent_action.training
 
@@ -195,10 +200,16 @@ def test_bad_fits_are_explained():
     data, mask = labelled(4)
     with pytest.raises(ValueError, match=r"no labelled frame lies in frames 1\.\.5 of any window"):
         model.fit_labels(data, mask & (torch.arange(9) > 5))
-    with pytest.raises(ValueError, match=r"mask must be bool \[4, 9\] \(\[\*B, T\]\), got torch.bool \[4, 9, 1\]"):
-        model.fit_labels(data, mask.unsqueeze(-1))
-    with pytest.raises(ValueError, match=r"mask must be bool \[4, 9\] .*, got torch.float32"):
+    with pytest.raises(ValueError, match=r"mask must be bool \[4, 9, 1\] or \[4, 9\], got torch.bool \[4, 8\]"):
+        model.fit_labels(data, mask[:, 1:])
+    with pytest.raises(ValueError, match=r"got torch.float32 \[4, 9\]; cast it with .bool\(\)"):
         model.fit_labels(data, mask.float())
+    with pytest.raises(ValueError, match="got None: hand in 'has_action'"):
+        model.fit_labels(data, None)
+    with pytest.raises(KeyError, match=r"reads 'action'; there are \['state'\]; rename with set_keys\(action="):
+        model.fit_labels(data.select("state"), mask)
+    with pytest.raises(ValueError, match=r"'action' must have the batch and frames \[4, 9\] .*, got \[4, 8, 2\]"):
+        model.fit_labels(data.clone().set("action", data["action"][:, 1:]), mask)
     with pytest.raises(ValueError, match=r"groups must be \[4\] \(\[\*B\]\), got \[4, 9\]"):
         model.fit_labels(data, mask, groups=torch.zeros(4, 9, dtype=torch.int64))
     with pytest.raises(ValueError, match="a window of 4 frames is too short"):
@@ -272,6 +283,8 @@ def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held()
         ({"action_decoder": LinearActionDecoder(7, 2)}, "'action_decoder': 7"),
         ({"operator": KoopmanOperator(4, input_dim=9)}, "'operator input': 9"),
         ({"lifting": KoopmanLifting(3, 6)}, "latent_dim differs: lifting 6, operator 4"),
+        ({"state_normalizer": Normalizer(4)}, "state_normalizer has 4 columns, the model 3"),
+        ({"action_normalizer": Normalizer(1)}, "action_normalizer has 1 columns, the model 2"),
         ({"lifting": KoopmanLifting(2, 4)}, "state_dim differs: latent_action 3, lifting 2"),
         (
             {"action_decoder": LinearActionDecoder(4, 2, in_key="w")},
@@ -281,7 +294,7 @@ def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held()
 )
 def test_parts_that_do_not_fit_are_refused(parts, message):
     with pytest.raises(ValueError, match=message):
-        make_model(parts=parts)
+        make_model(normalizers=False, parts=parts)
 
 
 def test_weights_are_drawn_anew():
