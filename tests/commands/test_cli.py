@@ -42,6 +42,23 @@ def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
     assert hint in err and "Traceback" not in err and out == ""
 
 
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        ("train --step 500", "unknown option of koap train: '--step'; did you mean '--steps'?"),
+        ("train --out x --lables=5", "unknown option of koap train: '--lables'; did you mean '--labels'?"),
+        ("latency x --step 4", "unknown option of koap latency: '--step'; did you mean '--steps'?"),
+        ("convert x --control-h 30", "unknown option of koap convert: '--control-h'; did you mean '--control-hz'?"),
+        ("validate x --foo", "unknown option of koap validate: '--foo'; known: --help, --quiet, --task, --plugin"),
+        ("trian --steps 5", "unknown command 'trian'; did you mean 'train'?"),
+    ],
+)
+def test_a_wrong_name_gets_the_nearest_of_its_command(call, said, capsys):
+    with pytest.raises(SystemExit) as left:
+        koap(*call.split())
+    assert left.value.code == 2 and capsys.readouterr().err == f"koap: {said}\n"
+
+
 def help_of(capsys, *words):
     with pytest.raises(SystemExit) as left:
         koap(*words)

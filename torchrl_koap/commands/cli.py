@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
@@ -77,7 +77,7 @@ def _run(arguments: Sequence[str]) -> int:
         if arguments[:1] in (["-h"], ["--help"]):
             print(subcommands.overview())
             return 0
-        command = _parsed(options.parse, subcommands.Subcommand, arguments)
+        command = _parsed(options, subcommands.Subcommand, arguments)
     options.check_options(command)
     with without_progress_bars() if command.quiet else nullcontext():
         result = command()
@@ -87,18 +87,23 @@ def _run(arguments: Sequence[str]) -> int:
     return 1 if isinstance(result, Mapping) and result.get("failed") else 0
 
 
-def _parsed(parse: Callable[..., Any], kind: Any, arguments: Sequence[str]) -> Any:
+def _parsed(options: Any, kind: Any, arguments: Sequence[str]) -> Any:
     """The command; what one of our own checks refuses is raised as it is, what tyro refuses leaves with 2."""
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # its words for what our own checks say
-            return parse(kind, arguments, console_outputs=False)
+            return options.parse(kind, arguments, console_outputs=False)
     except SystemExit as left:
         error = left.__context__
         while error is not None:
             if isinstance(error, ValueError) and _is_ours(error):
                 raise error from None
             error = error.__cause__ or error.__context__
-    return parse(kind, arguments)
+    try:
+        options.check_names(kind, arguments)
+    except ValueError as error:
+        _complain(str(error))
+        raise SystemExit(2) from None
+    return options.parse(kind, arguments)
 
 
 def _is_ours(error: BaseException) -> bool:

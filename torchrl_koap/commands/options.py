@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
@@ -23,6 +25,7 @@ from tyro.constructors import (
 )
 
 from torchrl_koap.files import read_bytes
+from torchrl_koap.lookup import lookup
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
 from torchrl_koap.runs.run_directory import RunDirectoryError
@@ -191,6 +194,32 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
     registry = ConstructorRegistry()
     registry.struct_rule(partial(_described, short, []))
     return tyro.cli(kind, args=arguments, registry=registry, **({"prog": "koap"} | how))
+
+
+def check_names(kind: Any, arguments: Sequence[str]) -> None:
+    """Checks that a call names a command and options that its help lists.
+
+    Args:
+        kind (type): a union of dataclasses that the first word chooses from.
+        arguments (sequence of str): the words.
+
+    Raises:
+        ValueError: for the first unknown name, with the nearest one of that command.
+    """
+    command = next(iter(arguments), "-")
+    if command.startswith("-"):
+        return
+    lookup([each.__name__.lower() for each in get_args(kind)], command, "command")
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+        parse(kind, [command, "--help-all" if command == "train" else "--help"])
+    lines = re.findall(r"^[│ ]*(-.*)", shown.getvalue(), re.MULTILINE)
+    known = [option for line in lines for option in re.findall(r"--\w[\w.-]*", line)]
+    known += ["--labels", "--config", "--help-all"] if command == "train" else []
+    for word in arguments[1:]:
+        option = word.partition("=")[0].replace("_", "-")
+        if option.startswith("--"):
+            lookup(known, option, f"option of koap {command}:")
 
 
 def _first_page() -> type:
