@@ -102,6 +102,7 @@ def test_no_labels_at_all():
         ({"command": [0], "robot": [0]}, "column 'q1' is the robot's and a command"),
         ({"robot": [0, 0]}, "robot holds q1 more than once"),
         ({"action_kind": "absolute"}, "absolute actions have 2 columns, the robot's columns are 4: name in targets"),
+        ({"action_kind": "absolute"}, r"\(--targets\) the column that each action is the target of \(known: .+, .+\)"),
         ({"targets": [0, 1]}, "targets are for action_kind='absolute'"),
         ({"action_kind": "absolute", "targets": [0, 3], "command": [3]}, "column 'cup_y' is a target and a command"),
         ({"action_units": ["m"]}, "action_units names 1 columns, there are 2"),

@@ -291,4 +291,6 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
 def _warnings(data: TensorDictBase, task: Task, names: Sequence[str]) -> dict[str, str]:
     """What is unlikely in data, numbered."""
     found = find_warnings(data, task, names)
+    if not data["has_action"].any():
+        found.insert(0, "no recording has actions: a planner can be trained, a policy cannot")
     return {f"warning {number}": warning for number, warning in enumerate(found, 1)}

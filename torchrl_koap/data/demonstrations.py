@@ -271,8 +271,8 @@ def _targets(
     if len(columns) != len(kinds):
         what = "the robot's columns are" if given is None else "targets are"
         problems.append(
-            f"absolute actions have {len(kinds)} columns, {what} {len(columns)}: name in targets the column that each"
-            " action is the target of"
+            f"absolute actions have {len(kinds)} columns, {what} {len(columns)}: name in targets (--targets) the column"
+            f" that each action is the target of (known: {', '.join(names)})"
         )
     return columns
 

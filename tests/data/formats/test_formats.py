@@ -53,6 +53,9 @@ def test_nothing_to_read(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(ValueError, match="holds no recordings that can be read; there are readers for minari:NAME"):
         read_recordings(tmp_path)
+    np.save(tmp_path / "run_0.npy", np.zeros((5, 2)))
+    with pytest.raises(ValueError, match=r"holds \*.npy files: save each recording with np.savez\(file, states="):
+        read_recordings(tmp_path)
     with pytest.raises(FileNotFoundError, match="none does not exist"):
         read_recordings(tmp_path / "none")
 

@@ -181,6 +181,20 @@ def test_faults_of_all_files_come_together(tmp_path):
     assert "cannot be read" in caught.value.problems[0]
 
 
+def test_the_same_fault_of_several_files_is_said_once(tmp_path):
+    files = sorted((write(tmp_path, version="v2.1") / "data").rglob("*.parquet"))
+    for file in files:
+        pq.write_table(pq.read_table(file).drop_columns(["episode_index"]), file)
+    with pytest.raises(DataError) as caught:
+        read_lerobot(tmp_path)
+    (said,) = caught.value.problems
+    assert said.startswith(f"{files[0]}: missing column 'episode_index'") and said.endswith("(so in 2 of 2 files)")
+
+
+def test_actions_that_are_announced_and_absent_are_told(tmp_path):
+    assert "action (info.json lists it, no file has it)" in read_lerobot(write(tmp_path, actions="missing")).skipped
+
+
 def test_missing_episodes_are_told(tmp_path):
     root = write(tmp_path, version="v2.1")
     (root / "data/chunk-000/episode_000000.parquet").unlink()

@@ -155,6 +155,10 @@ def read_recordings(
     name = find_format(source)
     if name is None and not Path(source).exists():
         raise FileNotFoundError(f"{source} does not exist")
+    if name is None and any(Path(source).glob("*.npy")):
+        raise ValueError(
+            f"{source} holds *.npy files: save each recording with np.savez(file, states=..., actions=...)"
+        )
     if name is None:
         known = "; ".join(form.what for form in FORMATS.values())
         raise ValueError(f"{source} holds no recordings that can be read; there are readers for {known}")

@@ -78,7 +78,7 @@ def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> floa
     if declared is not None and abs(declared / rate - 1) > UNEVEN:
         problems.append(
             f"column {clock.name!r} says {rate:.4g} frames per second, the source declares {declared:g}:"
-            " pass control_hz"
+            " pass control_hz (--control-hz)"
         )
     return rate if declared is None else declared
 

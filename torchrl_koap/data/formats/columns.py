@@ -98,7 +98,7 @@ def assemble(
     action_dim: int | None = None,
     action_names: Sequence[str] | None = None,
     skipped: Sequence[str] = (),
-    no_rate: str = "no file has time stamps (a column 'timestamp' in seconds): pass control_hz",
+    no_rate: str = "no file has time stamps (a column 'timestamp' in seconds): pass control_hz (--control-hz)",
 ) -> Recordings:
     """Splits episodes, leaves out what is no state, reads the rate off the time stamps, and checks what is left.
 

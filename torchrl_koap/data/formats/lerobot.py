@@ -91,6 +91,7 @@ def read_lerobot(
         pieces.append(Piece(f"episode {number}", states | clock, steps, cameras=clips[number]))
     if ACTION not in first:
         options = {"action_dim": width} | options
+        absent += [f"{ACTION} (info.json lists it, no file has it)"] if ACTION in known else []
     unread = [
         name for name in known if name not in (*chosen, *images, ACTION, TIME, EPISODE, FRAME, "index", "task_index")
     ]
@@ -170,6 +171,7 @@ def _read_table(root: Path, needed: Sequence[str]):
     """The rows of all files, sorted: the columns that are asked for, the actions, and ``__filename``."""
     pyarrow = import_pyarrow()
     files, problems = sorted((root / "data").rglob("*.parquet")), []
+    missing: dict[str, list[Path]] = {}
     kinds: dict[str, Any] = {}
     if not files:
         raise FileNotFoundError(f"no *.parquet below {root / 'data'}")
@@ -180,8 +182,10 @@ def _read_table(root: Path, needed: Sequence[str]):
         except (pyarrow.ArrowException, OSError) as error:
             problems.append(f"{file}: cannot be read: {str(error).splitlines()[0]}")
             continue
-        missing = [name for name in needed if name not in schema.names]
-        problems += [f"{file}: missing column {name!r}; the file has {', '.join(schema.names)}" for name in missing]
+        for name in needed:
+            if name not in schema.names:
+                said = f"missing column {name!r}; the file has {', '.join(schema.names)}"
+                missing.setdefault(said, []).append(file)
         for name in {*needed, ACTION, TIME}.intersection(schema.names):
             got = schema.field(name).type
             kind = number_type(got)
@@ -190,6 +194,10 @@ def _read_table(root: Path, needed: Sequence[str]):
                 problems.append(f"{file}: column {name!r} must hold numbers or lists of numbers, got {got}")
             elif kind != kinds[name]:
                 problems.append(f"{file}: column {name!r} holds {got}, that of another file {kinds[name]}")
+    problems += [
+        f"{found[0]}: {said}" + (f" (so in {len(found)} of {len(files)} files)" if len(found) > 1 else "")
+        for said, found in missing.items()
+    ]
     if problems:
         raise DataError(root, problems)
     try:
