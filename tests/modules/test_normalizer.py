@@ -39,10 +39,20 @@ def test_standard_and_rms(dtype):
     assert Normalizer.fit(torch.zeros(3, 1), mode="rms").scale.item() == 1.0
 
 
+def test_a_column_that_rarely_moves_is_scaled_by_how_far_it_moves_then():
+    values = torch.full((20_000, 2), 5.0)
+    values[::20, 0] = 5.0 + 3.0 * torch.tensor([1.0, -1.0]).repeat(500)
+    values[::40, 1] += 2.0
+    values[1::40, 1] += 0.001  # at rest, up to noise
+    normalizer = Normalizer.fit(values, mode="moving")
+    torch.testing.assert_close(normalizer.offset, torch.tensor([5.0, 5.0]))
+    torch.testing.assert_close(normalizer.scale, torch.tensor([3.0, 2.0]))
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3), min_size=1, max_size=20),
-    st.sampled_from(["minmax", "standard", "rms", "shared"]),
+    st.sampled_from(["minmax", "standard", "rms", "shared", "moving"]),
 )
 def test_always_finite_and_invertible(rows, mode):
     values = torch.tensor(rows, dtype=torch.float64)

@@ -62,7 +62,7 @@ class LinearForecast(nn.Module):
         self.weight.copy_(fit.weight)
         self.bias.copy_(fit.bias)
         rest = sequence - self._forecast(condition)
-        fitted = Normalizer.fit(rest, mode="standard")
+        fitted = Normalizer.fit(rest, mode="moving")
         nothing = (rest - fitted.offset).abs().amax(0) < _NOTHING  # such as a goal that never moves
         scale = torch.where(nothing, _NOTHING, fitted.scale)
         self.residual = Normalizer(len(scale), offset=fitted.offset, scale=scale).to(self.bias)
@@ -95,8 +95,9 @@ class StatePlanner(ConditionalSampler):
     (:class:`LinearForecast`), which carries over to goals never seen.
 
     Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
-    dict. Conditions are scaled by their range, plans by their standard deviation: by range first frames would be a
-    tenth as wide as last ones, and the noise of the schedule would cover them.
+    dict. Conditions are scaled by their range, plans by their spread while they move (``"moving"`` of
+    :meth:`Normalizer.fit`). By range first frames would be a tenth as wide as last ones, and the noise of the schedule
+    would cover them. By standard deviation an object that rarely moves would outweigh the robot in the loss.
 
     Args as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`, like keywords that are not listed; a
     sequence is a plan, of ``d`` columns.
@@ -150,7 +151,7 @@ class StatePlanner(ConditionalSampler):
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
         example = self.plan_normalizer.scale
         self.condition_normalizer = Normalizer.fit(self.condition(history)).to(example)
-        self.plan_normalizer = Normalizer.fit(self._displaced(history, plan), mode="standard").to(example)
+        self.plan_normalizer = Normalizer.fit(self._displaced(history, plan), mode="moving").to(example)
         if self.forecast is not None:
             history, plan = self.split_window((windows if seen is None else seen).reshape(-1, *windows.shape[-2:]))
             plan = self.plan_normalizer(self._displaced(history, plan))
