@@ -20,6 +20,14 @@ from torchrl_koap.tasks import Action
 TINY = ("--steps", 20, "--planner.batch-size", 8, "--planner.width", 8, "--controller.steps", 20)
 
 
+def test_train_and_eval_end_with_what_comes_next(arm, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert koap("train", "--dataset", arm, "--out", out, *TINY, "--planner.network", "mlp") == 0
+    assert capsys.readouterr().out.splitlines()[-1].split(maxsplit=1) == ["next", f"koap eval {out}"]
+    assert koap("eval", out) == 0
+    assert capsys.readouterr().out.splitlines()[-1].split() == ["report", str(out / "index.html")]
+
+
 @pytest.fixture(scope="module")
 def run(arm):
     out = arm.parent / "run"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -50,7 +51,8 @@ class Train(Command):
 
     def __call__(self) -> Mapping[str, Any]:
         """Trains."""
-        return train(self.config, command=as_typed()).results
+        results = train(self.config, command=as_typed()).results
+        return {**results, "next": f"koap eval {shlex.quote(str(self.config.out))}"}
 
 
 @dataclass(kw_only=True)
@@ -81,13 +83,14 @@ class Eval(Command):
         check_logger(self.logger)
         result = evaluate(self.run, self.config)
         folder = Path(self.run) if self.config.out is None else self.config.out
-        if self.report:
-            write_report(folder, animation=self.animate)
+        report = {"report": str(write_report(folder, animation=self.animate))} if self.report else {}
         with open_logger(self.logger, folder) as logger:
             if logger is not None:
                 rates = {f"{name}_rate": values["rate"] for name, values in result.get("rates", {}).items()}
                 log_scores(logger, result | rates)
-        return describe_offline(result) if result.get("kind") == KIND else result
+        if result.get("kind") != KIND:
+            return result | report
+        return "\n".join([describe_offline(result), *(f"report  {file}" for file in report.values())])
 
 
 @dataclass(kw_only=True)
