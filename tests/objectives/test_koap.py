@@ -194,7 +194,7 @@ def test_transitions_of_padded_frames_count_in_no_loss(trailing):
 # the network
 
 
-def test_keys_of_the_network_are_taken_over_and_renaming_leaves_it_alone():
+def test_keys_of_the_network_are_taken_over_and_renaming_reaches_it():
     network = make_network()
     network.set_keys(state="window", action=("robot", "velocity"))
     loss, batch = KOAPLoss(network), make_batch(3)
@@ -204,10 +204,13 @@ def test_keys_of_the_network_are_taken_over_and_renaming_leaves_it_alone():
     for key, value in loss(renamed).items():
         assert torch.equal(value, expected[key])
     loss.set_keys(state="x", action="a", has_action="labelled")
-    assert network.in_keys == ["window"] and network.out_keys[-1] == ("robot", "velocity")
+    assert network.in_keys == ["x"] and network.out_keys[-1] == "a"
+    assert network(TensorDict({"x": renamed["window"]}, [3]))["a"].shape == (3, T, 2)
     elsewhere = TensorDict({"x": renamed["window"], "a": renamed["robot", "velocity"]}, [3])
     assert torch.equal(loss(elsewhere.set("labelled", batch["has_action"]))["loss_action"], expected["loss_action"])
     loss.set_keys(state=None)
+    assert network.in_keys == ["state"] and network.in_key == "state"
+    network.set_keys(state="window")
     assert loss.in_keys[0] == "state" and network.in_key == "window"
 
 

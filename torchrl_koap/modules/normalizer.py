@@ -90,7 +90,7 @@ class Normalizer(nn.Module):
             mode (str): ``"minmax"`` maps the range of each column to [-1, 1], ``"standard"`` its mean and standard
                 deviation to 0 and 1, ``"shared"`` likewise with the largest standard deviation for all columns,
                 ``"rms"`` its root mean square to 1 and 0 to 0. ``"moving"`` maps the median to 0, and the root mean
-                square distance from it of the rows that are a hundredth of the farthest away to 1: a column that rarely
+                square distance from it, of rows with over 1 % of the largest distance, to 1: a column that rarely
                 moves is scaled by how far it moves then. A column whose scale would be zero, up to rounding, keeps
                 the scale 1.
             mask (Tensor, optional): ``[*N]`` or ``[*N, 1]`` bool, rows to use; the others may hold NaN. For actions

@@ -97,8 +97,7 @@ class WindowLoss(NetworkLoss):
     """Base class of the losses on windows of states of which some frames have an action label.
 
     Args:
-        network (InverseDynamics): the controller; the loss reads batches under its entries of states and actions,
-            until ``set_keys`` renames those of the loss.
+        network (InverseDynamics): the controller; its entries of states and actions are those of the loss.
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
@@ -131,6 +130,16 @@ class WindowLoss(NetworkLoss):
     def __init__(self, network: InverseDynamics, *, reduction: str = "mean"):
         super().__init__(network, reduction=reduction)
         super().set_keys(state=network.in_key, action=network.out_key)
+
+    def set_keys(self, **kwargs) -> None:
+        """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too.
+
+        Call ``set_keys`` of the network afterwards where it is to keep names of its own.
+        """
+        super().set_keys(**kwargs)
+        self.network.set_keys(
+            **{name: getattr(self.tensor_keys, name) for name in ("state", "action") if name in kwargs}
+        )
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
