@@ -43,7 +43,6 @@ def test_without_a_near_name_all_are_listed(name):
     [
         (lambda name: get_task(name), "unknown task"),
         (lambda name: make_koopman_inverse_dynamics(2, 2, preset=name), "unknown preset"),
-        (lambda name: make_koopman_inverse_dynamics(2, 2, network=name), "unknown network"),
         (lambda name: NoiseSchedule().solve(None, torch.zeros(1, 1, 1), 1, name), "unknown solver"),
         (lambda name: Normalizer.fit(None, mode=name), "unknown normalisation"),
     ],

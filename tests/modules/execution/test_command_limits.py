@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -131,10 +133,10 @@ def test_a_task_says_which_columns_they_are():
 def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):
     policy = load_policy("pretrained:sorting")
     assert policy.limits.lead == policy.execution.lead == 0.1
-    assert load_policy("pretrained:sorting", lead=0.0).limits is None
+    assert load_policy("pretrained:sorting", lead=0.0, limits=math.inf).limits is None
     saved = Trained.load("pretrained:sorting").save(tmp_path / "policy.safetensors")
     assert load_policy(saved, gain=1.2).execution == Execution(lead=0.1, gain=1.2)
-    assert load_policy(saved, lead=0.0, gain=1.0).limits is None
+    assert load_policy(saved, lead=0.0, gain=1.0, limits=math.inf).limits is None
 
 
 def test_those_who_know_what_they_commanded_go_without_gain():
