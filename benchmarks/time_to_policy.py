@@ -86,7 +86,8 @@ def main(
         success = score["rates"]["success"]
         kept = trained.results["planner"].get("kept_update", "")
         successes = round(success["rate"] * success["episodes"])
-        row = (*key, used.run.precision, kept, f"{seconds:.0f}", successes, success["episodes"], score["mode_entropy"])
+        entropy = "" if score["mode_entropy"] is None else f"{score['mode_entropy']:.3f}"
+        row = (*key, used.run.precision, kept, f"{seconds:.0f}", successes, success["episodes"], entropy)
         write(row)
         print(*row, flush=True)
 
