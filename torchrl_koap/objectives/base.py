@@ -124,7 +124,7 @@ class WindowLoss(NetworkLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    trains = (InverseDynamics,)
+    trains: tuple[type[nn.Module], ...] = (InverseDynamics,)
     network: InverseDynamics
 
     def __init__(self, network: InverseDynamics, *, reduction: str = "mean"):
