@@ -12,6 +12,7 @@ three seeds of noise each. What is in the table is not run again.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -20,6 +21,8 @@ from tables import open_table
 from tyro.conf import Positional
 
 from torchrl_koap import EvalConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, evaluate, train
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training import resolve
 
 RESULTS = Path(__file__).resolve().parent / "results" / "time_to_policy.csv"
 KEYS = ("task", "method", "labels", "network", "held_out", "updates", "seed")
@@ -60,34 +63,31 @@ def main(
     done, write = open_table(results, COLUMNS, KEYS)
     labels = LabelConfig(count=count, fraction=fraction, unit="trajectory" if fraction is None else "window")
     for updates in steps:
-        planner = PlannerConfig(steps=updates, network=network, held_out=held_out)
-        name = "-".join(map(str, (task, method, count or fraction, network, held_out, updates, seed)))
-        run = RunConfig(seed=seed, resume=True)
-        began = time.process_time()
-        trained = train(
-            TrainConfig(
-                dataset=str(dataset),
-                out=folder / name,
-                task=task,
-                method=method,
-                labels=labels,
-                planner=planner,
-                run=run,
-            )
+        asked = TrainConfig(
+            dataset=str(dataset),
+            out=folder,
+            task=task,
+            method=method,
+            labels=labels,
+            planner=PlannerConfig(steps=updates, network=network, held_out=held_out),
+            run=RunConfig(seed=seed, resume=True),
         )
-        seconds = time.process_time() - began
-        used = trained.config
-        network_used = (used.planner.network, used.planner.held_out, used.planner.steps)
-        key = (task, used.method, count or fraction, *network_used, seed)
+        config = resolve(asked, get_task(task))
+        planner = config.planner
+        key = (task, config.method, count or fraction, planner.network, planner.held_out, planner.steps, seed)
         if tuple(map(str, key)) in done:
             continue
+        config = replace(config, out=folder / "-".join(map(str, key)))
+        began = time.process_time()
+        trained = train(config)
+        seconds = time.process_time() - began
         again = PER_CONTEXT if trained.task.objects else 1
-        score = evaluate(folder / name, EvalConfig(episodes=ROLLOUTS, rollouts_per_context=again))
+        score = evaluate(config.out, EvalConfig(episodes=ROLLOUTS, rollouts_per_context=again))
         success = score["rates"]["success"]
         kept = trained.results["planner"].get("kept_update", "")
         successes = round(success["rate"] * success["episodes"])
         entropy = "" if score["mode_entropy"] is None else f"{score['mode_entropy']:.3f}"
-        row = (*key, used.run.precision, kept, f"{seconds:.0f}", successes, success["episodes"], entropy)
+        row = (*key, config.run.precision, kept, f"{seconds:.0f}", successes, success["episodes"], entropy)
         write(row)
         print(*row, flush=True)
 

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training import resolve
 
 
 @pytest.fixture
@@ -18,8 +17,7 @@ def study(benchmark_script, monkeypatch):
 
     def train(config):
         script.asked.append(config)
-        resolved = resolve(config, get_task(config.task))
-        return SimpleNamespace(task=get_task(config.task), config=resolved, results={"planner": {"kept_update": 40}})
+        return SimpleNamespace(task=get_task(config.task), results={"planner": {"kept_update": 40}})
 
     def evaluate(run, config):
         script.rolled.append(config)
@@ -42,6 +40,7 @@ def test_each_number_of_updates_is_trained_and_written_once(study, tmp_path):
     ]
     assert {row["network"] for row in rows} == {"mlp"} and {row["held_out"] for row in rows} == {"0.1"}
     assert [config.rollouts_per_context for config in study.rolled] == [3, 3]
+    assert [config.planner.steps for config in study.asked] == [30, 60]
     assert study.asked[-1].labels.unit == "window" and study.asked[-1].planner.steps == 60
 
 

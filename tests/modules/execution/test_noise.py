@@ -76,6 +76,19 @@ def test_agent_environment_and_evaluation_act_alike_bit_for_bit(horizon, tempera
         assert torch.equal(agent.act(row["observation"]), row["action"]), step
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_the_temperature_is_a_factor_of_the_start_noise(given):
+    planner = Still(MLPDenoiser(4, 8, horizon=14, width=8), state_dim=4)
+    plans = []
+    for temperature in (1.0, 0.5, 0.0):
+        execution = Execution(temperature=temperature)
+        policy = make_policy(planner, make_koopman_inverse_dynamics(4, 2), state_of=range(4), execution=execution)
+        torch.manual_seed(0)
+        noise = torch.randn(3, 14, 4) if given else None
+        plans.append(policy.plan(torch.zeros(3, policy.history, 4), noise))
+    assert plans[0].std() > 0.9 and torch.equal(plans[1], plans[0] / 2) and not plans[2].any()
+
+
 def test_the_episode_of_a_seed_in_an_evaluation_is_that_of_an_agent():
     from torchrl_koap.envs import AvoidingEnv
 

@@ -238,8 +238,8 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
     folder = file.with_suffix("")
     found: dict[str, Clip] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if path.is_dir() and _numbered(path):
-            name, held = path.name, sorted(_numbered(path))
+        if path.is_dir() and (pictures := _numbered(path)):
+            name, held = path.name, sorted(pictures)
         elif path.suffix == ".npy" and not path.name.endswith(TIMES):
             name, held = path.stem, list(range(len(_load(path))))
         else:
