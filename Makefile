@@ -27,7 +27,6 @@ demo: setup
 	$(BIN)/koap demos --task avoiding --episodes 96 --seed 0 --out $(OUT)-data
 	$(BIN)/koap train --task avoiding --dataset $(OUT)-data --labels 0.02 --seed 0 --out $(OUT)
 	$(BIN)/koap eval $(OUT) --episodes 60 --seed 100
-	@echo "report: $(OUT)/index.html"
 
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
