@@ -13,7 +13,7 @@ import stat
 import tempfile
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import filelock
@@ -56,6 +56,34 @@ def some(names: Sequence[str], most: int = 5) -> str:
     """
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def gathered(faults: Iterable[tuple[str, str]]) -> list[str]:
+    """Puts faults of many things into sentences, each once with the first of those that it is about.
+
+    Args:
+        faults (iterable of tuple): names of things, and what is wrong with them.
+
+    Examples:
+        >>> from torchrl_koap.files import gathered
+        >>> gathered([("a.csv", "it is empty"), ("b.csv", "row 2 is short"), ("c.csv", "it is empty")])
+        ['a.csv, c.csv: it is empty', 'b.csv: row 2 is short']
+    """
+    about: dict[str, list[str]] = {}
+    for name, said in faults:
+        about.setdefault(said, []).append(name)
+    return [f"{some(names)}: {said}" for said, names in about.items()]
+
+
+def option(name: str) -> str:
+    """Says what an option is called, in Python and in the shell.
+
+    Examples:
+        >>> from torchrl_koap.files import option
+        >>> option("control_hz")
+        'control_hz (--control-hz)'
+    """
+    return f"{name} (--{name.replace('_', '-')})"
 
 
 def check_file(path: str | Path, *, largest: int = LARGEST) -> None:

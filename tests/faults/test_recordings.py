@@ -29,7 +29,7 @@ RESAMPLED = ("--resample", "20", "--action-kind", "velocity")
 # what is done to every episode, what is said of it (nothing: it is accepted), and further words of the call
 KINDS: dict[str, tuple[Callable, str, tuple[str, ...]]] = {
     "a hole in time": (put("timestamp", lambda t: t + 3 * (t > 1)), "frames are 0.05 to 3.05 s apart", ()),
-    "stamps that jitter": (put("timestamp", jitter), "the usual step is 0.05 s: pass resample 20", ()),
+    "stamps that jitter": (put("timestamp", jitter), "the usual step is 0.05 s: pass resample .--resample. 20", ()),
     "a hole in time, resampled": (put("timestamp", lambda t: t + 3 * (t > 1)), "", RESAMPLED),
     "stamps that jitter, resampled": (put("timestamp", jitter), "", RESAMPLED),
     "stamps that stand, resampled": (put("timestamp", np.zeros_like), "time stamps do not increase", RESAMPLED),
@@ -45,7 +45,7 @@ KINDS: dict[str, tuple[Callable, str, tuple[str, ...]]] = {
         (),
     ),
     "a sparse action": (put("v0", sparse, actions=True), r"action column .*\(known in \d+\) is mostly empty", ()),
-    "states that are NaN": (put("q0", sparse), "states are not finite at frame 1", ()),
+    "states that are NaN": (put("q0", sparse), "states are not finite, first at frame 1", ()),
     "an episode that comes back": (
         put("episode_id", lambda ids: np.arange(LENGTH) // 10 % 2),
         "episode_id 0 comes back|frames are 0.05 to 0.55 s apart",

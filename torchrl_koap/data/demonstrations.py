@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
-from torchrl_koap.data.formats.columns import kind_of, unknown
+from torchrl_koap.data.formats.columns import unknown
+from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
 from torchrl_koap.data.quality import constant_columns

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchrl_koap.data import read_recordings
-from torchrl_koap.data.formats.columns import Piece, assemble, kind_of
+from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.files import DataError
 
 X = np.random.default_rng(0).normal(size=6).cumsum()
@@ -53,7 +53,7 @@ def test_a_counter_splits_and_sorts():
 )
 def test_what_is_no_state_is_left_out_and_listed(name):
     found = read(**{name: X})
-    assert found.state_names == ("x",) and found.skipped == (name,)
+    assert found.state_names == ("x",) and [said.partition(" (its")[0] for said in found.skipped] == [name]
 
 
 def test_a_column_that_rises_evenly_is_a_clock():
@@ -66,7 +66,7 @@ def test_columns_are_chosen_by_name():
     pieces = [Piece("run", states, {"v": X, "w": X})]
     found = assemble(pieces, "data", control_hz=5, state_columns=["time", "x"], drop_columns=["w"])
     assert (found.state_names, found.action_names, found.skipped) == (("time", "x"), ("v",), ("y", "w"))
-    with pytest.raises(DataError, match="unknown column in drop_columns: 'yy'; did you mean 'y'"):
+    with pytest.raises(DataError, match=r"unknown column in drop_columns \(--drop-columns\): 'yy'; did you mean 'y'"):
         assemble(pieces, "data", control_hz=5, drop_columns=["yy"])
 
 
@@ -98,7 +98,7 @@ def test_separators_blank_lines_truth_values_and_text(separator, point, tmp_path
     (tmp_path / "a.csv").write_text(text + "\n\n")
     found = read_recordings(tmp_path)
     assert found.control_hz == pytest.approx(10) and found.states[0].tolist() == [[0.5, 1], [0.7, 0]]
-    assert found.skipped == ("phase", "time") and found.actions[0].tolist() == [[1]]
+    assert found.skipped == ("phase (no numbers)", "time") and found.actions[0].tolist() == [[1]]
 
 
 def test_the_same_fault_of_many_files_is_said_once(tmp_path):
@@ -120,25 +120,37 @@ def test_archives_of_truth_values_and_of_lists(tmp_path):
         read_recordings(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("kind", "names"),
-    {
-        "clock": "elapsed sim_time header.stamp wall_time stamp.nanosec timeStamp t_ms",
-        "episode": "episodeId run trial_no traj-idx demonstration ep",
-        "end": "is_last truncated episode_ends",
-        "start": "is_first trajectory_starts",
-        "length": "lengths episode_length",
-        "frame": "timestep stepIndex frame_number",
-        "other": "discount cumulative_reward return_to_go next.success __index_level_0__",
-        None: "q restart length return_spring left_arm_time_constant step_height q_s run_speed",
-    }.items(),
-)
-def test_names_say_what_is_no_state(kind, names):
-    assert {name: kind_of(name)[0] for name in names.split()} == dict.fromkeys(names.split(), kind)
+def test_the_order_of_columns_does_not_count_but_their_names_do():
+    pieces = [Piece("a", {"x": X, "y": 2 * X}), Piece("b", {"y": 2 * X, "x": X})]
+    found = assemble(pieces, "data", control_hz=20, action_dim=1)
+    np.testing.assert_array_equal(*found.states)
+    pieces += [Piece(name, {"x": X, "Y": X}) for name in "cd"]
+    with pytest.raises(DataError, match="c, d: its state columns are not those of a: it lacks y and has Y besides"):
+        assemble(pieces, "data", control_hz=20, action_dim=1)
+    chosen = {"drop_columns": ["y", "Y"]}, {"state_columns": ["x"]}
+    assert all(assemble(pieces, "data", control_hz=20, action_dim=1, **only).state_names == ("x",) for only in chosen)
 
 
-def test_units_of_clocks():
-    assert [kind_of(f"time_{unit}")[1] for unit in ("s", "msec", "us", "ns")] == [1, 1e-3, 1e-6, 1e-9]
+def test_what_splits_can_be_dropped():
+    assert len(read(timeouts=ENDS).states) == 2
+    pieces = [Piece("run", {"x": X, "timeouts": ENDS, "frame_index": np.array([0, 1, 1, 2, 2, 9])}, {"v": X})]
+    assert len(assemble(pieces, "data", control_hz=20, drop_columns=["timeouts", "frame_index"]).states) == 1
+
+
+def test_lost_frames_and_rows_without_episode_are_told():
+    with pytest.raises(DataError, match="run: column 'frame_index' goes from 2 to 5: give the missing frames"):
+        read(frame_index=[0, 1, 2, 5, 6, 7])
+    assert read(frame_index=[0, 5, 10, 15, 20, 25]).control_hz == 20
+    with pytest.raises(DataError, match="column 'traj_id' is empty in row 2"):
+        read(traj_id=[0, 0, np.nan, 1, 1, 1])
+
+
+def test_all_clocks_are_looked_at():
+    ticks = np.arange(6)
+    found = read(control_hz=None, time=ticks / 20, ros_time=ticks / 4)
+    assert found.control_hz == pytest.approx(20) and found.skipped == ("time", "ros_time (it says 4 frames per second)")
+    parted = {"stamp.secs": 7 + ticks // 4, "stamp.nsecs": ticks % 4 * 0.25e9}  # ROS: seconds, and nanoseconds beside
+    assert read(control_hz=None, **parted).control_hz == pytest.approx(4)
 
 
 @pytest.mark.parametrize("named", ["csv", "npz", "parquet"])

@@ -32,13 +32,31 @@ def test_what_has_no_label():
 def test_no_labels_at_all_needs_their_width():
     assert make_recordings([FRAMES], action_dim=7).actions[0].shape == (4, 7)
     assert make_recordings([FRAMES], action_names=["a", "b"]).actions[0].shape == (4, 2)
-    with pytest.raises(DataError, match="action_dim says how many columns"):
+    with pytest.raises(DataError, match=r"how many columns an action has, or in action_columns \(--action-columns\)"):
         make_recordings([FRAMES])
 
 
 def test_tensors_are_arrays_too():
     recordings = make_recordings([torch.from_numpy(FRAMES).float().requires_grad_()], [torch.ones(4, 1)])
     assert recordings.states[0].dtype == np.float64 and recordings.num_labels == 4
+
+
+def test_what_is_masked_or_none_is_unknown():
+    """A mask that is not looked at would make labels of what its owner has ruled out."""
+    hidden = np.ma.masked_array(np.ones((4, 2)), mask=np.arange(4)[:, None] == [1, 1])
+    objects = np.array([[1.0, None], [1.0, 2.0], [1.0, 2.0], [1.0, 2.0]])
+    for steps in (hidden, objects):
+        recordings = make_recordings([FRAMES.astype(object)], [steps])
+        assert recordings.num_labels == 3 and recordings.states[0].dtype == np.float64
+    with pytest.raises(DataError, match="not finite, first at frame 1 in column 'state_0'"):
+        make_recordings([np.ma.masked_equal(FRAMES, 3.0)], action_dim=1)
+
+
+def test_arrays_of_any_type_of_numbers():
+    kept = [FRAMES.astype(kind) for kind in ("f2", ">f4", ">i8", "u1")] + [np.asfortranarray(FRAMES), FRAMES[::-1]]
+    kept += [torch.from_numpy(FRAMES).bfloat16()]
+    recordings = make_recordings((frames for frames in kept), action_dim=1)
+    assert [frames.sum() for frames in recordings.states] == [105.0] * 7
 
 
 def with_nan(array):
@@ -53,19 +71,25 @@ def with_nan(array):
         ([], None, {}, "there are no trajectories"),
         ([FRAMES], [None, None], {}, "1 trajectories of states, 2 of actions"),
         ([FRAMES, FRAMES[:, :2]], None, {"action_dim": 1}, "trajectory 1: states have 2 columns, those before have 3"),
-        ([FRAMES[:1]], [None], {"action_dim": 1}, "trajectory 0: 1 frame; a transition needs two"),
+        ([FRAMES[:1]], [None], {"action_dim": 1}, "trajectory 0: 1 frames; a transition needs two"),
         ([FRAMES.astype(complex)], [np.ones((4, 1))], {}, "trajectory 0: states are complex128, wanted numbers"),
         ([FRAMES[0]], [np.ones((4, 1))], {}, r"trajectory 0: states must be \[T, d\], got \[3\]"),
-        ([with_nan(FRAMES)], [np.ones((4, 1))], {}, r"not finite at frame 2, columns \[1\]"),
+        ([with_nan(FRAMES)], [np.ones((4, 1))], {}, "not finite, first at frame 2 in column 'state_1'"),
         ([FRAMES], [np.full((4, 1), np.inf)], {}, "the action of step 0 is infinite; NaN means that it is unknown"),
         ([FRAMES], [np.ones((3, 1))], {}, r"3 actions for 5 frames; wanted one per frame \(5\) or one per"),
         ([FRAMES], [np.ones(4)], {}, r"actions must be \[T, a\] or \[T - 1, a\], got \[4\]"),
         ([FRAMES], [np.array([["x"]] * 4)], {}, "wanted numbers"),
         ([FRAMES, FRAMES], [np.ones((4, 1)), np.ones((4, 2))], {}, "trajectory 1: actions have 2 columns"),
-        ([FRAMES], [np.ones((4, 1))], {"action_dim": 3}, "actions have 1 columns, action_dim says 3"),
+        ([FRAMES], [np.ones((4, 1))], {"action_dim": 3}, r"actions have 1 columns, action_dim \(--action-dim\) says 3"),
         ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b"]}, "state_names names 2 columns, there are 3"),
         ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b", "a"]}, "state_names holds a more than once"),
-        ([FRAMES], [np.ones((4, 1))], {"control_hz": 0}, "control_hz must be a positive number"),
+        ([FRAMES], [np.ones((4, 1))], {"control_hz": 0}, r"control_hz \(--control-hz\) must be a positive"),
+        ([FRAMES], [np.ones((4, 1))], {"control_hz": True}, "must be a positive number .* got True"),
+        ([torch.ones(5, 3).to_sparse()], None, {"action_dim": 1}, "states are no table of numbers, got Tensor"),
+        ([{"q": FRAMES}], None, {"action_dim": 1}, "states are no table of numbers, got dict"),
+        ("recordings", None, {"action_dim": 1}, r"sequence of arrays \[T, d\], .* got str: files are read by read_rec"),
+        (3.0, None, {"action_dim": 1}, "got float"),
+        ([FRAMES, FRAMES], [np.ones((9, 1))] * 2, {}, "used: trajectory 0, trajectory 1: 9 actions for 5 frames"),
     ],
 )
 def test_faults_are_named(states, actions, options, message):

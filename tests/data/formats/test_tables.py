@@ -52,7 +52,9 @@ def test_named_action_columns_and_episodes(tmp_path):
 
 def test_archives_have_no_columns_to_name(tmp_path):
     np.savez(tmp_path / "a.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)), control_hz=30.0)
-    with pytest.raises(ValueError, match=r"action_columns: not an option for NumPy archives \(a.npz\)"):
+    with pytest.raises(
+        ValueError, match=r"action_columns .--action-columns.: not an option for NumPy archives \(a.npz\)"
+    ):
         read_tables(tmp_path, action_columns=["action_0"])
 
 
@@ -81,7 +83,7 @@ def test_columns_of_text_are_named(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     parquet.write_table(pyarrow.table(columns_of(action=[0.1] * 6, phase=["reach"] * 6)), tmp_path / "run.parquet")
     recordings = read_tables(tmp_path)
-    assert recordings.skipped == ("phase", "timestamp") and recordings.state_names == ("x", "y")
+    assert recordings.skipped == ("phase (no numbers)", "timestamp") and recordings.state_names == ("x", "y")
 
 
 def test_faults_of_all_files_are_named(tmp_path):
@@ -93,9 +95,9 @@ def test_faults_of_all_files_are_named(tmp_path):
         read_tables(tmp_path)
     text = str(caught.value)
     assert "a.npz: has no states: wanted one of states" in text and "it holds pictures" in text
-    assert "b.csv: row 3 has 1 fields, the header has 2" in text
-    assert "c.csv: row 2, column 'y': 'left' is no number" in text
-    assert "d.parquet: cannot be read" in text
+    assert "b.csv: line 3 has 1 fields, the header has 2" in text
+    assert "c.csv: line 2, column 'y': 'left' is no number" in text
+    assert "d.parquet: it is no parquet file, or damaged" in text
 
 
 @pytest.mark.parametrize(
@@ -114,15 +116,22 @@ def test_tables_without_a_rate_or_states(columns, message, tmp_path):
 def test_a_rate_that_is_given_needs_no_time_stamps(tmp_path):
     write_csv(tmp_path / "run.csv", {"x": [0.0, 1.0], "action": [0.0, 1.0]})
     assert read_tables(tmp_path, control_hz=30).control_hz == 30
-    with pytest.raises(DataError, match="unknown action column 'akcion'; did you mean 'action'"):
+    with pytest.raises(
+        DataError, match=r"unknown column in action_columns \(--action-columns\): 'akcion'; did you mean 'action'"
+    ):
         read_tables(tmp_path, control_hz=30, action_columns=["akcion"])
 
 
 def test_other_columns_in_another_file(tmp_path):
     write_csv(tmp_path / "a.csv", columns_of())
-    write_csv(tmp_path / "b.csv", {"timestamp": [0.0, 0.02], "y": [0.0, 1.0], "x": [0.0, 1.0]})
-    with pytest.raises(DataError, match="b.csv: state columns are timestamp, y, x; those of a.csv are timestamp, x, y"):
+    write_csv(tmp_path / "b.csv", {"timestamp": [0.0, 0.02], "y": [0.0, 1.0], "x": [2.0, 3.0]})
+    assert read_tables(tmp_path, action_dim=1).states[1].tolist() == [[2, 0], [3, 1]]  # by name, not by place
+    write_csv(tmp_path / "c.csv", {"timestamp": [0.0, 0.02], "X": [0.0, 1.0], "y": [0.0, 1.0]})
+    with pytest.raises(
+        DataError, match="c.csv: its state columns are not those of a.csv: it lacks x and has X besides"
+    ):
         read_tables(tmp_path)
+    assert read_tables(tmp_path, action_dim=1, state_columns=["y"]).state_names == ("y",)
 
 
 def test_an_empty_folder(tmp_path):

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from torchrl_koap.files import some
+from torchrl_koap.files import option, some
 
 UNEVEN = 0.2  # share of the usual step by which a step in time may differ
 SLOWEST, FASTEST = 1.0, 2000.0  # Hz; beyond, stamps are in another unit
@@ -44,18 +44,23 @@ class Clock:
 
 def usual_rate(clock: Clock, problems: list[str]) -> float | None:
     """Frames per second by the usual step of time stamps; None, and a problem, where they cannot be seconds."""
-    back = [name for name, step in zip(clock.sources, clock.steps, strict=True) if not (step > 0).all()]
-    if back or not sum(map(len, clock.steps)):
-        where = f" in {len(back)} of {len(clock.steps)} trajectories ({some(back)})" if back else ""
-        said = f"time stamps do not increase: column {clock.name!r}{where}"
-        problems.append(f"{said}; pass control_hz if they mean nothing")
+    back = [
+        f"{name} (frame {int((~(step > 0)).argmax()) + 1})"
+        for name, step in zip(clock.sources, clock.steps, strict=True)
+        if not (step > 0).all()
+    ]
+    if back:
+        problems.append(
+            f"time stamps do not increase, or are missing, in column {clock.name!r} of {len(back)} of"
+            f" {len(clock.steps)} trajectories: {some(back)}; pass {option('control_hz')} if they mean nothing"
+        )
         return None
     rate, name = 1 / clock.usual, clock.name
     if SLOWEST <= rate <= FASTEST:
         return rate
     problems.append(
         f"column {name!r} says {rate:.3g} frames per second if it is in seconds: name it {name}_ms, {name}_us or"
-        f" {name}_ns if it is in another unit, or pass control_hz"
+        f" {name}_ns if it is in another unit, or pass {option('control_hz')}"
     )
     return None
 
@@ -72,24 +77,23 @@ def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> floa
     ]
     if uneven:
         problems.append(
-            f"{some(uneven)}; the usual step is {1 / rate:.4g} s: pass resample {rate:.3g} (Hz) to bring them to a"
-            " fixed rate, or control_hz if the stamps are wrong"
+            f"{some(uneven)}; the usual step is {1 / rate:.4g} s: pass {option('resample')} {rate:.3g} to bring"
+            f" them to a fixed rate, or {option('control_hz')} if the stamps are wrong"
         )
     if declared is not None and abs(declared / rate - 1) > UNEVEN:
         problems.append(
             f"column {clock.name!r} says {rate:.4g} frames per second, the source declares {declared:g}:"
-            " pass control_hz (--control-hz)"
+            f" pass {option('control_hz')}"
         )
     return rate if declared is None else declared
 
 
 def told_rate(clock: Clock, control_hz: float) -> str:
-    """What time stamps say that are not looked at, where it is another rate; else nothing."""
-    wrong: list[str] = []
-    rate = usual_rate(clock, wrong)
-    if rate is None or abs(control_hz / rate - 1) <= UNEVEN:
-        return ""
-    return f" (it says {rate:.4g} frames per second)"
+    """What time stamps say that are not looked at, where it is no rate or another one; else nothing."""
+    rate = usual_rate(clock, [])
+    if rate is None:
+        return " (its time stamps are not looked at)"
+    return "" if abs(control_hz / rate - 1) <= UNEVEN else f" (it says {rate:.4g} frames per second)"
 
 
 def rises_evenly(trajectories: Sequence[np.ndarray]) -> bool:

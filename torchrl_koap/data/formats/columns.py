@@ -3,35 +3,19 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import Clock, find_rate, rises_evenly, told_rate, usual_rate
 from torchrl_koap.data.formats.frames import Clip, check_cameras
+from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
-from torchrl_koap.files import DataError
+from torchrl_koap.files import DataError, gathered, option, some
 from torchrl_koap.lookup import lookup
-
-_NUMBERED = "(_?(id|idx|index|number|num|nr|no))?"
-# what columns are called that are no state: words of a name joined by _, in lower case, without unit
-_KINDS = {
-    "clock": r"t|(.+_)?(time_?stamps?|stamps?)|((sim|wall|ros|unix|system|log|elapsed)_)?times?|elapsed|(date|up)_?time"
-    r"|clock",
-    "episode": rf"(episode|ep|traj|trajectory|demo|demonstration|run|rollout|trial)s?{_NUMBERED}",
-    "end": r"(is_)?(timeout|terminal|termination|terminated|truncation|truncated|done|last)s?|(episode|ep|traj)_ends?",
-    "start": r"(is_)?first|(episode|ep|traj|trajectory)_starts?",
-    "length": r"lengths|(episode|ep|traj|trajectory|demo)_len(gth)?s?",
-    "frame": rf"(frame|step|time_?step)s?{_NUMBERED}",
-    "other": r"index|task_index|row|_*index_level_0_*|unnamed:_0|(.+_)?(rewards?|success)|returns?(_to_go)?|discounts?",
-}
-_KIND = {kind: re.compile(pattern) for kind, pattern in _KINDS.items()}
-UNITS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6}
-UNITS |= {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9}
-_UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(UNITS)})[)\]]?")
 
 
 @dataclass(frozen=True)
@@ -56,33 +40,6 @@ class Piece:
     def frames(self) -> int:
         """Number of frames."""
         return len(next(iter(self.states.values()), ()))
-
-
-def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a table ``[T]`` or ``[T, d]``, numbered if there are several."""
-    table = np.asarray(values)
-    table = table.reshape(len(table), int(np.prod(table.shape[1:])))
-    alone = table.shape[1] == 1
-    return {name if alone else f"{name}_{index}": table[:, index] for index in range(table.shape[1])}
-
-
-def kind_of(name: str) -> tuple[str | None, float]:
-    """What a column is by its name, None for a state; and of a clock its unit in seconds, 0.001 of "Time [ms]"."""
-    plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.strip()).lower().removeprefix("next.")
-    unit = _UNIT.fullmatch(plain)
-    if unit and _KIND["clock"].fullmatch(_joined(unit[1])):
-        return "clock", UNITS[unit[2]]
-    return next((kind for kind, pattern in _KIND.items() if pattern.fullmatch(_joined(plain))), None), 1.0
-
-
-def numbered(texts: Sequence[object]) -> np.ndarray:
-    """Names of episodes ``[T]`` as numbers, in the order in which they come."""
-    numbers: dict[object, int] = {}
-    return np.array([numbers.setdefault(text, len(numbers)) for text in texts], dtype=float)
-
-
-def _joined(name: str) -> str:
-    return re.sub(r"[\s./-]+", "_", name)
 
 
 def assemble(
@@ -119,52 +76,62 @@ def assemble(
     """
     if not pieces:
         raise DataError(source, "there are no trajectories")
-    seen = {name for piece in pieces for name in piece.cameras}
-    pieces = [replace(piece, cameras=_without(piece.cameras, drop_columns)) for piece in pieces]
-    drop_columns = [name for name in drop_columns if name not in seen]
-    problems = [*_other_names(pieces), *_other_lengths(pieces)]
+    seen = dict.fromkeys(name for piece in pieces for name in piece.states)
+    every = dict.fromkeys(name for piece in pieces for name in (*piece.states, *(piece.actions or ()), *piece.cameras))
+    problems = unknown(state_columns, [*seen], f"column in {option('state_columns')}:")
+    problems += unknown(drop_columns, [*every], f"column in {option('drop_columns')}:")
+    looked_at = {name for name in seen if not state_columns or name in state_columns or kind_of(name)[0] is not None}
+    pieces = [
+        replace(
+            piece,
+            states={name: values for name, values in piece.states.items() if name in looked_at - {*drop_columns}},
+            actions=_without(piece.actions or {}, drop_columns) or None,
+            cameras=_without(piece.cameras, drop_columns),
+        )
+        for piece in pieces
+    ]
+    problems += gathered([*_other_names(pieces), *_other_lengths(pieces)])
     if problems:
         raise DataError(source, problems)
     check_cameras(pieces, source)
-    left_out = list(skipped)
     parts = [part for piece in pieces for part in _episodes(piece, problems)]
-    left_out += [f"{part.name} (fewer than two frames)" for part in parts if part.frames < 2]
+    short = [f"{part.name} (fewer than two frames)" for part in parts if part.frames < 2]
     pieces = [part for part in parts if part.frames > 1]
     if not pieces:
         raise DataError(source, problems or [f"none of its {len(parts)} trajectories has two frames"])
     names = list(pieces[0].states)
     acting = next((list(piece.actions) for piece in pieces if piece.actions is not None), [])
-    problems += unknown(state_columns, names, "column in state_columns:")
-    problems += unknown(drop_columns, [*names, *acting], "column in drop_columns:")
-    problems += [
-        f"{name!r} may say which episode a frame is of, or where episodes end: call it episode_index, timeouts or"
-        " episode_ends then; else name the state's columns in state_columns, or drop it in drop_columns"
-        for name in dict.fromkeys(name for piece in pieces for name in piece.unclear)
-        if name not in drop_columns and not state_columns
-    ]
+    unclear = dict.fromkeys(name for piece in pieces for name in piece.unclear if name not in drop_columns)
+    if unclear and not state_columns:
+        problems.append(
+            f"{', '.join(map(repr, unclear))} may say which episode a frame is of, or where episodes end: call it"
+            " episode_index, timeouts or episode_ends then; else name the state's columns in"
+            f" {option('state_columns')}, or drop it in {option('drop_columns')}"
+        )
     even = set() if state_columns else _even(pieces)
     usable = [name for name in names if kind_of(name)[0] is None and name not in even]
     observed = [name for name in state_columns or usable if name not in drop_columns]
     about = dict.fromkeys(even, " (it rises evenly: a clock)")
-    clock, rate, times = _clock(pieces), control_hz, None
+    (clock, *others), rate, times = _clocks(pieces) or [None], control_hz, None
     if control_hz is None and clock is not None:
         times = clock.times
         rate = find_rate(clock, declared_hz, problems) if resample is None else usual_rate(clock, problems)
-    elif control_hz is None:
+    else:
+        problems += gathered(_lost_frames(pieces))
+        others = [clock, *others]
+    if rate is None and clock is None:
         rate = declared_hz
         problems += [no_rate] if rate is None else []
-    elif clock is not None:
-        about[clock.name] = told_rate(clock, control_hz)
-    left_out += [name + about.get(name, "") for name in names if name not in observed]
+    about |= {other.name: told_rate(other, rate) for other in others if other is not None and rate is not None}
+    left_out = [*skipped, *short, *(name + about.get(name, "") for name in seen if name not in observed)]
+    left_out += [name for name in drop_columns if name not in left_out]
     if not observed:
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
-    left_out += [name for name in acting if name in drop_columns]
-    acting = [name for name in acting if name not in drop_columns]
     if problems:
         raise DataError(source, problems)
     recordings = make_recordings(
         [_stack(piece.states, observed) for piece in pieces],
-        [_stack(piece.actions, acting) if piece.actions and acting else None for piece in pieces],
+        [_stack(piece.actions, acting) if piece.actions else None for piece in pieces],
         action_dim=action_dim,
         state_names=observed,
         action_names=acting or action_names,
@@ -177,8 +144,8 @@ def assemble(
     return recordings if resample is None else resampled(recordings, resample, action_kind, times=times)
 
 
-def _without(cameras: Mapping[str, Clip], dropped: Sequence[str]) -> dict[str, Clip]:
-    return {name: clip for name, clip in cameras.items() if name not in dropped}
+def _without(columns: Mapping[str, Any], dropped: Sequence[str]) -> dict[str, Any]:
+    return {name: values for name, values in columns.items() if name not in dropped}
 
 
 def unknown(asked: Sequence[str], known: Sequence[str], what: str) -> list[str]:
@@ -196,14 +163,37 @@ def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarra
     return np.stack([columns[name] for name in names], 1).astype(np.float64)
 
 
-def _clock(pieces: Sequence[Piece]) -> Clock | None:
-    """The first column of time stamps, in seconds from the first frame of every piece."""
-    name = next((name for name in pieces[0].states if kind_of(name)[0] == "clock"), None)
-    if name is None:
-        return None
-    stamps = [piece.states[name].astype(np.float64) for piece in pieces]
-    times = [(values - values[:1]) * kind_of(name)[1] for values in stamps]
-    return Clock(name, times, [piece.name for piece in pieces])
+def _clocks(pieces: Sequence[Piece]) -> list[Clock]:
+    """The columns of time stamps, in seconds from the first frame of every piece."""
+    found: dict[str, list[np.ndarray]] = {}
+    for name in pieces[0].states:
+        kind, unit = kind_of(name)
+        if kind != "clock":
+            continue
+        times = [piece.states[name] * unit for piece in pieces]
+        whole = (other for other, seconds in found.items() if all((part == part.round()).all() for part in seconds))
+        seconds = next(whole, None)
+        if seconds is not None and all(((part >= 0) & (part < 1)).all() for part in times):  # ROS: s and ns
+            found[seconds] = [part + rest for part, rest in zip(found[seconds], times, strict=True)]
+        else:
+            found[name] = times
+    names = [piece.name for piece in pieces]
+    return [Clock(name, [part - part[:1] for part in times], names) for name, times in found.items()]
+
+
+def _lost_frames(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
+    """Pieces whose count of frames has holes, which no clock tells."""
+    for piece in pieces:
+        for name in [name for name in piece.states if kind_of(name)[0] == "frame"]:
+            steps = np.diff(piece.states[name])
+            lost = np.flatnonzero(steps != np.median(steps))
+            if len(lost):
+                before, after = piece.states[name][lost[0] : lost[0] + 2]
+                yield (
+                    piece.name,
+                    f"column {name!r} goes from {before:g} to {after:g}: give the missing frames, or end an episode"
+                    f" there (a column 'episode_index'), or leave the count out by {option('drop_columns')}",
+                )
 
 
 def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
@@ -218,7 +208,8 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
         return [piece]
     if piece.actions is not None and any(len(values) != length for values in piece.actions.values()):
         problems.append(
-            f"{piece.name}: it holds {len(starts)} episodes, so an action beside each of its {length} frames"
+            f"{piece.name}: it holds {len(starts)} episodes and {len(next(iter(piece.actions.values())))} actions for"
+            f" {length} frames: several episodes need an action beside every frame"
         )
         return [piece]
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
@@ -249,6 +240,8 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     columns = {kind: piece.states[name] for kind, name in called.items()}
     number, frame = columns.get("episode"), columns.get("frame")
     if number is not None:
+        if np.isnan(number).any():
+            raise ValueError(f"column {called['episode']!r} is empty in row {int(np.isnan(number).argmax())}")
         sorting = columns.get("clock") if frame is None else frame
         starts = _changes(number)
         sorted_by = number[:, None] if sorting is None else np.stack([number, sorting], 1)
@@ -299,19 +292,24 @@ def _even(pieces: Sequence[Piece]) -> set[str]:
     return found if len(found) < len(states) else set()
 
 
-def _other_names(pieces: Sequence[Piece]) -> Iterator[str]:
+def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
     for kind in ("state", "action"):
         named = [(piece.name, piece.states if kind == "state" else piece.actions) for piece in pieces]
-        found = [(name, list(columns)) for name, columns in named if columns is not None]
-        for name, columns in found:
-            if columns != found[0][1]:
-                first, wanted = found[0][0], ", ".join(found[0][1])
-                yield f"{name}: {kind} columns are {', '.join(columns)}; those of {first} are {wanted}"
+        found = [(name, columns) for name, columns in named if columns is not None]
+        for name, columns in found[1:]:
+            first, wanted = found[0]
+            missing, more = (some([*rest]) for rest in (wanted.keys() - columns.keys(), columns.keys() - wanted.keys()))
+            if missing or more:
+                said = [f"lacks {missing}"] * bool(missing) + [f"has {more} besides"] * bool(more)
+                yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}"
 
 
-def _other_lengths(pieces: Sequence[Piece]) -> Iterator[str]:
+def _other_lengths(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
     for piece in pieces:
         for columns in (piece.states, piece.actions or {}):
-            if len({len(values) for values in columns.values()}) > 1:
-                shapes = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
-                yield f"{piece.name}: its columns have different numbers of rows: {shapes}"
+            lengths: dict[int, list[str]] = {}
+            for name, values in columns.items():
+                lengths.setdefault(len(values), []).append(name)
+            if len(lengths) > 1:
+                said = "; ".join(f"{length} in {some(names)}" for length, names in lengths.items())
+                yield piece.name, f"its columns have different numbers of rows: {said}"

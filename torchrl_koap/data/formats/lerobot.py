@@ -25,7 +25,7 @@ from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import lerobot_clips
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, check_file, read_bytes, some
+from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, some
 
 PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
 EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
@@ -74,12 +74,12 @@ def read_lerobot(
         raise DataError(root, "there are no trajectories")
     first, width = next(iter(rows.values())), _announced(info) or options.get("action_dim")
     if ACTION not in first and not width:
-        raise DataError(root, "no file has actions, and info.json does not say how many columns an action has")
+        silent = "no file has actions, and info.json does not say how many columns an action has"
+        raise DataError(root, f"{silent}: say it in {option('action_dim')}")
     names = [label for name in chosen for label in _names(known[name], name, first[name].shape[1])]
     if len(set(names)) < len(names):  # two features with the same names of columns
         names = [label for name in chosen for label in _names({}, name, first[name].shape[1])]
     acting = _names(known.get(ACTION) or {}, ACTION, first[ACTION].shape[1] if ACTION in first else width)
-    stamped = TIME in first and all(np.isfinite(columns[TIME]).all() for columns in rows.values())
     cameras = [name for name in images if known[name].get("dtype") in IMAGES]
     clips, pieces = lerobot_clips(root, info, cameras, rows), []
     unseen = [name for name in images if name.split(".")[-1] not in clips[min(rows)]]
@@ -87,7 +87,7 @@ def read_lerobot(
     for number, columns in rows.items():
         states = dict(zip(names, np.concatenate([columns[name] for name in chosen], 1).T, strict=True))
         steps = dict(zip(acting, columns[ACTION].T, strict=True)) if ACTION in columns else None
-        clock = {TIME: columns[TIME][:, 0]} if stamped else {}
+        clock = {TIME: columns[TIME][:, 0]} if TIME in columns else {}
         pieces.append(Piece(f"episode {number}", states | clock, steps, cameras=clips[number]))
     if ACTION not in first:
         options = {"action_dim": width} | options
@@ -101,7 +101,7 @@ def read_lerobot(
         declared_hz=_rate(info),
         action_names=acting,
         skipped=[*absent, *unread],
-        no_rate="info.json holds no fps: pass control_hz",
+        no_rate=f"info.json holds no fps: pass {option('control_hz')}",
         **options,
     )
 
@@ -150,7 +150,9 @@ def read_rows(root: str | Path, features: Sequence[str], *, episodes: Sequence[i
     missing = sorted((set(episodes) or expected.keys()) - {*found.tolist()})
     if missing:
         absent, there = (some([str(number) for number in numbers]) for numbers in (missing, found))
-        problems = [f"{len(missing)} episodes are missing: {absent}; name in episodes which to read (here: {there})"]
+        problems = [
+            f"{len(missing)} episodes are missing: {absent}; name in {option('episodes')} those to read: {there}"
+        ]
     rows: dict[int, dict[str, Any]] = {}
     for number, start, end in zip(found.tolist(), starts, ends, strict=True):
         if episodes and number not in episodes:
@@ -170,8 +172,8 @@ def read_rows(root: str | Path, features: Sequence[str], *, episodes: Sequence[i
 def _read_table(root: Path, needed: Sequence[str]):
     """The rows of all files, sorted: the columns that are asked for, the actions, and ``__filename``."""
     pyarrow = import_pyarrow()
-    files, problems = sorted((root / "data").rglob("*.parquet")), []
-    missing: dict[str, list[Path]] = {}
+    files = sorted((root / "data").rglob("*.parquet"))
+    faults: list[tuple[str, str]] = []
     kinds: dict[str, Any] = {}
     if not files:
         raise FileNotFoundError(f"no *.parquet below {root / 'data'}")
@@ -179,27 +181,26 @@ def _read_table(root: Path, needed: Sequence[str]):
         try:
             check_file(file, largest=_LARGEST)
             schema = pyarrow.parquet.read_schema(file)
-        except (pyarrow.ArrowException, OSError) as error:
-            problems.append(f"{file}: cannot be read: {str(error).splitlines()[0]}")
+        except pyarrow.ArrowException:
+            faults.append((str(file), "it is no parquet file, or damaged"))
             continue
-        for name in needed:
-            if name not in schema.names:
-                said = f"missing column {name!r}; the file has {', '.join(schema.names)}"
-                missing.setdefault(said, []).append(file)
+        except OSError as error:
+            faults.append((str(file), f"it cannot be read: {error}"))
+            continue
+        there = ", ".join(schema.names)
+        faults += [
+            (str(file), f"missing column {name!r}; it has {there}") for name in needed if name not in schema.names
+        ]
         for name in {*needed, ACTION, TIME}.intersection(schema.names):
             got = schema.field(name).type
             kind = number_type(got)
             kinds.setdefault(name, kind)
             if kind is None:
-                problems.append(f"{file}: column {name!r} must hold numbers or lists of numbers, got {got}")
+                faults.append((str(file), f"column {name!r} must hold numbers or lists of numbers, got {got}"))
             elif kind != kinds[name]:
-                problems.append(f"{file}: column {name!r} holds {got}, that of another file {kinds[name]}")
-    problems += [
-        f"{found[0]}: {said}" + (f" (so in {len(found)} of {len(files)} files)" if len(found) > 1 else "")
-        for said, found in missing.items()
-    ]
-    if problems:
-        raise DataError(root, problems)
+                faults.append((str(file), f"column {name!r} holds {got}, that of another file {kinds[name]}"))
+    if faults:
+        raise DataError(root, gathered(faults))
     try:
         data = pyarrow.dataset.dataset(files, schema=pyarrow.schema(list(kinds.items())), format="parquet")
         table = data.to_table(columns=[*kinds, "__filename"])

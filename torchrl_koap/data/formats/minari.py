@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.columns import Piece, assemble, spread
+from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.kinds import spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError
+from torchrl_koap.files import DataError, gathered, option
 
 PREFIX = "minari:"
 
@@ -36,36 +37,46 @@ def read_minari(source: str, **options: Any) -> Recordings:
             f"Minari data set {name!r} is not on this machine (here: {known}); `minari download` it"
         )
     dataset = minari.load_dataset(name, download=False)
-    pieces, skipped, problems = [], [], []
-    for episode in dataset.iterate_episodes():
+    pieces, skipped, faults = [], [], []
+    for episode in _episodes(dataset, source):
         states: dict[str, np.ndarray] = {}
+        called = f"episode {episode.id}"
         for name, array in _leaves(episode.observations):
             if array.ndim > 2 or array.dtype.kind not in "fiub":
                 skipped.append(name or "observation")
             else:
                 states |= spread(name or "state", array)
         if not states:
-            problems.append(f"episode {episode.id}: observations hold no numbers but images")
+            faults.append((called, "observations hold no numbers but images"))
         if isinstance(episode.actions, (Mapping, tuple)):
             kind = "Dict" if isinstance(episode.actions, Mapping) else "Tuple"
-            problems.append(f"episode {episode.id}: its actions are a {kind}, wanted one vector [T, a] of numbers")
+            faults.append((called, f"its actions are a {kind}, wanted one vector [T, a] of numbers"))
             continue
         steps = np.asarray(episode.actions)
         if steps.ndim > 2 or steps.dtype.kind != "f" and (steps.ndim < 2 or steps.dtype.kind not in "iub"):
-            problems.append(f"episode {episode.id}: actions must be [T, a], got {steps.dtype} {list(steps.shape)}")
+            faults.append((called, f"actions must be [T, a], got {steps.dtype} {list(steps.shape)}"))
             continue
         acting = {f"action_{index}": values for index, values in enumerate(steps.reshape(len(steps), -1).T)}
         pieces.append(Piece(str(episode.id), states, acting))
-    if problems:
-        raise DataError(source, problems)
+    if faults:
+        raise DataError(source, gathered(faults))
     return assemble(
         pieces,
         source,
         declared_hz=_rate(dataset),
         skipped=skipped,
-        no_rate="its environment says nothing of render_fps: pass control_hz",
+        no_rate=f"its environment says nothing of render_fps: pass {option('control_hz')}",
         **options,
     )
+
+
+def _episodes(dataset: Any, source: str) -> Iterator[Any]:
+    """The episodes of a data set; those that Minari cannot put together as its spaces say are named."""
+    for number in dataset.episode_indices:
+        try:
+            yield next(iter(dataset.iterate_episodes([number])))
+        except (KeyError, ValueError, TypeError, OSError, StopIteration) as error:
+            raise DataError(source, f"episode {number} is damaged, or not as its spaces say: {error}") from error
 
 
 def _leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:

@@ -8,16 +8,26 @@ action is NaN, has no label.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from torchrl_koap.data.formats.frames import Clip
-from torchrl_koap.files import DataError
+from torchrl_koap.files import DataError, gathered, option
+
+FRAMES, STEPS = "[T, d]", "[T, a] or [T - 1, a]"
+FROM_FILES = "files are read by read_recordings (`koap convert`)"
+NO_ACTIONS = (
+    f"say in {option('action_dim')} how many columns an action has, or in {option('action_columns')} which columns of a"
+    " table are actions"
+)
 
 
 @dataclass(frozen=True)
@@ -98,45 +108,56 @@ def make_recordings(
         >>> [steps.shape for steps in recordings.actions], recordings.num_labels
         ([(4, 2), (3, 2)], 4)
     """
-    problems: list[str] = []
-    if not len(states):
+    states = _listed(states, "states", FRAMES, source)
+    actions = [None] * len(states) if actions is None else _listed(actions, "actions", STEPS, source)
+    if not states:
         raise DataError(source, "there are no trajectories")
-    actions = [None] * len(states) if actions is None else actions
     if len(actions) != len(states):
         raise DataError(source, f"{len(states)} trajectories of states, {len(actions)} of actions")
     labels = [str(index) for index in range(len(states))] if sources is None else list(sources)
+    faults: list[tuple[str, str]] = []
     what = [f"trajectory {label}" for label in labels]
-    frames = [_frames(value, name, problems) for value, name in zip(states, what, strict=True)]
+    frames = [_table(value, "states", FRAMES, name, faults) for value, name in zip(states, what, strict=True)]
     width = next((array.shape[1] for array in frames if array is not None), 0)
-    known = [_steps(value, name, problems) for value, name in zip(actions, what, strict=True)]
+    known = [
+        None if value is None else _table(value, "actions", STEPS, name, faults)
+        for value, name in zip(actions, what, strict=True)
+    ]
     wide = next((array.shape[1] for array in known if array is not None), action_dim)
     if wide is None and action_names is not None:
         wide = len(action_names)
+    problems: list[str] = []
     if wide is None:
-        problems.append("no trajectory has actions: action_dim says how many columns an action has")
         wide = 1
+        problems += [] if faults else [f"no trajectory has actions: {NO_ACTIONS}"]
     elif action_dim is not None and action_dim != wide:
-        problems.append(f"actions have {wide} columns, action_dim says {action_dim}")
-    for name, seen, done in zip(what, frames, known, strict=True):
-        if seen is None:
-            continue
-        length = len(seen)
-        if seen.shape[1] != width:
-            problems.append(f"{name}: states have {seen.shape[1]} columns, those before have {width}")
-        if done is not None and done.shape[1] != wide:
-            problems.append(f"{name}: actions have {done.shape[1]} columns, those before have {wide}")
-        elif done is not None and len(done) not in (length - 1, length):
-            problems.append(
-                f"{name}: {len(done)} actions for {length} frames; wanted one per frame ({length}) or one per"
-                f" transition ({length - 1})"
-            )
+        problems.append(f"actions have {wide} columns, {option('action_dim')} says {action_dim}")
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
+    for name, seen, done in zip(what, frames, known, strict=True):
+        if seen is not None and seen.shape[1] != width:
+            faults.append((name, f"states have {seen.shape[1]} columns, those before have {width}"))
+        elif seen is not None and len(seen) < 2:
+            faults.append((name, f"{len(seen)} frames; a transition needs two"))
+        elif seen is not None and not np.isfinite(seen).all():
+            frame, column = np.argwhere(~np.isfinite(seen))[0]
+            called = repr(given_states[column]) if len(given_states) == width else column
+            faults.append((name, f"states are not finite, first at frame {frame} in column {called}"))
+        if done is None:
+            continue
+        infinite = np.isinf(done).any(-1)
+        if done.shape[1] != wide:
+            faults.append((name, f"actions have {done.shape[1]} columns, those before have {wide}"))
+        elif seen is not None and len(done) not in (len(seen) - 1, len(seen)):
+            wanted = f"wanted one per frame ({len(seen)}) or one per transition ({len(seen) - 1})"
+            faults.append((name, f"{len(done)} actions for {len(seen)} frames; {wanted}"))
+        elif infinite.any():
+            faults.append((name, f"the action of step {infinite.argmax()} is infinite; NaN means that it is unknown"))
     problems += _sparse([array for array in known if array is not None and array.shape[1] == wide], given_actions)
-    if control_hz is not None and not (isinstance(control_hz, (int, float, np.number)) and 0 < control_hz < math.inf):
-        problems.append(f"control_hz must be a positive number of frames per second, got {control_hz!r}")
-    if problems:
-        raise DataError(source, problems)
+    if control_hz is not None:
+        problems += wrong_rate(control_hz, "control_hz")
+    if problems or faults:
+        raise DataError(source, [*gathered(faults), *problems])
     steps = [
         np.full((len(seen) - 1, wide), np.nan) if done is None else _whole(done[: len(seen) - 1])
         for seen, done in zip(frames, known, strict=True)
@@ -156,49 +177,48 @@ def make_recordings(
     )
 
 
-def _frames(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | None:
-    array = _table(value, f"{name}: states", "[T, d]", problems)
-    if array is None:
-        return None
-    if array.dtype.kind not in "fiub":
-        problems.append(f"{name}: states are {array.dtype}, wanted numbers in the unit that the robot reports")
-    elif len(array) < 2:
-        problems.append(f"{name}: {len(array)} frame; a transition needs two")
-    else:
-        bad = ~np.isfinite(array).all(-1)
-        if bad.any():
-            columns = np.flatnonzero(~np.isfinite(array).all(0)).tolist()
-            problems.append(f"{name}: states are not finite at frame {int(bad.argmax())}, columns {columns}")
-        return array.astype(np.float64)
-    return None
+def wrong_rate(value: Any, name: str) -> list[str]:
+    """What is to be said of frames per second that are none."""
+    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and not np.iscomplexobj(value)
+    if number and 0 < value < math.inf:
+        return []
+    return [f"{option(name)} must be a positive number of frames per second, got {value!r}"]
 
 
-def _steps(value: ArrayLike | None, name: str, problems: list[str]) -> np.ndarray | None:
-    array = None if value is None else _table(value, f"{name}: actions", "[T, a] or [T - 1, a]", problems)
-    if array is None:
-        return None
-    if array.dtype.kind not in "fiub":
-        problems.append(f"{name}: actions are {array.dtype}, wanted numbers")
-        return None
-    array = array.astype(np.float64)
-    infinite = np.isinf(array).any(-1)
-    if infinite.any():
-        problems.append(
-            f"{name}: the action of step {int(infinite.argmax())} is infinite; NaN means that it is unknown"
-        )
-    return array
+def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
+    """One array per trajectory."""
+    with contextlib.suppress(TypeError, RuntimeError):  # what is no sequence; nested tensors
+        if not isinstance(values, (str, Path, Mapping)):
+            return list(values)
+    kind = type(values).__name__
+    raise DataError(
+        source, f"{what} must be a sequence of arrays {wanted}, one per trajectory, got {kind}: {FROM_FILES}"
+    )
 
 
-def _table(value: ArrayLike, name: str, wanted: str, problems: list[str]) -> np.ndarray | None:
+def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str, str]]) -> np.ndarray | None:
+    """Numbers of a trajectory as float64, NaN where they are masked or None; else there is a fault more."""
     try:
-        array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
-    except ValueError:
-        widths = sorted({np.size(row) for row in value})  # type: ignore[union-attr, arg-type]
-        problems.append(f"{name} are lists of different lengths: rows of {' and '.join(map(str, widths))} numbers")
+        if isinstance(value, torch.Tensor):
+            value = value.detach().cpu()
+            array = (value.double() if value.is_floating_point() else value).numpy()
+        elif isinstance(value, np.ma.MaskedArray):
+            array = value.astype(np.float64).filled(np.nan) if value.dtype.kind in "fiub" else value.data
+        else:
+            array = np.asarray(value)
+            array = array.astype(np.float64) if array.dtype == object else array
+    except (ValueError, TypeError, RuntimeError):  # ragged lists; other objects; sparse tensors
+        said = f"{what} are no table of numbers, got {type(value).__name__}"
+        if isinstance(value, (list, tuple)) and len(widths := sorted({np.size(row) for row in value})) > 1:
+            said = f"{what} are lists of different lengths: rows of {' and '.join(map(str, widths))} numbers"
+        faults.append((name, said))
         return None
-    if array.ndim == 2 and array.shape[-1]:
-        return array
-    problems.append(f"{name} must be {wanted}, got {list(array.shape)}")
+    if array.ndim != 2 or not array.shape[-1]:
+        faults.append((name, f"{what} must be {wanted}, got {list(array.shape)}"))
+    elif array.dtype.kind not in "fiub":
+        faults.append((name, f"{what} are {array.dtype}, wanted numbers in the unit that the robot reports"))
+    else:
+        return array.astype(np.float64)
     return None
 
 
@@ -212,7 +232,8 @@ def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:
         return []
     return [
         f"{known.max()} steps have actions, but action column {', '.join(sparse)} is mostly empty, and only steps in"
-        " which all columns are known are labels: repeat its last value where it holds on, or drop it (drop_columns)"
+        " which all columns are known are labels: repeat its last value where it holds on, or drop it in"
+        f" {option('drop_columns')}"
     ]
 
 

@@ -20,15 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.columns import Piece, assemble, kind_of, spread
+from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import Clip
+from torchrl_koap.data.formats.kinds import as_numbers, kind_of, spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError
+from torchrl_koap.files import DataError, gathered, option
 
 
 def is_hdf5(path: str | Path) -> bool:
     """Whether a path is an HDF5 file, by its name."""
-    return Path(path).suffix in (".hdf5", ".h5") and Path(path).is_file()
+    return Path(path).suffix.lower() in (".hdf5", ".h5") and Path(path).is_file()
 
 
 def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = None, **options: Any) -> Recordings:
@@ -48,83 +49,86 @@ def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = Non
     if not file.is_file():
         raise FileNotFoundError(f"{file} is no file")
     try:
-        stream = h5py.File(file, "r")
+        with h5py.File(file, "r") as stream:
+            pieces, declared, skipped = _read(stream, file, observations)
     except OSError as error:
-        raise DataError(file, f"no HDF5 file: {str(error).splitlines()[0]}") from error
-    with stream:
-        if "data" not in stream or not isinstance(stream["data"], h5py.Group):
-            raise DataError(file, f"no group 'data'; the file holds {', '.join(stream) or 'nothing'}")
-        demos = sorted(stream["data"], key=_number)
-        problems = [
-            f"data/{name} has no group 'obs'"
-            for name in demos
-            if not isinstance(stream["data"][name].get("obs"), h5py.Group)
-        ]
-        if problems or not demos:
-            raise DataError(file, problems or "'data' holds no trajectories")
-        first = stream[f"data/{demos[0]}"]
-        entries = {name: part for demo in demos for name, part in stream[f"data/{demo}/obs"].items()}
-        usable = sorted(name for name, part in entries.items() if _is_table(part))
-        chosen = usable if observations is None else list(observations)
-        if not chosen:
-            problems.append(f"no entry of obs is a table of numbers; there are {', '.join(first['obs'])}")
-        declared = _control_frequency(stream["data"].attrs.get("env_args"))
-        pieces = [_piece(stream[f"data/{name}"], name, chosen, problems) for name in demos]
-        seen = {name for piece in pieces for name in piece.cameras}
-        skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
-        read = ("obs", "next_obs", "actions")
-        skipped += [name for name in sorted(first) if name not in read and kind_of(name)[0] != "clock"]
-        skipped += [name for name in stream if name != "data"]
-    if problems:
-        raise DataError(file, problems)
+        raise DataError(file, "it is no HDF5 file, or damaged") from error
     return assemble(
         pieces,
         str(file),
         declared_hz=declared,
         skipped=skipped,
-        no_rate="env_args holds no control_freq: pass control_hz",
+        no_rate=f"env_args holds no control_freq: pass {option('control_hz')}",
         **options,
     )
 
 
-def _piece(group: Any, name: str, chosen: Sequence[str], problems: list[str]) -> Piece:
+def _read(stream: Any, file: Path, observations: Sequence[str] | None) -> tuple[list[Piece], float | None, list[str]]:
+    """Demonstrations, the rate that is declared, and what is not read."""
+    if not _is_group(stream.get("data")):
+        wanted = "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions)"
+        raise DataError(file, f"no group 'data', {wanted}; the file holds {', '.join(stream) or 'nothing'}")
+    data = stream["data"]
+    demos = sorted((name for name in data if _is_group(data.get(name))), key=_number)
+    faults = [(f"data/{name}", "it has no group 'obs'") for name in demos if not _is_group(data[name].get("obs"))]
+    if faults or not demos:
+        raise DataError(file, gathered(faults) or "'data' holds no trajectories")
+    first = data[demos[0]]
+    entries = {name: data[demo]["obs"].get(name) for demo in demos for name in data[demo]["obs"]}
+    usable = sorted(name for name, part in entries.items() if _is_table(part))
+    chosen = usable if observations is None else list(observations)
+    if not chosen:
+        faults.append(("data/*/obs", f"no entry is a table of numbers; there are {', '.join(first['obs'])}"))
+    pieces = [_piece(data[name], name, chosen, faults) for name in demos]
+    if faults:
+        raise DataError(file, gathered(faults))
+    seen = {name for piece in pieces for name in (*piece.states, *piece.cameras)}
+    skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
+    skipped += [name for name in sorted(first) if name not in ("obs", "next_obs", "actions", *seen)]
+    skipped += [f"data/{name} (no group)" for name in data if name not in demos]
+    skipped += [name for name in stream if name != "data"]
+    return pieces, _control_frequency(data.attrs.get("env_args")), skipped
+
+
+def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]]) -> Piece:
     """One demonstration."""
     states: dict[str, np.ndarray] = {}
     following = group.get("next_obs", {})
     behind = all(entry in following for entry in chosen)
     for entry in chosen:
-        part = group["obs"].get(entry)
+        part, called = group["obs"].get(entry), (f"data/{name}", f"obs/{entry}")
+        last = following[entry] if behind else part
         if part is None:
-            problems.append(f"data/{name}/obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}")
+            faults.append((called[0], f"obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}"))
         elif not _is_table(part):
-            said = "no table of numbers: it cannot be part of the state"
-            problems.append(f"data/{name}/obs/{entry} is {_shape(part)}, {said}")
+            faults.append(
+                (called[0], f"{called[1]} is {_shape(part)}, no table of numbers: it cannot be part of the state")
+            )
+        elif _shape(last)[1:] != _shape(part)[1:] or not len(last) and len(part):
+            faults.append((called[0], f"next_obs/{entry} is {_shape(last)}, {called[1]} is {_shape(part)}"))
         else:
-            last = following[entry] if behind else part[:0]
-            if _shape(last)[1:] != _shape(part)[1:] or behind and not len(last):
-                problems.append(f"data/{name}/next_obs/{entry} is {_shape(last)}, obs/{entry} is {_shape(part)}")
-                continue
-            states |= spread(entry, np.concatenate([part, last[-1:]]))
+            states |= spread(entry, np.concatenate([part, last[-1:]] if behind else [part]))
     if not behind:  # time stamps may lie beside obs
-        stamps = [entry for entry in group if kind_of(entry)[0] == "clock" and _is_table(group[entry])]
-        states = {entry: group[entry][()].ravel() for entry in stamps} | states
+        for entry in [entry for entry in group if kind_of(entry)[0] == "clock" and _shape(group.get(entry))]:
+            stamps = as_numbers(entry, group[entry][()].ravel())
+            states = states if stamps is None else {entry: stamps} | states
     file, cameras = str(Path(group.file.filename).resolve()), {}
     for film, part in group["obs"].items():
         if len(_shape(part)) == 4:  # where nobody kept the frame behind the last one, that one is taken again
             last = (len(part) - (film not in following),) if behind else ()
             cameras[film] = Clip(file, (*range(len(part)), *last), f"data/{name}/obs/{film}")
-    if "actions" not in group:
-        return Piece(name, states, cameras=cameras)
-    actions = group["actions"]
-    if not _is_table(actions):
-        problems.append(f"data/{name}/actions must be numbers [T, a], got {_shape(actions)}")
-        return Piece(name, states)
-    columns = spread("action", actions).values()
-    return Piece(name, states, {f"action_{index}": values for index, values in enumerate(columns)}, cameras=cameras)
+    actions = group.get("actions")
+    if actions is not None and not _is_table(actions):
+        faults.append((f"data/{name}", f"actions must be numbers [T, a], got {_shape(actions)}"))
+    columns = spread("action", actions).values() if _is_table(actions) else ()
+    steps = {f"action_{index}": values for index, values in enumerate(columns)}
+    return Piece(name, states, steps or None, cameras=cameras)
 
 
 def _shape(entry: Any) -> list[int]:
-    return list(getattr(entry, "shape", ()))
+    import h5py
+
+    return list(entry.shape or ()) if isinstance(entry, h5py.Dataset) else []
 
 
 def _number(name: str) -> tuple[int, str]:
@@ -133,9 +137,13 @@ def _number(name: str) -> tuple[int, str]:
 
 
 def _is_table(entry: Any) -> bool:
+    return len(_shape(entry)) in (1, 2) and entry.dtype.kind in "fiub"
+
+
+def _is_group(entry: Any) -> bool:
     import h5py
 
-    return isinstance(entry, h5py.Dataset) and entry.ndim in (1, 2) and entry.dtype.kind in "fiub"
+    return isinstance(entry, h5py.Group)
 
 
 def _control_frequency(text: Any) -> float | None:

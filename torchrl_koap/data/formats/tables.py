@@ -5,7 +5,7 @@
 
     folder/run_000.npz    states [T, d] (also "state", "observations", "observation", "obs"), actions [T or T - 1, a]
                           (also "action"), or none; state_names, action_names, control_hz if wanted
-    folder/run_001.csv    a header; a row per frame; columns "action", "action_*" or "action.*" are actions, "timestamp"
+    folder/run_001.csv    a header; a row per frame; columns "action", "action_*", "Action 0" are actions, "timestamp"
                           or "time" is in seconds, "episode" or "episode_index" splits the file into trajectories, and
                           all others are states; an empty field is NaN
     folder/run_002.parquet  the same; columns may also be lists of numbers
@@ -18,6 +18,7 @@ What is not read (further entries of an archive, parquet columns without numbers
 from __future__ import annotations
 
 import csv
+import io
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -29,23 +30,23 @@ import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.clocks import UNEVEN
-from torchrl_koap.data.formats.columns import UNITS, Piece, assemble, kind_of, numbered
+from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import clips_beside
-from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, some
+from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, number_of
+from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
+from torchrl_koap.files import DataError, gathered, option
 from torchrl_koap.lookup import lookup
 
 # what readers of damaged files raise
-_UNREADABLE = (ValueError, OSError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, csv.Error)
+_DAMAGED = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
-_TRUTH = {"true": 1.0, "false": 0.0}
 _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "frame": "a count of frames"}
 _Table = tuple[Piece, "float | None", list[str]]  # columns, declared rate, and what is not read
 
 
 def is_table_folder(folder: str | Path) -> bool:
-    """Whether a folder holds tables of this kind."""
+    """Whether a folder holds tables of this kind, or is one itself."""
     return any(_files(Path(folder)))
 
 
@@ -53,7 +54,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     """Reads a folder of tables, in the order of their names.
 
     Args:
-        folder (str or Path): the folder.
+        folder (str or Path): the folder, or a single table.
         action_columns: as for :func:`~torchrl_koap.data.read_recordings`; in NumPy archives actions are an entry.
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
@@ -64,28 +65,29 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     archives = [file.name for file in files if file.suffix.lower() == ".npz"]
     if action_columns is not None and archives:
         raise ValueError(
-            f"action_columns: not an option for NumPy archives ({archives[0]}), whose actions are the entry"
+            f"{option('action_columns')}: not an option for NumPy archives ({archives[0]}), whose actions are the entry"
             f" {' or '.join(map(repr, ACTIONS))}"
         )
-    problems: dict[str, list[str]] = {}
+    faults: list[tuple[str, str]] = []
     tables: list[_Table] = []
     for file in files:
         try:
             piece, rate, unread = _READERS[file.suffix.lower()](file, action_columns)
             tables.append((_with_cameras(piece, file), rate, unread))
-        except _UNREADABLE as error:
-            problems.setdefault(str(error) or type(error).__name__, []).append(str(file))
-    if problems:
-        raise DataError(folder, [f"{some(names)}: {said}" for said, names in problems.items()])
+        except (ValueError, OSError) as error:
+            faults.append((str(file), str(error)))
+    if faults:
+        raise DataError(folder, gathered(faults))
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
         if "resample" not in options or len(rates) < len(tables):
             said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
-            raise DataError(folder, f"{said}: pass resample (Hz) to bring them to one rate, or control_hz")
+            cure = f"pass {option('resample')} to bring them to one rate, or {option('control_hz')}"
+            raise DataError(folder, f"{said}: {cure}")
         tables = [(_stamped(piece, rate), None, names) for (piece, _, names), rate in zip(tables, rates, strict=True)]
     beside = {file.with_suffix("") for file in files}
-    others = [path for path in sorted(folder.iterdir()) if path not in files and path not in beside]
-    unread = [f"{path.name} (no table)" for path in others]
+    others = [path for path in sorted(files[0].parent.iterdir()) if path not in files and path not in beside]
+    unread = [f"{path.name} (no table)" for path in others if folder.is_dir()]
     return assemble(
         _named_alike([piece for piece, _, _ in tables]),
         str(folder),
@@ -103,7 +105,8 @@ def _with_cameras(piece: Piece, file: Path) -> Piece:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in _READERS and path.is_file())
+    found = [folder] if folder.is_file() else sorted(folder.glob("[!.]*"))
+    return [path for path in found if path.suffix.lower() in _READERS and path.is_file()]
 
 
 def _stamped(piece: Piece, rate: float) -> Piece:
@@ -112,15 +115,23 @@ def _stamped(piece: Piece, rate: float) -> Piece:
     return replace(piece, states={"timestamp": np.arange(frames) / rate} | piece.states)
 
 
-def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
+def _entries(file: Path) -> dict[str, np.ndarray]:
+    """The arrays of an archive."""
+    if not zipfile.is_zipfile(file):
+        raise ValueError("it is no NumPy archive, as np.savez writes them, or damaged")
     entries = {}
     with np.load(file, allow_pickle=False) as archive:
         for name in archive.files:
             try:
                 entries[name] = archive[name]
-            except ValueError as error:
-                what = f"entry {name!r} cannot be read: it holds objects (lists of different lengths?), or is damaged"
-                raise ValueError(what) from error
+            except _DAMAGED as error:
+                what = "it holds objects (lists of different lengths, or None?), or is damaged"
+                raise ValueError(f"entry {name!r} cannot be read: {what}") from error
+    return entries
+
+
+def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
+    entries = _entries(file)
     key = next((name for name in STATES if name in entries), None)
     if key is None:
         held = ", ".join(entries) or "nothing"
@@ -148,8 +159,17 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
         if entries[acting].ndim != 2 or entries[acting].dtype.kind not in "fiub":
             raise ValueError(f"{acting} must be numbers [T, a] or [T - 1, a], got {list(entries[acting].shape)}")
         steps = _named(entries[acting], entries.get("action_names"), "action")
-    rate = float(entries["control_hz"]) if "control_hz" in entries else None
-    return Piece(file.name, states, steps, tuple(unclear)), rate, unread
+    return Piece(file.name, states, steps, tuple(unclear)), _declared(entries.get("control_hz")), unread
+
+
+def _declared(entry: np.ndarray | None) -> float | None:
+    """Frames per second, where an archive says it."""
+    if entry is None:
+        return None
+    found = as_numbers("control_hz", entry.ravel())
+    if found is None or len(found) != 1 or wrong_rate(found[0], "control_hz"):
+        raise ValueError(f"entry 'control_hz' must be one positive number of frames per second, got {entry}")
+    return float(found[0])
 
 
 def _named_alike(pieces: list[Piece]) -> list[Piece]:
@@ -171,10 +191,11 @@ def _named_alike(pieces: list[Piece]) -> list[Piece]:
 def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, np.ndarray]:
     """Columns of a table by name."""
     width = table.shape[1]
-    names = [f"{kind}_{index}" for index in range(width)] if given is None else [str(name) for name in given]
+    made_up = [f"{kind}_{index}" for index in range(width)]
+    names = made_up if given is None else np.atleast_1d(given).astype(str).tolist()
     if len(names) != width or len(set(names)) != width:
         raise ValueError(f"{kind}_names must be {width} different names, got {', '.join(names)}")
-    return {name: table[:, index] for index, name in enumerate(names)}
+    return {name: column for name, column in zip(names, table.T.astype(np.float64), strict=True)}
 
 
 def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:
@@ -189,7 +210,7 @@ def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | 
         last = values - (values[-1] == length)
     elif kind in ("length", None) and values.sum() == length and values.all():
         last = values.cumsum() - 1
-    elif kind == "start" and rises and values[0] == 0:
+    elif kind in ("start", None) and rises and values[0] == 0:
         last = np.append(values[1:], length) - 1
     else:
         return None
@@ -199,12 +220,14 @@ def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | 
 def _frame_entry(name: str, values: np.ndarray, length: int) -> np.ndarray:
     """An entry about frames, one number each, or the name of an episode."""
     if values.shape not in ((length,), (length, 1)):
-        raise ValueError(f"entry {name!r} must have one number for each of {length} frames, got {list(values.shape)}")
-    if kind_of(name)[0] == "episode" and values.dtype.kind in "US":
-        return numbered(values.ravel().tolist())
-    if values.dtype.kind not in "fiub":
+        raise ValueError(
+            f"entry {name!r} must have one number for each of {length} frames, or for each episode its end, start or"
+            f" length so that all frames are of one; got {values.dtype} {list(values.shape)}"
+        )
+    found = as_numbers(name, values.ravel())
+    if found is None:
         raise ValueError(f"entry {name!r} must be numbers, got {values.dtype}")
-    return values.ravel().astype(np.float64)
+    return found
 
 
 def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
@@ -212,49 +235,41 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
         text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8: save it as CSV UTF-8") from error
-    separator = max(",;\t", key=text.partition("\n")[0].count)
-    rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(field.strip() for field in row)]
+    first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
+    separator = max(",;\t", key=first.count)
+
+    def plain(field: str) -> str:
+        return field.strip() if separator == "," else field.strip().replace(",", ".")
+
+    reader = csv.reader(io.StringIO(text), delimiter=separator)
+    try:
+        found = [(reader.line_num, [plain(field) for field in row]) for row in reader if any(map(str.strip, row))]
+    except csv.Error as error:
+        raise ValueError(f"it is no table: {error}") from error
+    rows = [(line, row) for line, row in found if row[0][:1] != "#"]
+    if rows and None not in map(number_of, rows[0][1]):  # numpy.savetxt makes the header a comment
+        rows = [*[(line, row) for line, row in found if row[0][:1] == "#" and line < rows[0][0]][-1:], *rows]
     if len(rows) < 2:
         raise ValueError("wanted a header and a row per frame")
-    header = [name.strip() for name in rows[0]]
+    header = [" ".join(name.strip("# ").split()) for name in rows[0][1]]
     header[0] = header[0] or "unnamed: 0"  # the index of the rows, as pandas writes and reads it
-    if all(_number(name, comma=separator != ",") is not None for name in header):
+    if None not in map(number_of, header):
         raise ValueError("its first row holds numbers, wanted the names of the columns")
-    for number, name in enumerate(header):
+    for place, name in enumerate(header):
         if not name:
-            raise ValueError(f"column {number + 1} has no name")
-        if header.index(name) != number:
-            raise ValueError(f"columns {header.index(name) + 1} and {number + 1} are both named {name!r}")
-    for number, row in enumerate(rows[1:], 2):
+            raise ValueError(f"column {place + 1} has no name")
+        if header.index(name) != place:
+            raise ValueError(f"columns {header.index(name) + 1} and {place + 1} are both named {name!r}")
+    for line, row in rows[1:]:
         if len(row) != len(header):
-            raise ValueError(f"row {number} has {len(row)} fields, the header has {len(header)}")
+            raise ValueError(f"line {line} has {len(row)} fields, the header has {len(header)}")
     columns: dict[str, np.ndarray | None] = {}
-    for name, fields in zip(header, zip(*rows[1:], strict=True), strict=True):
-        values = [_number(field.strip(), comma=separator != ",") for field in fields]
-        odd = [row for row, value in enumerate(values) if value is None]
-        if odd and kind_of(name)[0] == "episode":
-            values, odd = numbered(fields), []
-        if 0 < len(odd) < len(values):
-            raise ValueError(f"row {odd[0] + 2}, column {name!r}: {fields[odd[0]]!r} is no number")
-        columns[name] = (_dates(fields) if kind_of(name)[0] == "clock" else None) if odd else np.array(values)
+    for name, texts in zip(header, zip(*(row for _, row in rows[1:]), strict=True), strict=True):
+        columns[name] = as_numbers(name, np.array(texts))
+        odd = [row for row, text in enumerate(texts, 1) if number_of(text) is None]
+        if columns[name] is None and len(odd) < len(texts):
+            raise ValueError(f"line {rows[odd[0]][0]}, column {name!r}: {texts[odd[0] - 1]!r} is no number")
     return _split(file, columns, action_columns)
-
-
-def _dates(fields: Sequence[object]) -> np.ndarray | None:
-    """Dates with times as seconds, None if one is none."""
-    try:
-        return (np.array(fields, dtype="datetime64[ns]") - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
-    except ValueError:
-        return None
-
-
-def _number(field: str, *, comma: bool) -> float | None:
-    """What a field says: NaN if it is empty, 0 or 1 for a truth, None if it is text."""
-    field = field.replace(",", ".") if comma else field
-    try:
-        return _TRUTH[field.lower()] if field.lower() in _TRUTH else float(field or "nan")
-    except ValueError:
-        return None
 
 
 def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
@@ -262,21 +277,18 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
     try:
         table = pyarrow.parquet.read_table(file)
     except pyarrow.ArrowException as error:
-        raise ValueError(f"cannot be read: {str(error).splitlines()[0]}") from error
+        raise ValueError("it is no parquet file, or damaged") from error
     columns: dict[str, np.ndarray | None] = {}
     for name in table.column_names:
         values = table[name]
         if pyarrow.types.is_boolean(values.type):
             values = values.cast(pyarrow.int8())
-        dated = pyarrow.types.is_timestamp(values.type) or pyarrow.types.is_duration(values.type)
-        if dated and kind_of(name)[0] == "clock":
-            columns[name] = values.cast(pyarrow.int64()).to_numpy() * UNITS[values.type.unit]
-            continue
         kind = number_type(values.type)
         if kind is None:  # text, dates, pictures
-            columns[name] = numbered(values.to_pylist()) if kind_of(name)[0] == "episode" else None
+            plain = pyarrow.types.is_temporal(values.type)
+            columns[name] = as_numbers(name, values.to_numpy() if plain else np.array(values.to_pylist(), dtype=object))
             continue
-        block = numbers(values.cast(kind), name)
+        block = numbers(values.cast(kind, safe=False), name)
         alone = not pyarrow.types.is_list(kind)
         columns |= {name if alone else f"{name}_{index}": block[:, index] for index in range(block.shape[1])}
     return _split(file, columns, action_columns)
@@ -287,9 +299,13 @@ _READERS = {".npz": _read_npz, ".csv": _read_csv, ".parquet": _read_parquet}
 
 def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns: Sequence[str] | None) -> _Table:
     """States and actions of a table with named columns, None where they hold no numbers."""
-    acting = [name for name in columns if name == "action" or name.startswith(("action_", "action."))]
+    acting = [name for name in columns if is_action(name)]
     if action_columns is not None:
-        acting = [name for name in action_columns if lookup(columns, name, "action column") is not None]
+        acting = [
+            name
+            for name in action_columns
+            if lookup(columns, name, f"column in {option('action_columns')}:") is not None
+        ]
     unread = [name for name, values in columns.items() if values is None]
     for name in unread:
         what = "an action" if name in acting else _NEEDED.get(kind_of(name)[0])
@@ -301,4 +317,5 @@ def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns:
             f"no column holds numbers: {', '.join(columns)} (fields lie between commas, semicolons or tabs)"
         )
     states = {name: values for name, values in known.items() if name not in acting}
-    return Piece(file.name, states, {name: known[name] for name in acting} or None), None, unread
+    said = [f"{name} (no numbers)" for name in unread]
+    return Piece(file.name, states, {name: known[name] for name in acting} or None), None, said

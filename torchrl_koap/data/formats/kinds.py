@@ -1,0 +1,98 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a column of recordings is: by its name a clock, an episode, an action ...; by what it holds, numbers or none."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import numpy as np
+
+_NUMBERED = "(_?(id|idx|index|number|num|nr|no))?"
+_ONE = "(episode|ep|traj|trajectory|demo|demonstration|run|rollout|trial|segment|take|session|attempt)"
+_END = "(timeout|terminal|termination|terminated|truncation|truncated|done|last|finished)s?(_float)?"
+# what columns are called that are no state: words of a name joined by _, in lower case, without unit
+_KINDS = {
+    "clock": r"t|(.+_)?(time_?stamps?|stamps?)|((sim|wall|ros|unix|system|log|elapsed)_)?times?|elapsed|(date|up)_?time"
+    r"|clock",
+    "episode": rf"{_ONE}s?{_NUMBERED}",
+    "end": rf"(is_)?{_END}|{_ONE}_({_END}|ends?)",
+    "start": rf"(is_)?first|{_ONE}_(first|starts?)|new_{_ONE}",
+    "length": rf"lengths|{_ONE}_len(gth)?s?",
+    "frame": rf"(frame|step|time_?step)s?{_NUMBERED}",
+    "other": r"index|task_index|row|_*index_level_0_*|unnamed:_0|(.+_)?(rewards?|success)|returns?(_to_go)?|discounts?",
+}
+_KIND = {kind: re.compile(pattern) for kind, pattern in _KINDS.items()}
+_ACTING = re.compile(r"actions?(\d*|[^a-z\d].*)", re.IGNORECASE)
+_UNITS = {1.0: "s sec secs seconds", 1e-3: "ms msec msecs milliseconds", 1e-6: "us usec usecs microseconds"}
+_UNITS |= {1e-9: "ns nsec nsecs nanosec nanosecs nanoseconds", 60.0: "min minutes"}
+UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
+_UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(UNITS)})[)\]]?")
+_WORDS = {"true": 1.0, "false": 0.0} | dict.fromkeys(("", "na", "n/a", "null", "none"), np.nan)
+
+
+def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of a table ``[T]`` or ``[T, d]``, numbered if there are several."""
+    table = np.asarray(values, dtype=np.float64)
+    table = table.reshape(len(table), int(np.prod(table.shape[1:])))
+    alone = table.shape[1] == 1
+    return {name if alone else f"{name}_{index}": table[:, index] for index in range(table.shape[1])}
+
+
+def kind_of(name: str) -> tuple[str | None, float]:
+    """What a column is by its name, None for a state; and of a clock its unit in seconds, 0.001 of "Time [ms]"."""
+    plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.strip()).lower().removeprefix("next.")
+    unit = _UNIT.fullmatch(plain)
+    if unit and _KIND["clock"].fullmatch(_joined(unit[1])):
+        return "clock", UNITS[unit[2]]
+    return next((kind for kind, pattern in _KIND.items() if pattern.fullmatch(_joined(plain))), None), 1.0
+
+
+def is_action(name: str) -> bool:
+    """Whether a column of a table is an action by its name: "action", "Action_0", "actions[1]"."""
+    return _ACTING.fullmatch(name) is not None
+
+
+def _joined(name: str) -> str:
+    return re.sub(r"[\s./#-]+", "_", name).strip("_")
+
+
+def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
+    """A column ``[T]`` of any type as float64; None if it holds no numbers.
+
+    Truths are 0 and 1, the dates of a clock in its unit, names of episodes numbered in the order in which they come.
+    """
+    (kind, unit), held = kind_of(name), values.dtype.kind
+    if held in "mM" and kind == "clock":
+        since = values.astype("datetime64[ns]") - np.datetime64(0, "ns") if held == "M" else values
+        return since / np.timedelta64(1, "s") / unit
+    if held in "fiub":
+        return values.astype(np.float64)
+    if held not in "SUO":
+        return None
+    plain = (value.decode(errors="replace") if isinstance(value, bytes) else value for value in values.tolist())
+    texts = ["" if value is None else str(value) for value in plain]
+    numbers = [number_of(text) for text in texts]
+    known = [number for number in numbers if number is not None]
+    if len(known) == len(numbers):
+        return np.array(known)
+    if kind == "episode":
+        order = {text: number for number, text in enumerate(dict.fromkeys(texts))}
+        return np.array([order[text] for text in texts], dtype=np.float64)
+    if kind != "clock" or known:
+        return None
+    try:
+        with warnings.catch_warnings():  # NumPy counts with zones of time, but warns of them
+            warnings.simplefilter("ignore")
+            return as_numbers(name, np.array(texts, dtype="datetime64[ns]"))
+    except ValueError:
+        return None
+
+
+def number_of(text: str) -> float | None:
+    """What text says: NaN if it is empty, 0 or 1 for a truth, None if it is no number."""
+    text = text.strip().lower()
+    try:
+        return _WORDS[text] if text in _WORDS else None if "_" in text else float(text)
+    except ValueError:
+        return None
