@@ -195,7 +195,7 @@ def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, 
     names = made_up if given is None else np.atleast_1d(given).astype(str).tolist()
     if len(names) != width or len(set(names)) != width:
         raise ValueError(f"{kind}_names must be {width} different names, got {', '.join(names)}")
-    return {name: column for name, column in zip(names, table.T.astype(np.float64), strict=True)}
+    return dict(zip(names, table.T.astype(np.float64), strict=True))
 
 
 def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:
