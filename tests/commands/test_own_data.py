@@ -71,7 +71,8 @@ def test_absolute_targets(arrays, tmp_path, capsys):
     assert koap("validate", tmp_path / "wrong") == 0
     printed = capsys.readouterr().out
     assert re.search("^action kind +delta .default.$", printed, re.MULTILINE)
-    assert printed.count("look like absolute targets; convert again with --action-kind absolute --targets q1 q2") == 2
+    assert re.search("^labels look +absolute: .+ .near a column; mean correlation 1", printed, re.MULTILINE)
+    assert printed.count("look like absolute targets; convert again with --action-kind absolute\n") == 2
     assert koap(*command, "--action-kind", "absolute") == 0
     assert "absolute targets" not in capsys.readouterr().out
     assert koap("train", "--dataset", tmp_path / "arm", "--out", tmp_path / "run", "--method", "linear", *TINY) == 0

@@ -5,20 +5,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from shared_data import SHARED
 
-from torchrl_koap.data import make_demonstrations
-from torchrl_koap.data.action_kinds import kind_warnings
+from torchrl_koap.data import make_demonstrations, read_recordings
+from torchrl_koap.data.action_kinds import describe_likely, kind_warnings, likely_kinds
 
 NOISE = np.random.default_rng(0).normal(size=(4, 60, 3))
 PATHS = [noise.cumsum(0) for noise in NOISE]
 DELTAS = [np.diff(path[:, :2], axis=0) for path in PATHS]
 TARGETS = [path[1:, :2] + 0.1 * noise[1:, :2] for path, noise in zip(PATHS, NOISE[::-1], strict=True)]
+NORMALISED = [np.tanh(0.2 * path[1:, :2] - 1) for path in PATHS]
 JOINTS = ("shoulder.pos", "elbow pos", "cup")
 
 
-def warnings(states, actions, names=JOINTS, acting=("a", "b"), **described):
+def demonstrations(states, actions, names=JOINTS, acting=("a", "b"), **described):
     described |= {"state_names": names, "action_names": acting, "control_hz": 10}
-    return list(kind_warnings(*make_demonstrations(states, actions, **described)))
+    return make_demonstrations(states, actions, **described)
+
+
+def warnings(*arguments, **described):
+    return list(kind_warnings(*demonstrations(*arguments, **described)))
 
 
 def test_targets_that_are_declared_as_changes():
@@ -38,7 +44,7 @@ def test_far_numbers_are_compared_as_the_robot_reports_them():
 def test_a_name_that_is_the_same_allows_for_targets_that_lie_farther_away():
     paths = [path + 50 for path in PATHS]
     ahead = [frames[1:, :2] + 3 * noise[1:, :2] for frames, noise in zip(paths, NOISE[::-1], strict=True)]
-    assert not warnings(paths, ahead)
+    assert warnings(paths, ahead)[0].endswith("--action-kind raw")
     assert "absolute --targets" in warnings(paths, ahead, acting=JOINTS[:2])[0]
 
 
@@ -63,5 +69,81 @@ def test_velocities_that_are_also_in_the_state_are_no_targets():
     assert not warnings(moving, steps, names=("q", "dq", "dp"), acting=("u",))
 
 
+@pytest.mark.parametrize(
+    ("actions", "kind", "said"),
+    [
+        (DELTAS, "delta", "near the change of a column"),
+        (TARGETS, "absolute", "near a column"),
+        (NORMALISED, "raw", "near neither"),
+    ],
+)
+def test_the_likely_kind_comes_with_its_numbers(actions, kind, said):
+    likely = likely_kinds(*demonstrations(PATHS, actions))
+    assert {name: each.kind for name, each in likely.items()} == {"a": kind, "b": kind}
+    column = np.corrcoef(np.concatenate(actions)[:, 0], np.concatenate([path[1:, 0] for path in PATHS]))[0, 1]
+    if kind != "delta":
+        assert likely["a"].follows_column == pytest.approx(column, abs=1e-5)
+        assert likely["a"].follows_column > likely["a"].follows_change
+    words = describe_likely(likely)
+    assert words.startswith(f"{kind}: a, b ({said}; mean correlation ")
+    assert f"{np.mean([each.follows_column for each in likely.values()]):.2f} with a column" in words
+
+
+def test_an_action_that_never_changes_is_of_no_kind():
+    steps = [np.column_stack([step[:, 0], np.ones(len(step))]) for step in DELTAS]
+    assert list(likely_kinds(*demonstrations(PATHS, steps))) == ["a"]
+
+
+def test_normalised_targets_are_raw():
+    (said,) = warnings(PATHS, NORMALISED)
+    assert said.startswith("2 of 2 actions follow columns of the state and not their changes (mean correlation 0.")
+    assert said.endswith("convert again with --action-kind raw")
+    assert not warnings(PATHS, NORMALISED, action_kind="raw")
+
+
+def test_targets_in_other_units_than_their_columns_are_raw():
+    degrees = [57.3 * steps for steps in TARGETS]
+    said = warnings(PATHS, degrees, action_kind="absolute", targets=JOINTS[:2])
+    assert len(said) == 2 and all(each.endswith("or convert again with --action-kind raw") for each in said)
+    assert "away from its target 'shoulder.pos' on average, which spreads by" in said[0]
+    offset = [steps + 90 for steps in TARGETS]
+    assert not warnings(PATHS, offset, action_kind="absolute", targets=JOINTS[:2])
+
+
+def test_raw_actions_that_are_something_better():
+    assert warnings(PATHS, TARGETS, action_kind="raw")[0].endswith(
+        "they look like absolute targets; convert again with --action-kind absolute --targets shoulder.pos 'elbow pos'"
+    )
+    (said,) = warnings(PATHS, DELTAS, action_kind="raw")
+    assert said.startswith("actions follow changes of columns") and said.endswith("--action-kind delta")
+    assert not warnings(PATHS, TARGETS, action_kind=["delta", "raw"])[1:]
+
+
+def test_targets_that_are_the_robots_columns_need_not_be_named():
+    assert warnings(PATHS, TARGETS, robot=[0, 1])[0].endswith("convert again with --action-kind absolute")
+
+
 def test_few_labels_say_nothing():
     assert not warnings([PATHS[0][:10]], [TARGETS[0][:9]])
+    assert not likely_kinds(*demonstrations([PATHS[0][:10]], [TARGETS[0][:9]]))
+
+
+GROUNDS = SHARED / "proving_grounds"
+
+
+@pytest.mark.skipif(not GROUNDS.is_dir(), reason="no shared/proving_grounds")
+class TestDataOfOthers:
+    def test_joint_targets_of_a_humanoid_are_absolute(self):
+        data, task = make_demonstrations(read_recordings(GROUNDS / "unitree_g1"))
+        assert {each.kind for each in likely_kinds(data, task).values()} == {"absolute"}
+        assert [said.endswith("convert again with --action-kind absolute") for said in kind_warnings(data, task)] == [
+            True
+        ]
+
+    def test_normalised_joint_targets_of_a_hand_are_raw(self):
+        with np.load(GROUNDS / "adroit_door_human_25.npz") as arrays:
+            ends = arrays["episode_ends"][:-1]
+            states, actions = (np.split(arrays[name], ends) for name in ("observations", "actions"))
+        data, task = make_demonstrations(states, actions, control_hz=25)
+        assert {each.kind for each in likely_kinds(data, task).values()} == {"raw"}
+        assert [said[-17:] for said in kind_warnings(data, task)] == ["--action-kind raw"]

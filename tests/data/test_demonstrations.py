@@ -19,6 +19,9 @@ from torchrl_koap.data import (
 )
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import Action, Task
+from torchrl_koap.training import TrainConfig, resolve
+from torchrl_koap.training.closed_form import axes_of
+from torchrl_koap.training.policy_facts import command_ranges, commanded_columns
 
 RANDOM = np.random.default_rng(0)
 STATES = [RANDOM.normal(size=(30, 4)).cumsum(0) for _ in range(3)]
@@ -73,6 +76,16 @@ def test_every_action_may_be_of_its_own_kind():
     assert task.delta_actions == (0,) and task.targets == ()
 
 
+def test_raw_actions_are_about_no_column():
+    data, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="raw", robot=[0, 1], command=[2, 3])
+    assert {(action.kind, action.column) for action in task.actions.values()} == {("raw", None)}
+    assert not task.targets and not task.delta_actions and task.action_rule is None
+    assert axes_of(task, (0, 1)) == {"axes": [], "guessed": True} and commanded_columns(task) is None
+    assert resolve(TrainConfig(out="run"), task).controller.preset == "absolute"  # centred, read off the present frame
+    labels = data["action"][data["has_action"].squeeze(-1)]
+    assert command_ranges(task, data) == [[float(x.min()), float(x.max())] for x in labels.T]
+
+
 def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
     """What it is shown, and what the policy adds again, are inverse to each other."""
     targets = [STATES[0][:-1, :2] + ACTIONS[0], None, None]
@@ -103,6 +116,7 @@ def test_no_labels_at_all():
         ({"robot": [0, 0]}, "robot holds q1 more than once"),
         ({"action_kind": "absolute"}, "absolute actions have 2 columns, the robot's columns are 4: name in targets"),
         ({"action_kind": "absolute"}, r"\(--targets\) the column that each action is the target of \(known: .+, .+\)"),
+        ({"action_kind": "raw", "targets": [0, 1]}, "targets are for action_kind='absolute'"),
         ({"targets": [0, 1]}, "targets are for action_kind='absolute'"),
         ({"action_kind": "absolute", "targets": [0, 3], "command": [3]}, "column 'cup_y' is a target and a command"),
         ({"action_units": ["m"]}, "action_units names 1 columns, there are 2"),

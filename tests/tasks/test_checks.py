@@ -26,7 +26,7 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
         ({"actions": {"x": "m"}}, r"actions: wanted 'x': Action\('m'\), got 'm'"),
         (
             {"actions": {"x": Action(kind="change")}},
-            "actions: 'x' is of kind 'change'; known: delta, absolute, gripper",
+            "actions: 'x' is of kind 'change'; known: delta, absolute, raw, gripper",
         ),
         ({"actions": {"x": Action(column=5)}}, "actions: the state has 5 columns, got 5"),
         ({"actions": {"x": Action("m", "absolute", 0), "y": Action()}}, "name the column .* or none names one"),

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.commands.options import Command
 from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations, write_recordings
+from torchrl_koap.data.action_kinds import describe_likely, likely_kinds
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings
 from torchrl_koap.data.quality import drop_short, find_warnings, plan_coverage, trim_still
@@ -141,9 +142,9 @@ class Convert(Command):
         drop_short: leave out trajectories that are shorter than a window.
         robot: state columns of the robot itself, which the controller reads (default: all that are no command).
         command: neighbouring columns that repeat the last command; nothing that learns sees them.
-        action_kind: of each action column, or one for all: "delta" (velocities, efforts, changes) or "absolute"
-            (targets of state columns); with --resample "change" (over one frame, summed) or "velocity" (or effort,
-            held) instead of "delta" (default: delta).
+        action_kind: of each action column, or one for all: "delta" (velocities, efforts, changes), "absolute" (targets
+            of state columns) or "raw" (neither, such as normalised targets); with --resample "change" (over one frame,
+            summed) or "velocity" (or effort, held) instead of "delta" (default: delta).
         targets: for absolute actions the state column that each is the target of (default: the robot's).
         action_units: unit of each action column, or one for all.
         state_units: unit of each state column, or one for all.
@@ -194,6 +195,7 @@ class Convert(Command):
             "steps": len(data),
             **_contents(recordings),
             "action kind": ", ".join(self.action_kind) or "delta (default)",
+            "labels look": describe_likely(likely_kinds(data, task)) or "like no kind: too few",
             "skipped": ", ".join(recordings.skipped) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],

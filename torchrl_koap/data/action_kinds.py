@@ -1,10 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Whether actions are of the kind that their task declares: changes, or absolute targets of state columns."""
+"""Which kind actions are of by their labels, and whether that is the kind that their task declares."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -12,18 +13,73 @@ from tensordict import TensorDictBase
 from torchrl_koap import keys
 from torchrl_koap.files import some
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.action_rules import ActionKind
 
 NEAR, NAMED = 0.3, 1.0  # share of a column's spread within which its targets lie; likewise if they bear its name
 NEARER = 3.0  # times as far from one reading of an action as from the other
+CLEARER = 2.0  # times as much that one reading leaves unexplained as the other
+FOLLOWS = 0.8  # correlation with a change that no level explains away
 FEW, MANY = 20, 20_000  # labels below which nothing is said, and that are looked at
+
+
+@dataclass(frozen=True)
+class LikelyKind:
+    """What an action column looks like by its labels.
+
+    Args:
+        kind (str): ``"absolute"``: it lies near a state column; ``"delta"``: it follows the change of one; ``"raw"``:
+            neither.
+        column (int): the state column that it lies nearest to, in units of that column's spread.
+        distance (float): how far from there, on average.
+        follows_column (float): largest correlation with a state column, between 0 and 1.
+        follows_change (float): largest correlation with the change of one.
+    """
+
+    kind: ActionKind
+    column: int
+    distance: float
+    follows_column: float
+    follows_change: float
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """Labelled steps ``[n]``: the actions ``[n, a]``, what followed ``[n, d]`` and how it changed ``[n, d]``."""
+
+    actions: np.ndarray
+    level: np.ndarray
+    change: np.ndarray
+    names: list[str]  # of the columns
+
+
+def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
+    """Guesses the kind of every action from its labels.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` in the storage layout.
+        task (Task): what they are of.
+
+    Returns:
+        dict: by the name of the action; none below 20 labels, and none of an action that never changes.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data import make_demonstrations
+        >>> from torchrl_koap.data.action_kinds import likely_kinds
+        >>> path = np.sin(np.arange(30.0))[:, None]
+        >>> likely_kinds(*make_demonstrations([path], [np.diff(path, axis=0)], control_hz=10))["action_0"].kind
+        'delta'
+    """
+    labels = _labels(data, task)
+    return {} if labels is None else _likely(labels, task)
 
 
 def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     """Finds actions that contradict their kind.
 
-    Changes that lie at the next value of a state column look like absolute targets, unless they are velocities by what
-    another column does. Absolute targets that lie at the change of their column, per frame or per second, look like
-    changes.
+    Changes look wrong where they lie at the next value of a state column, or follow columns more than their changes;
+    absolute targets where they lie at the change of their column, per frame or per second, or far from the column; raw
+    actions where all of them are near columns, or all follow changes.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout.
@@ -37,9 +93,54 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
         >>> list(kind_warnings(*make_demonstrations([path], [path[1:]], control_hz=10)))[0][:51]
         'actions lie within 0 of state_0 on average: they lo'
     """
+    labels = _labels(data, task)
+    if labels is None:
+        return
+    yield from _targets_far_away(labels, task)
+    likely = _likely(labels, task)
+    kinds = {name: action.kind for name, action in task.actions.items()}
+    aimed = {name for name, each in likely.items() if each.kind == "absolute"}
+    wrong = {name for name in aimed if kinds[name] == "delta"}
+    wrong |= aimed if len(aimed) == task.action_dim and set(kinds.values()) == {"raw"} else set()
+    if wrong:
+        reached = [labels.names[likely[name].column] for name in kinds if name in wrong]
+        asked = " ".join("absolute" if name in wrong else kind for name, kind in kinds.items())
+        if len(wrong) == task.action_dim:
+            usual = [likely[name].column for name in kinds] == list(task.robot)
+            asked = "absolute" if usual else f"absolute --targets {shlex.join(reached)}"
+        yield (
+            f"actions lie within {max(likely[name].distance for name in wrong):.2g} of {some(reached)} on average: they"
+            f" look like absolute targets; convert again with --action-kind {asked}"
+        )
+    changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
+    still = [each for each in changes if each.kind == "raw" and _clear(each.follows_column, each.follows_change)]
+    if 2 * len(still) > len(changes):
+        yield (
+            f"{len(still)} of {task.action_dim} actions follow columns of the state and not their changes"
+            f" ({_correlations(still)}): they look like neither changes nor targets; convert again with"
+            " --action-kind raw"
+        )
+    raw = [each for name, each in likely.items() if kinds[name] == "raw"]
+    if len(raw) == task.action_dim and all(each.kind == "delta" for each in raw):
+        yield f"actions follow changes of columns ({_correlations(raw)}): convert again with --action-kind delta"
+
+
+def describe_likely(likely: dict[str, LikelyKind]) -> str:
+    """Returns what :func:`likely_kinds` found in words, with its numbers."""
+    found: dict[str, list[str]] = {}
+    for name, each in likely.items():
+        found.setdefault(each.kind, []).append(name)
+    said = {"absolute": "near a column", "delta": "near the change of a column", "raw": "near neither"}
+    return "; ".join(
+        f"{kind}: {some(names)} ({said[kind]}; {_correlations([likely[name] for name in names])})"
+        for kind, names in found.items()
+    )
+
+
+def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
     labelled = data.get(keys.HAS_ACTION).squeeze(-1).nonzero().squeeze(-1)
     if len(labelled) < FEW:
-        return
+        return None
     rows = data[labelled[:: 1 + len(labelled) // MANY]]
     before, after, actions = (
         rows.get(key).double().cpu().numpy() for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION, keys.ACTION)
@@ -47,32 +148,68 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))
     seen = list(task.state_columns)
     names = [task.observation_names[column] for column in seen]
-    level, change = (after + origin)[:, seen], (after - before)[:, seen]
-    targets: dict[int, int] = {}
-    gaps: list[float] = []
-    for index, (name, action) in enumerate(task.actions.items()):
-        steps = (actions + added)[:, index, None]
-        at, moved, speed = (np.abs(steps - there).mean(0) for there in (level, change, change * task.control_hz))
-        if action.kind == "absolute" and action.column is not None:
-            near = min(moved[action.column], speed[action.column])
-            if NEARER * near < at[action.column]:
-                yield (
-                    f"absolute action {name!r} is {at[action.column]:.2g} away from its target"
-                    f" {names[action.column]!r} on average and {near:.2g} from its change: it looks like a change or a"
-                    " velocity; convert again with --action-kind delta"
-                )
-        elif action.kind == "delta" and speed.min() > NEAR * steps.std():
-            share = np.where([column == name for column in names], NAMED, NEAR) * level.std(0)
-            fits = np.flatnonzero((at < share) & (NEARER * at < moved))
-            if len(fits):
-                targets[index] = int(fits[(at / share)[fits].argmin()])
-                gaps.append(at[targets[index]])
-    if not targets:
-        return
-    reached = [names[column] for column in targets.values()]
-    kinds = ["absolute" if index in targets else action.kind for index, action in enumerate(task.actions.values())]
-    asked = " ".join(kinds) if len(targets) < task.action_dim else f"absolute --targets {shlex.join(reached)}"
-    yield (
-        f"actions lie within {max(gaps):.2g} of {some(reached)} on average: they look like absolute targets; convert"
-        f" again with --action-kind {asked}"
+    return _Labels(actions + added, (after + origin)[:, seen], (after - before)[:, seen], names)
+
+
+def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
+    found: dict[str, LikelyKind] = {}
+    spread = labels.level.std(0)
+    for name, steps in zip(task.actions, labels.actions.T, strict=True):
+        if not np.ptp(steps):
+            continue
+        level, change = (_correlation(steps, columns) for columns in (labels.level, labels.change))
+        distance, *others = (np.abs(steps[:, None] - there).mean(0) for there in _readings(labels, task))
+        room = np.where([column == name for column in labels.names], NAMED, NEAR) * spread
+        moves = min(map(np.min, others)) <= NEAR * steps.std()
+        fits = np.flatnonzero((distance < room) & _clear(level, change.max()) & (not moves))
+        share = np.divide(distance, room, out=np.full_like(room, np.inf), where=room > 0)
+        moves = moves or change.max() > FOLLOWS or _clear(change.max(), level.max())
+        kind: ActionKind = "absolute" if len(fits) else "delta" if moves else "raw"
+        column = int(fits[share[fits].argmin()] if len(fits) else share.argmin())
+        found[name] = LikelyKind(kind, column, float(distance[column]), float(level.max()), float(change.max()))
+    return found
+
+
+def _targets_far_away(labels: _Labels, task: Task) -> Iterator[str]:
+    """Absolute actions that are nearer to the change of their column, or farther from it than the column moves."""
+    for (name, action), steps in zip(task.actions.items(), labels.actions.T, strict=True):
+        if action.kind != "absolute" or action.column is None:
+            continue
+        level, target = labels.level[:, action.column], labels.names[action.column]
+        away, *others = (np.abs(steps - there[:, action.column]).mean() for there in _readings(labels, task))
+        if NEARER * min(others) < away:
+            yield (
+                f"absolute action {name!r} is {away:.2g} away from its target {target!r} on average and"
+                f" {min(others):.2g} from its change: it looks like a change or a velocity; convert again with"
+                " --action-kind delta"
+            )
+        elif min(away, (steps - level).std()) > NAMED * level.std() and np.ptp(steps):
+            yield (
+                f"absolute action {name!r} is {away:.2g} away from its target {target!r} on average, which spreads by"
+                f" {level.std():.2g}: name another in --targets, or convert again with --action-kind raw"
+            )
+
+
+def _readings(labels: _Labels, task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What actions may be equal to: the next columns, their changes over a frame, and these per second."""
+    return labels.level, labels.change, labels.change * task.control_hz
+
+
+def _correlation(steps: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Size of the correlation of an action ``[n]`` with columns ``[n, d]``, 0 for one that never moves."""
+    columns = columns - columns.mean(0)
+    size = np.sqrt((columns**2).mean(0))
+    moves = size > 1e-12 * np.abs(columns).max(initial=1.0)
+    return np.abs((steps - steps.mean()) @ columns / len(steps)) / np.where(moves, steps.std() * size, np.inf)
+
+
+def _clear(one: np.ndarray | float, other: np.ndarray | float) -> np.ndarray | bool:
+    """Whether a correlation explains an action clearly better than another one."""
+    return CLEARER * (1 - one) < 1 - other
+
+
+def _correlations(likely: list[LikelyKind]) -> str:
+    columns, changes = (
+        np.mean([getattr(each, name) for each in likely]) for name in ("follows_column", "follows_change")
     )
+    return f"mean correlation {columns:.2f} with a column, {changes:.2f} with its change"

@@ -27,7 +27,7 @@ from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
 # what a user calls the kind of an action, and the kind that it is when its rate is settled
-ACTION_KINDS: dict[str, ActionKind] = {name: "absolute" if name == "absolute" else "delta" for name in ADDS_UP}
+ACTION_KINDS: dict[str, ActionKind] = dict.fromkeys(ADDS_UP, "delta") | {"absolute": "absolute", "raw": "raw"}
 _COARSE = 1e-5  # share of a column's range to which float32 has to hold it
 _SLACK = 1.5  # episodes may be that much longer than the longest demonstration
 
@@ -108,9 +108,10 @@ def make_demonstrations(
         command (sequence of str or int): neighbouring columns that repeat the last command. Their differences are the
             actions, so nothing that learns ever sees them.
         action_kind (str, or sequence of str): ``"delta"``, velocities, efforts or changes: small where the robot stands
-            still; or ``"absolute"``, targets of the columns ``targets``. One for all actions or one for each, such as
-            of a gripper that is commanded by its width beside joints that are commanded by changes. ``"change"`` (over
-            one frame) and ``"velocity"`` (or effort) say which ``"delta"`` is meant, as ``resample`` needs to know.
+            still; ``"absolute"``, targets of the columns ``targets``; or ``"raw"``, what no state column is moved by or
+            near to, such as torques or normalised targets. One for all actions or one for each, such as of a gripper
+            that is commanded by its width beside joints that are commanded by changes. ``"change"`` (over one frame)
+            and ``"velocity"`` (or effort) say which ``"delta"`` is meant, as ``resample`` needs to know.
         targets (sequence of str or int, optional): where all actions are absolute, the state column that each is the
             target of. Default: the robot's columns, if there are as many.
         resample (float, optional): frames per second that are wanted, where ``control_hz`` is that of the arrays; see
@@ -264,7 +265,7 @@ def _targets(
     problems: list[str],
 ) -> list[int]:
     """State columns that absolute actions are the targets of."""
-    if "delta" in kinds:
+    if set(kinds) != {"absolute"}:
         if given is not None:
             problems.append("targets are for action_kind='absolute'")
         return []

@@ -21,7 +21,7 @@ PLANNED_OPEN_ABOVE = 0.07  # m; half way from a box held to fingers open: plans 
 OPEN = 0.08
 OPENING = 5  # control steps that the fingers need to open
 _MOVES = 1e-4
-ActionKind = Literal["delta", "absolute", "gripper"]
+ActionKind = Literal["delta", "absolute", "raw", "gripper"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class Action:
     Args:
         unit (str): such as ``"m"``, ``"rad"``, ``"N"`` or ``""``; errors are averaged over columns of one unit.
         kind (str): ``"delta"``: a change of a command, a velocity or an effort, small where the robot stands still;
-            ``"absolute"``: a command itself; ``"gripper"``: an absolute one that is read off planned widths.
+            ``"absolute"``: a command itself; ``"raw"``: anything else, such as a normalised target, of which nothing is
+            assumed; ``"gripper"``: an absolute one that is read off planned widths.
         column (int, optional): state column that a ``"delta"`` moves, that an ``"absolute"`` action is the target of
             (controllers then decode the distance to it), or in which a ``"gripper"`` tells its width.
         constant (float, optional): what it always is, whatever is decoded. Default: it differs.

@@ -50,6 +50,11 @@ def _action_faults(task: Task) -> list[str]:
     with_target = [action.kind == "absolute" and action.column is not None for action in task.actions.values()]
     if any(with_target) and not all(with_target):
         faults.append("actions: all are absolute and name the column that they are the target of, or none names one")
+    faults += [
+        f"actions: {name!r} is raw, of which no column is known, got column {action.column}"
+        for name, action in task.actions.items()
+        if action.kind == "raw" and action.column is not None
+    ]
     if sum(action.kind == "gripper" for action in task.actions.values()) > 1:
         faults.append("actions: at most one is a gripper")
     return faults

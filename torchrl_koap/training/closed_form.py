@@ -65,7 +65,7 @@ def axes_of(task: Task, columns: Sequence[int]) -> dict[str, Any]:
     known = task.moved_columns()
     if known:
         return {"axes": list(known), "guessed": False}
-    moved = task.targets or task.robot
+    moved = task.targets or (task.robot if task.delta_actions else ())
     if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
         moved = ()
     return {"axes": [list(columns).index(column) for column in moved], "guessed": True}

@@ -71,7 +71,7 @@ def commanded_columns(task: Task) -> dict[str, list[int]] | None:
     if task.command is None:
         return None
     commands = list(range(task.observation_dim))[task.command_columns][: len(actions)]
-    if not len(actions) == len(moved) == len(commands):
+    if not actions or not len(actions) == len(moved) == len(commands):
         return None
     return {"states": moved, "commands": commands, "actions": actions}
 
@@ -108,7 +108,7 @@ def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]
             for column in changes:
                 ranges[column] = [-largest, largest]
     for column, meaning in enumerate(meanings):
-        if meaning.kind == "absolute":
+        if meaning.kind in ("absolute", "raw"):
             numbers = labelled[:, column]
             numbers = numbers if meaning.column is None else torch.cat([numbers, data[STATE][:, meaning.column]])
             ranges[column] = [float(numbers.min()), float(numbers.max())]

@@ -14,7 +14,7 @@ from torchrl_koap.files import DataError, some
 from torchrl_koap.lookup import lookup
 
 # kinds of actions by name: whether they add up over the frames of a longer step; None where the name does not tell
-ADDS_UP = {"delta": None, "change": True, "velocity": False, "absolute": False}
+ADDS_UP = {"delta": None, "change": True, "velocity": False, "absolute": False, "raw": False}
 LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
 MOST = 2.0  # new frames in one recorded step
 _LEVELS = 10  # a column of no more integers is a switch
