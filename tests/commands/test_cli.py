@@ -30,8 +30,7 @@ from torchrl_koap.runs.run_directory import RunDirectory
         (["eval", "x", "--episode", "3"], "--episodes"),
         (["train"], "--out"),
         (["trian"], "train"),
-        ([], "train"),
-        (["train", "--out", "x", "--steps", "many"], "--planner.steps"),
+        (["train", "--out", "x", "--device"], "--device"),
     ],
 )
 def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
@@ -51,12 +50,22 @@ def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
         ("convert x --control-h 30", "unknown option of koap convert: '--control-h'; did you mean '--control-hz'?"),
         ("validate x --foo", "unknown option of koap validate: '--foo'; known: --help, --quiet, --task, --plugin"),
         ("trian --steps 5", "unknown command 'trian'; did you mean 'train'?"),
+        ("train --out x --steps many", "--steps must be a whole number, got 'many'"),
+        ("train --out x --seed=1.5", "--seed must be a whole number, got '1.5'"),
+        ("convert x --out y --control-hz fast", "--control-hz must be a number, got 'fast'"),
+        ("curve --out x --labels 0.1 few", "--labels must be a number, got 'few'"),
     ],
 )
-def test_a_wrong_name_gets_the_nearest_of_its_command(call, said, capsys):
+def test_a_wrong_word_gets_one_line(call, said, capsys):
     with pytest.raises(SystemExit) as left:
         koap(*call.split())
     assert left.value.code == 2 and capsys.readouterr().err == f"koap: {said}\n"
+
+
+def test_no_word_at_all_shows_every_command(capsys):
+    assert koap() == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("usage: koap COMMAND") and "koap bench --table 1" in err
 
 
 def help_of(capsys, *words):

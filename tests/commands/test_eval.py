@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 from tiny_runs import koap
@@ -30,7 +31,9 @@ def test_what_an_evaluation_writes(copied_run, capsys):
     assert tensors["length"].tolist() == [row["steps"] for row in rows] and about["task"] == "avoiding"
     assert (copied_run / "index.html").stat().st_size > 1000
     out = capsys.readouterr().out
-    assert "rates success" in out and "labels_read_outside_budget" in out and "mean_action" not in out
+    lines = dict(line.split("  ", 1) for line in out.splitlines() if "  " in line)
+    assert re.fullmatch(r" *\d+\.\d %; 95 % interval .* %, \d of 3 rollouts", lines["success"])
+    assert "always the mean action" in lines["action error, 2 columns"] and "{" not in out
 
 
 def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstrations, no_report, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 
 import pytest
@@ -73,7 +74,7 @@ def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
     page = write_report(run).read_text()
     pictures = {path.name for path in (run / "plots").iterdir()}
     assert {"plan_errors.png", "action_errors.png", "demonstrations.png", "losses.png"} <= pictures
-    for word in ("plan error, energy score", "action error, 7 columns", "mrad", "plans are worse than standing still"):
+    for word in ("plan error, 14 columns", "action error, 7 columns", "mrad", "plans are worse than standing still"):
         assert word in page
     for word in ("rollouts.png", "Executed rollouts", " mm", "x (m)", "--episodes 60", "koap inspect"):
         assert word not in page
@@ -91,8 +92,11 @@ def test_latent_space_and_suggestions(run):
 def test_the_command_says_it_in_words(run, capsys):
     assert main(["eval", str(run), "--samples", "2", "--threads", "1", "--no-report"]) == 0
     out = capsys.readouterr().out
-    assert "plans, energy score (mrad): planner" in out and "actions, left out, RMSE (mrad): controller" in out
-    assert "FAULT: plans are worse than standing still" in out and "closed loop by a linear model of the labels" in out
+    rows = dict(re.split("  +", line, maxsplit=1) for line in out.splitlines())
+    assert " mrad; energy score; standing still " in rows["plan error, 14 columns"]
+    assert rows["action error, 7 columns"].endswith(" labels of recordings left out of the fit")
+    assert rows["FAULT 1"].startswith("plans are worse than standing still") and "--steps" in rows["FAULT 1"]
+    assert "steps on a linear model of the robot" in rows["largest command in a closed loop"]
 
 
 def test_a_single_column_with_labels_outside_the_budget(tmp_path):
@@ -125,7 +129,7 @@ def test_a_policy_of_its_own_is_judged_by_its_first_actions(tmp_path, capsys):
     arm = save_arm(tmp_path / "arm", labelled=6, joints=2)
     run = train_arm(tmp_path / "run", arm, method="dp", labels=LabelConfig(count=3), planner={"steps": 30})
     assert main(["eval", str(run), "--samples", "3", "--threads", "1"]) == 0
-    assert "actions, outside budget, RMSE (mrad): controller" in capsys.readouterr().out
+    assert re.search(r"action error, 2 columns .* labels outside the budget\n", capsys.readouterr().out)
     result = json.loads((run / "eval.json").read_text())
     outside = result["action_errors"]["outside_budget"]
     assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 3
@@ -176,5 +180,6 @@ def test_a_controller_worse_than_the_mean_is_a_fault():
     assert [row["episode"] for row in found["trajectory"]] == [4, 5]
     faults = offline_faults({"note": ""}, {"left_out": found, "outside_budget": {"note": ""}})
     assert faults == [
-        "action b is worse than always giving its mean (labelled trajectories left out): 2e+03 against 1e+03 mrad"
+        "action b is worse than always giving its mean (each labelled recording left out in turn): 2000 against 1000"
+        " mrad; check --action-kind, or label a recording that moves it"
     ]

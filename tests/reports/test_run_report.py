@@ -35,8 +35,8 @@ def test_headline_has_intervals_and_n(run):
     for wanted in (
         "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts",
         f"0.22 2 of 24 modes; a uniform choice averages {expected_entropy(2, 24):.2f}, n = 2",
-        "action error, 2 columns 0.91 mm ridge 1.04, mean action 3, n = 20 labels, outside budget",
-        "400 Hz 8.5 ms per plan, 0.5 ms per control step",
+        "action error, 2 columns 0.91 mm root mean square; ridge regression 1.04, always the mean action 3; 20 labels",
+        "time of a plan 8.5 ms then 0.5 ms per control step; the robot's step has 35 ms",
         "Outside the budget, for evaluation only: 20 labels",
     ):
         assert wanted in text
@@ -44,7 +44,7 @@ def test_headline_has_intervals_and_n(run):
 
 def test_order_headline_labels_pictures_commands(run):
     text = Page(run / "index.html").text
-    places = [text.index(word) for word in ("Result", "Labels", "Executed rollouts", "All numbers", "Do it again")]
+    places = [text.index(word) for word in ("Result", "Training", "Executed rollouts", "All numbers", "Do it again")]
     assert places == sorted(places)
     assert "koap train --out 'a folder'" in text
     solver = "--episodes 4 --seed 100 --strategy feedback --replan-interval 4"

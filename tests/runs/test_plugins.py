@@ -67,7 +67,7 @@ def test_what_reads_the_run_imports_the_plugin_by_itself(run, tmp_path, monkeypa
     shutil.copytree(run, out)
     search_path.append(str(PLUGINS))
     assert koap("eval", out, "--episodes", 1, "--threads", 1, "--no-report") == 0 and NAME in METHODS
-    assert "rates success" in capsys.readouterr().out
+    assert "95 % interval" in capsys.readouterr().out
     weights = (out / "controller.safetensors").read_bytes()
     (out / "controller.safetensors").unlink()
     # found in the current directory as well, as by `python -m`

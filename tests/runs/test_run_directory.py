@@ -29,8 +29,8 @@ def test_rows_are_read_back(run):
     rows = run.read_metrics()
     assert tuple(rows[0]) == ("phase", "step", "loss_planner", "loss_action")
     assert rows[1]["loss_planner"] == "0.1" and rows[1]["loss_action"] == ""
-    assert run.last_metrics("planner") == {"loss_planner": 0.15}
-    assert run.last_metrics("controller") == {"loss_action": 0.1}
+    assert run.last_metrics("planner") == {"loss_planner": 0.15, "updates": 150}
+    assert run.last_metrics("controller") == {"loss_action": 0.1, "updates": 100}
     assert run.last_metrics("other") == {}
 
 
@@ -113,7 +113,7 @@ def test_a_new_value_gets_a_column_and_earlier_rows_stay(tmp_path):
         "controller,50,,0.25,1.0",
         "controller,100,,0.125,0.5",
     ]
-    assert run.last_metrics("controller") == {"loss_mine": 0.125, "learning_rate": 0.5}
+    assert run.last_metrics("controller") == {"loss_mine": 0.125, "learning_rate": 0.5, "updates": 100}
 
 
 def test_a_half_written_checkpoint_is_taken_away_by_the_next_one_who_works_there(tmp_path):

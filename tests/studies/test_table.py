@@ -9,7 +9,15 @@ import pytest
 from tiny_runs import read_csv
 
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.studies.table import CELL_COLUMNS, Measure, markdown_table, summarise, table_rows, write_csv
+from torchrl_koap.studies.table import (
+    CELL_COLUMNS,
+    Measure,
+    markdown_table,
+    result_rows,
+    summarise,
+    table_rows,
+    write_csv,
+)
 
 
 def cell(method="koap", labels=0.02, seed=0, *, successes=20, episodes=30, **more):
@@ -76,6 +84,18 @@ def test_seeds_are_pooled():
     assert item.mean("mode_entropy") == pytest.approx(0.55)
     assert item.measures["action_error"] == Measure(1.5, 1.0, 2.0)
     assert item.mean("labelled_transitions") == 320.5 and item.mean("relative_plan_error") is None
+
+
+def test_a_terminal_shows_success_or_the_action_error():
+    offline = {"episodes": None, "successes": None, "relative_action_error": 0.022, "kind": "offline"}
+    rows = [cell(seed=0, successes=30), cell(seed=1, successes=15), failed(labels=0.1), cell("linear") | offline]
+    assert result_rows(rows) == {
+        "avoiding, koap, 2 % labels": "success 75.0 % (62.8-84.2), n = 60",
+        "avoiding, linear, 2 % labels": "action error 2.2 % of the mean action's",
+        "avoiding, koap, 10 % labels": "no training done",
+    }
+    (name,) = result_rows([cell(demonstrations=0.5)])
+    assert name == "avoiding, koap, 2 % labels, 50 % of the demonstrations"
 
 
 def test_nothing_is_pooled_that_differs():

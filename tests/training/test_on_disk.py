@@ -206,7 +206,7 @@ def test_a_policy_is_evaluated_without_a_planner(policy_run, tmp_path, capsys):
     assert result["rates"]["success"]["rate"] == sum(row["outcome"] == "success" for row in result["episode"]) / 2
     rollouts = load_tensors(out / "rollouts.safetensors")[0]
     assert rollouts["length"].tolist() == [row["steps"] for row in result["episode"]]
-    assert "rates success" in capsys.readouterr().out
+    assert "95 % interval" in capsys.readouterr().out
 
 
 def test_a_policy_spends_the_labels_it_was_given(policy_run):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import sys
 import traceback
@@ -33,7 +32,7 @@ from torchrl_koap.commands.shell import (
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
 HINT = "KOAP_TRACEBACK=1 shows where"
-_LONG = ("episode", "action_errors")  # entries of a result that are not printed
+_SHORT = 8  # entries of a list that is printed whole
 _MAY_BE_EMPTY = ("--action-units", "--state-units")  # the unit of a number without one
 
 
@@ -74,9 +73,9 @@ def _run(arguments: Sequence[str]) -> int:
     _check_words(arguments)
     options, subcommands, without_progress_bars = _commands()
     with written_output(), wide_enough():
-        if arguments[:1] in (["-h"], ["--help"]):
-            print(subcommands.overview())
-            return 0
+        if not arguments or arguments[0] in ("-h", "--help"):
+            print(subcommands.overview(), file=sys.stdout if arguments else sys.stderr)
+            return 0 if arguments else 2
         command = _parsed(options, subcommands.Subcommand, arguments)
     options.check_options(command)
     with without_progress_bars() if command.quiet else nullcontext():
@@ -99,7 +98,7 @@ def _parsed(options: Any, kind: Any, arguments: Sequence[str]) -> Any:
                 raise error from None
             error = error.__cause__ or error.__context__
     try:
-        options.check_names(kind, arguments)
+        options.check_call(kind, arguments)
     except ValueError as error:
         _complain(str(error))
         raise SystemExit(2) from None
@@ -169,31 +168,35 @@ def _complain(message: str) -> None:
 
 
 def _show(result: Any) -> None:
-    """Prints a result: a table of names and values, without the rows of single episodes or action columns."""
+    """Prints a result: a table of names and values."""
     if not isinstance(result, Mapping):
         print(result)
         return
-    lines = [line for key, value in result.items() if key not in _LONG for line in _lines(key, value)]
+    lines = [line for key, value in result.items() for line in _lines(key, value)]
     width = min(max((len(name) for name, _ in lines), default=0), 45)
     for name, text in lines:
         print(f"{name:<{width}}  {text}")
 
 
-def _lines(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+def _lines(name: str, value: Any) -> Iterator[tuple[str, str]]:
     """A line per value; a mapping of plain values is one line, a nested one a line for each of its entries."""
     if isinstance(value, Mapping) and any(isinstance(entry, Mapping) for entry in value.values()):
         for key, entry in value.items():
             yield from _lines(f"{name} {key}", entry)
     elif isinstance(value, Mapping):
-        yield name, json.dumps({key: _short(entry) for key, entry in value.items()})
+        yield name, ", ".join(f"{key.replace('_', ' ')} {_words(entry)}" for key, entry in value.items())
     else:
-        yield name, _short(value)
+        yield name, _words(value)
 
 
-def _short(value: Any) -> Any:
+def _words(value: Any) -> str:
+    """A value as words; of a long list the first few entries and how many there are."""
     if isinstance(value, list):
-        return [_short(entry) for entry in value]
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+        shown = " ".join(map(_words, value if len(value) <= _SHORT else value[:3]))
+        return shown if len(value) <= _SHORT else f"{shown} ... ({len(value)} values)"
+    if value is None:
+        return "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

@@ -196,15 +196,16 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
     return tyro.cli(kind, args=arguments, registry=registry, **({"prog": "koap"} | how))
 
 
-def check_names(kind: Any, arguments: Sequence[str]) -> None:
-    """Checks that a call names a command and options that its help lists.
+def check_call(kind: Any, arguments: Sequence[str]) -> None:
+    """Checks that a call names a command and options that its help lists, with numbers where it says so.
 
     Args:
         kind (type): a union of dataclasses that the first word chooses from.
         arguments (sequence of str): the words.
 
     Raises:
-        ValueError: for the first unknown name, with the nearest one of that command.
+        ValueError: for the first unknown name, with the nearest one of that command, or the first value that is no
+            number.
     """
     command = next(iter(arguments), "-")
     if command.startswith("-"):
@@ -214,12 +215,25 @@ def check_names(kind: Any, arguments: Sequence[str]) -> None:
     with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
         parse(kind, [command, "--help-all" if command == "train" else "--help"])
     lines = re.findall(r"^[│ ]*(-.*)", shown.getvalue(), re.MULTILINE)
-    known = [option for line in lines for option in re.findall(r"--\w[\w.-]*", line)]
-    known += ["--labels", "--config", "--help-all"] if command == "train" else []
+    wanted = {name: kind for line in lines for name, kind in re.findall(r"(--\w[\w.-]*)(?: (N|NUMBER)\b)?", line)}
+    more = ["--labels", "--config", "--help-all"] if command == "train" else []
+    option = ""
     for word in arguments[1:]:
-        option = word.partition("=")[0].replace("_", "-")
-        if option.startswith("--"):
-            lookup(known, option, f"option of koap {command}:")
+        name, equals, value = word.partition("=")
+        if name.startswith("--"):
+            option = lookup([*wanted, *more], name.replace("_", "-"), f"option of koap {command}:")
+        if equals or not name.startswith("--"):
+            _check_number(option, value if equals else word, wanted.get(option, ""))
+
+
+def _check_number(option: str, value: str, wanted: str) -> None:
+    kinds = {"N": (int, "a whole number"), "NUMBER": (float, "a number")}
+    if wanted in kinds:
+        number, words = kinds[wanted]
+        try:
+            number(value)
+        except ValueError:
+            raise ValueError(f"{option} must be {words}, got {value!r}") from None
 
 
 def _first_page() -> type:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,16 +22,18 @@ from torchrl_koap.evaluation import (
     suggest,
 )
 from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop, time_calls
-from torchrl_koap.evaluation.offline import KIND, describe_offline
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import InverseDynamicsFollower
 from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, exportable
 from torchrl_koap.reports.pictures import draw_pictures
+from torchrl_koap.reports.rows import as_text, evaluation_rows, training_rows
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.progress import check_logger, log_scores, open_logger, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.studies import Machines, Study, run_study
+from torchrl_koap.studies.table import result_rows
 from torchrl_koap.tasks import Task
 from torchrl_koap.training import TrainConfig, Trained, train
 
@@ -49,10 +50,11 @@ class Train(Command):
 
     config: Options[TrainConfig]
 
-    def __call__(self) -> Mapping[str, Any]:
+    def __call__(self) -> dict[str, str]:
         """Trains."""
-        results = train(self.config, command=as_typed()).results
-        return {**results, "next": f"koap eval {shlex.quote(str(self.config.out))}"}
+        train(self.config, command=as_typed())
+        out = str(self.config.out)
+        return {**as_text(training_rows(RunFacts.read(out))), "run": out, "next": f"koap eval {shlex.quote(out)}"}
 
 
 @dataclass(kw_only=True)
@@ -78,8 +80,8 @@ class Eval(Command):
     animate: bool = True
     logger: str = "csv"
 
-    def __call__(self) -> dict[str, Any] | str:
-        """Evaluates and reports; the figures of an evaluation without an environment come in words."""
+    def __call__(self) -> dict[str, str]:
+        """Evaluates and reports."""
         check_logger(self.logger)
         result = evaluate(self.run, self.config)
         folder = Path(self.run) if self.config.out is None else self.config.out
@@ -88,9 +90,8 @@ class Eval(Command):
             if logger is not None:
                 rates = {f"{name}_rate": values["rate"] for name, values in result.get("rates", {}).items()}
                 log_scores(logger, result | rates)
-        if result.get("kind") != KIND:
-            return result | report
-        return "\n".join([describe_offline(result), *(f"report  {file}" for file in report.values())])
+        faults = {f"FAULT {number}": fault for number, fault in enumerate(result.get("faults", ()), 1)}
+        return as_text(evaluation_rows(RunFacts.read(folder))) | faults | report
 
 
 @dataclass(kw_only=True)
@@ -240,7 +241,9 @@ class Curve(Command):
     def __call__(self) -> dict[str, Any]:
         """Does what is missing of the study and writes its report."""
         result = run_study(self.config, self.machines)
-        return {**result.counts, "report": str(result.report)}
+        cells = ", ".join(f"{count} {status}" for status, count in result.counts.items())
+        failed = {"failed": result.counts["failed"]} if result.counts["failed"] else {}
+        return {**result_rows(result.rows), "trainings": cells, **failed, "report": str(result.report)}
 
 
 @dataclass(kw_only=True)

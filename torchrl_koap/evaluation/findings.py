@@ -15,6 +15,8 @@ OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"  # entry of figures 
 ON_THE_CIRCLE = 1e-3  # eigenvalues whose magnitude is nearer to 1 lie on the unit circle, in texts and pictures alike
 NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 GOOD = 0.9  # a success rate of a part that is not at fault
+MORE = "train longer (--steps) or record more"  # what to do about plans
+KIND = "check --action-kind, or label a recording that moves it"  # about an action
 _LEFT = 0.1  # share of recorded paths that a controller may leave
 _WORSE = 2.0  # from here on a latent model's error is no longer that of a comparable model
 
@@ -114,13 +116,13 @@ def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[s
             if own > other > 0:
                 what = f"columns in {row['unit']}" if row["unit"] else "columns without a unit"
                 against = _against(own, other, row["unit"])
-                faults.append(f"plans are worse than {name.replace('_', ' ')} ({what}): {against}")
-    where = {"outside_budget": "labels outside the budget", "left_out": "labelled trajectories left out"}
+                faults.append(f"plans are worse than {name.replace('_', ' ')} ({what}): {against}; {MORE}")
+    where = {"outside_budget": "labels outside the budget", "left_out": "each labelled recording left out in turn"}
     for split, words in where.items():
         for row in action.get(split, {}).get("column", ()):
             if row["controller"] > row["mean_action"]:
                 against = _against(row["controller"], row["mean_action"], row["unit"])
-                faults.append(f"action {row['name']} is worse than always giving its mean ({words}): {against}")
+                faults.append(f"action {row['name']} is worse than always giving its mean ({words}): {against}; {KIND}")
     return faults
 
 
@@ -156,7 +158,7 @@ def _describe_probe(outside: Mapping[str, Any]) -> str:
 
 def _against(own: float, other: float, unit: str) -> str:
     shown, factor = thousandths(unit)
-    return f"{own * factor:.3g} against {other * factor:.3g} {shown}".rstrip()
+    return f"{own * factor:.4g} against {other * factor:.4g} {shown}".rstrip()
 
 
 def _times(large: float, small: float) -> str:

@@ -115,27 +115,15 @@ def _faults(found: Mapping[str, Any]) -> list[str]:
     late, distance, faults = found["largest_command_late"], found["distance_to_demonstrations"], []
     if late > UNSTABLE:
         faults.append(
-            f"this policy is unstable: within {found['steps']} steps of a closed loop, by a linear model of how states"
-            f" follow actions, commands grow to {late:.3g} times the largest demonstrated one"
+            f"this policy is unstable: on a linear model of the robot, commands grow to {late:.3g} times the largest"
+            f" demonstrated one within {found['steps']} steps; check --action-kind, or label more recordings"
         )
     if distance > FAR:
         faults.append(
-            f"this policy leaves its demonstrations: its closed loop ends {distance:.3g} standard deviations from the"
-            " nearest recorded state"
+            f"this policy leaves its demonstrations: on a linear model of the robot it ends {distance:.3g} standard"
+            " deviations from the nearest recorded state; train longer (--steps) or record more"
         )
     return faults
-
-
-def describe_loop(found: Mapping[str, Any]) -> str:
-    """Returns a line about :func:`check_loop`."""
-    if "note" in found:
-        return f"closed loop: not looked at ({found['note']})"
-    return (
-        f"closed loop by a linear model of the labels, {found['steps']} steps: largest command"
-        f" {found['largest_command']:.3g}, late {found['largest_command_late']:.3g} times the largest demonstrated one,"
-        f" {found['limited_commands']} of {found['commands']} limited, distance to the nearest recorded state"
-        f" {found['distance_to_demonstrations']:.2g} standard deviations"
-    )
 
 
 def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
@@ -152,8 +140,8 @@ def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
         return {"limited_commands": 0}
     margin = policy.execution.limits
     fault = (
-        f"{limited} of {commands} commands were farther than {margin:g} of its width outside the demonstrated range and"
-        " were held there (limits)"
+        f"{limited} of {commands} commands left the demonstrated range by more than {margin:g} of its width and were"
+        " limited there; --limits inf sends them as they are"
     )
     return {"limited_commands": limited, "faults": [fault]}
 

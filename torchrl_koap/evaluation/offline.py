@@ -12,11 +12,10 @@ from torch import Tensor
 from torchrl_koap.data import controller_view, select_trajectories
 from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
 from torchrl_koap.evaluation.findings import offline_faults
-from torchrl_koap.evaluation.loop_on_labels import check_loop, describe_loop
+from torchrl_koap.evaluation.loop_on_labels import check_loop
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.tasks.columns import thousandths
 
 if TYPE_CHECKING:
     from torchrl_koap.evaluation.config import EvalConfig
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
-_PLANS = ("planner", "standing_still", "constant_velocity")
-_ACTIONS = ("controller", "ridge", "mean_action")
 _COMMANDS = "the controller decodes no recorded states: it follows plans by the command that it gave"
 
 
@@ -136,24 +133,3 @@ def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, 
 def _per_trajectory(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[dict[str, Any]]:
     parts = {"plans": plan} | {f"actions, {split.replace('_', ' ')}": action[split] for split in SPLITS}
     return [{"judged": name, **row} for name, part in parts.items() for row in part.get("trajectory", ())]
-
-
-def describe_offline(result: Mapping[str, Any]) -> str:
-    """Says the figures of :func:`evaluate_offline` in words, a line per unit, for a terminal."""
-    lines = ["judged on recorded data: the task has no environment"]
-    plan, action = result["plan_errors"], result["action_errors"]
-    lines += [f"plans: {plan['note']}"] if "note" in plan else []
-    for row in plan.get("unit", ()):
-        lines.append(_line("plans, energy score", row, {name: row[name]["energy_score"]["overall"] for name in _PLANS}))
-    for split in SPLITS:
-        head, part = f"actions, {split.replace('_', ' ')}", action[split]
-        lines += [f"{head}: {part['note']}"] if "note" in part else []
-        lines += [_line(f"{head}, RMSE", row, {name: row[name] for name in _ACTIONS}) for row in part.get("unit", ())]
-    lines.append(describe_loop(result["loop"]))
-    return "\n".join([*lines, *(f"FAULT: {fault}" for fault in result["faults"])])
-
-
-def _line(head: str, row: Mapping[str, Any], values: Mapping[str, float]) -> str:
-    shown, factor = thousandths(row["unit"])
-    figures = ", ".join(f"{name.replace('_', ' ')} {factor * value:.4g}" for name, value in values.items())
-    return f"{head}{f' ({shown})' if shown else ''}: {figures}"

@@ -27,7 +27,7 @@ _HANDLES = (
 
 def _caption(run: RunFacts) -> str:
     objects = " Beside it the objects that were moved." if run.task is not None and run.task.bodies else ""
-    return f"Blue: transitions whose action the training may read. Grey: states only.{objects}"
+    return f"Blue: steps with an action that the training may read. Grey: states only.{objects}"
 
 
 @picture(

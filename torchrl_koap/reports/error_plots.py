@@ -36,7 +36,7 @@ TERMS = {
     "loss_reconstruction": "reconstruction",
     "loss_koopman": "linear latent dynamics",
     "loss_action": "action decoder (labelled steps)",
-    "held_out_score": "plan error, held-out demonstrations",
+    "held_out_score": "plan error, held-out recordings",
 }
 _PLANS = {
     "planner": ("planner", BLUE, "solid"),
@@ -50,7 +50,7 @@ _ACTIONS = {
 }
 _SPLITS = {
     "outside_budget": "labels outside the budget, for evaluation only",
-    "left_out": "labels inside the budget, a trajectory left out at a time",
+    "left_out": "each labelled recording in turn left out of the fit",
 }
 _MANY = 6  # from here on names of columns are turned
 
@@ -59,9 +59,9 @@ _MANY = 6  # from here on names of columns are turned
     "losses.png",
     source="metrics.csv",
     title="Losses",
-    caption="Pale: logged values; line: running mean, its last value in the corner. Logarithmic. Of the plan error,"
-    " standing still has 1; the weights with the least one (dot) are kept. A planner's loss says little about its"
-    " rollouts: look at the pictures above.",
+    caption="Logarithmic scale. Pale: logged values; line: running mean; number: its last value. A plan error of 1 is"
+    " that of standing still. The dot marks the weights that were kept. A planner's loss has no absolute scale: read"
+    " the plan error, or the rollouts, instead.",
     order=100,
 )
 def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
@@ -84,7 +84,7 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
     for index, (name, values) in enumerate(columns.items()):
         axes = figure.add_subplot(down, across, index + 1)
         set_title(axes, TERMS.get(name, name.removeprefix("loss_").replace("_", " ")))
-        axes.set_xlabel("training step")
+        axes.set_xlabel("update")
         here = np.isfinite(values)
         x, y = step[here], values[here]
         if (y > 0).any():
@@ -132,7 +132,7 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     source="actions.safetensors",
     title="Predicted against recorded actions",
     caption="Uses all actions, for evaluation only: those of demonstrations outside the label budget, which trained and"
-    " selected nothing. Points on the diagonal are exact; a slope below 1 means timid actions, points beside it drift.",
+    " selected nothing. Points on the diagonal are exact. A slope below 1 means that actions are too small.",
     order=90,
 )
 def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
@@ -189,10 +189,10 @@ def _rms(values: np.ndarray) -> float:
     "plan_errors.png",
     source="eval.json",
     title="Errors of the plans",
-    caption="On trajectories that the planner has never seen, for each planned step. Left: energy score of the sampled"
-    " plans, which no second way of doing the task spoils; dashed, what needs no learning. Right: the best of the"
-    " samples, in which a planner is to have what was recorded among its plans. A row per unit; distances over all"
-    " columns of that unit together.",
+    caption="Measured on held-out recordings, which the planner has never seen, for each planned step. Lower is better."
+    " Left: the energy score, which is the distance of the plans from the recording, less half of the distance between"
+    " plans. Right: the distance of the nearest plan. Dashed lines need no learning. Each row of panels is one unit; a"
+    " distance is over all columns of that unit.",
     order=15,
     offline=True,
 )
@@ -215,8 +215,8 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
             axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
             tidy(axes, grid=True)
         pair[0].set_ylabel(f"distance ({shown or 'units of the data'})")
-        set_title(pair[0], f"energy score: {_list_names(row['columns'])}")
-        set_title(pair[1], f"best of {plan['samples']} plans")
+        set_title(pair[0], f"energy score\n{_list_names(row['columns'])}")
+        set_title(pair[1], f"nearest of {plan['samples']} plans\n")
     each = f", {1e3 / run.control_hz:.0f} ms each" if run.control_hz else ""
     for axes in panels[-1]:
         axes.set_xlabel(f"planned step{each}")
@@ -228,9 +228,9 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     "action_errors.png",
     source="eval.json",
     title="Errors of the actions",
-    caption="Root mean square error of the actions decoded from recorded states, a group of bars per action column."
-    " Red: the controller does no better there than always giving the mean action. Controllers see recorded states"
-    " here; planned ones are not as good.",
+    caption="Root mean square error of the actions that are predicted from recorded states, by action column. Lower is"
+    " better. A red bar, if there is one, is a column in which the controller is no better than always giving the mean"
+    " action. On the robot the controller reads planned states, and its errors are larger.",
     order=16,
     offline=True,
 )
@@ -247,7 +247,7 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     for (name, part), line in zip(parts, panels, strict=True):
         for unit, axes in zip(units, line, strict=True):
             _draw_bars(axes, [row for row in part["column"] if row["unit"] == unit], unit)
-        judged = f"{part['labels']:,} labels of {part['trajectories']} trajectories"
+        judged = f"{part['labels']:,} labels of {part['trajectories']} recordings"
         set_title(line[0], f"{_SPLITS.get(name, name)}\n{judged}")
     handles = [Line2D([], [], color=color, linewidth=6, label=label) for label, color in _ACTIONS.values()]
     if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
@@ -278,4 +278,4 @@ def _part(result: Any, name: str) -> Mapping[str, Any]:
 
 def _list_names(names: Sequence[str]) -> str:
     """Names of columns in a title, the middle of many left out."""
-    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, {names[1]}, ... {names[-1]} ({len(names)} columns)"
+    return ", ".join(names) if len(names) <= 3 else f"{names[0]} ... {names[-1]} ({len(names)} columns)"

@@ -47,10 +47,10 @@ _MODELS = {
     "latent.png",
     source="inspect.json",
     title="What the latent space holds",
-    caption="Left: eigenvalues of the latent operator; orange ones lie outside the unit circle, where predictions grow,"
-    " pale ones on it within a thousandth. Middle: errors of predicted states, latent actions given; a test of the"
-    " models, not a forecast. Right, for evaluation only: how much of the true actions a linear probe on labels"
-    " outside the budget, and the run's own decoder, explain on held-out demonstrations.",
+    caption="Left: eigenvalues of the Koopman operator, which predicts the lifted state. Orange ones lie outside the"
+    " unit circle, where predictions grow; pale ones lie on it within a thousandth. Middle: errors of predicted states"
+    " if the latent actions are known. Right, for evaluation only: the share of the true actions that is explained on"
+    " held-out demonstrations, by a linear map fitted to all labels (probe) and by the run's own decoder.",
     order=60,
 )
 def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:

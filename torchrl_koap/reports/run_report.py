@@ -12,11 +12,9 @@ from typing import Any
 from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, draw_pictures
-from torchrl_koap.reports.run_facts import RunFacts, number
-from torchrl_koap.tasks.columns import thousandths
+from torchrl_koap.reports.rows import evaluation_rows, training_rows
+from torchrl_koap.reports.run_facts import RunFacts
 
-_ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
-_PLAN_BASELINES = ("standing_still", "constant_velocity")
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
 _EVAL_ELSEWHERE = ("episode", "trajectory", "faults", "rates", "action_errors")
@@ -44,14 +42,14 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
         title=" on ".join(str(config[key]) for key in ("method", "task") if config.get(key)) or "run",
         subtitle=_subtitle(run),
         notes=[*problems.values(), *run.damaged, *(evaluation.get("faults") or ())],
-        tiles=_tiles(run),
+        tiles=evaluation_rows(run),
         evaluated=bool(evaluation),
         commands={name: _filled(command, run) for name, command in commands.items()},
         advice=[
             {"finding": item.finding, "proposal": item.proposal, "command": _filled(item.command, run)}
             for item in advice(run)
         ],
-        labels=summary.get("labels"),
+        training=training_rows(run),
         labels_read=run.evaluated("labels_read_outside_budget"),
         label_figure=next((item for item in figures if item["name"] == _BESIDE_LABELS), None),
         figures=[item for item in figures if item["name"] != _BESIDE_LABELS],
@@ -60,7 +58,7 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
             (head, shown)
             for head, source, elsewhere in (
                 ("Evaluation", evaluation, _EVAL_ELSEWHERE),
-                ("Training", summary, ("labels", "command_ranges")),
+                ("Training", summary, ("command_ranges",)),
             )
             if (shown := {key: value for key, value in source.items() if key not in elsewhere})
         ],
@@ -134,78 +132,3 @@ def _filled(command: str, run: RunFacts) -> str:
 
 def _given(source: Mapping[str, Any], key: str) -> bool:
     return source.get(key) not in (None, "", [], {})
-
-
-def _tiles(run: RunFacts) -> list[dict[str, Any]]:
-    """Returns name, value, note and bar (or None) of every headline number of a run."""
-    found = [*_offline_errors(run), *_rates(run), _entropy(run), _speed(run)]
-    return [item for item in found if item is not None]
-
-
-def _tile(name: str, value: str, note: str, interval: tuple[float, ...] | None = None) -> dict[str, Any]:
-    return {"name": name, "value": value, "note": note, "bar": interval}
-
-
-def _offline_errors(run: RunFacts) -> list[dict[str, Any]]:
-    """Errors of plans and actions on recorded data."""
-    found, evaluation = [], run.evaluation
-    for row in evaluation.get("plan_errors", {}).get("unit", ()):
-        shown, factor = thousandths(row["unit"])
-        values = {name: factor * row[name]["energy_score"]["overall"] for name in ("planner", *_PLAN_BASELINES)}
-        note = ", ".join(f"{name.replace('_', ' ')} {values[name]:.3g}" for name in _PLAN_BASELINES)
-        head = f"plan error, energy score, {len(row['columns'])} columns"
-        found.append(_tile(head, f"{values['planner']:.3g} {shown}".rstrip(), note))
-    split = evaluation.get("action_errors_on")
-    errors = run.action_errors[split] if split else {}
-    for row in errors.get("unit", ()):
-        shown, factor = thousandths(row["unit"])
-        others = [f"{name.replace('_', ' ')} {factor * row[name]:.3g}" for name in ("ridge", "mean_action")]
-        others.append(f"n = {errors['labels']:,} labels, {split.replace('_', ' ')}")
-        head = f"action error, {len(row['columns'])} columns"
-        found.append(_tile(head, f"{factor * row['controller']:.3g} {shown}".rstrip(), ", ".join(others)))
-    return found
-
-
-def _rates(run: RunFacts) -> list[dict[str, Any]]:
-    """Shares of the rollouts: success, and those that the task's own score adds."""
-    contexts, found = run.evaluated("contexts"), []
-    for name, values in run.rates.items():
-        rate, low, high, total = (number(values.get(key)) for key in ("rate", "low", "high", "episodes"))
-        if rate is None:
-            continue
-        notes, interval = [], None
-        if low is not None and high is not None:
-            notes = [f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"]
-            interval = tuple(100 * min(max(part, 0.0), 1.0) for part in (rate, low, high))
-        if total:
-            among = f" in {contexts:g} contexts" if contexts and name == "success" else ""
-            notes.append(f"{round(rate * total)} of {total:g} rollouts{among}")
-        found.append(_tile(name, f"{100 * rate:.1f} %", ", ".join(notes), interval))
-    return found
-
-
-def _entropy(run: RunFacts) -> dict[str, Any] | None:
-    """Entropy of the modes, of tasks that can be done in several ways."""
-    modes = run.modes.number
-    name = next((name for name in _ENTROPIES if run.evaluated(name) is not None), None)
-    if name is None or modes < 2:
-        return None
-    value, low, high = (run.evaluated(name + end) for end in ("", "_low", "_high"))
-    contexts, episodes = run.evaluated("contexts"), run.evaluated("episodes")
-    notes = [] if low is None or high is None else [f"95 % interval {low:.2f} to {high:.2f}"]
-    distinct = run.evaluation.get("distinct_modes")
-    notes += [] if distinct is None else [f"{distinct} of {modes} modes"]
-    if run.successes and contexts and name == "mode_entropy":
-        notes += [f"mean over contexts, {episodes / contexts:g} rollouts each"] if episodes else []
-    elif run.successes:
-        notes.append(f"a uniform choice averages {run.expected_entropy:.2f}, n = {run.successes}")
-    return _tile(f"{_ENTROPIES[name]}, base {modes}", f"{value:.2f}", "; ".join(notes))
-
-
-def _speed(run: RunFacts) -> dict[str, Any] | None:
-    rate = run.evaluated("control_hz")
-    if rate is None:
-        return None
-    parts = {"plan_ms": "ms per plan", "control_ms": "ms per control step"}
-    notes = [f"{run.evaluated(key):.3g} {what}" for key, what in parts.items() if run.evaluated(key)]
-    return _tile("control rate", f"{rate:.0f} Hz", ", ".join(notes))

@@ -114,11 +114,12 @@ class RunDirectory:
         return rows
 
     def last_metrics(self, phase: str) -> dict[str, float]:
-        """The values of the last row of a phase; none if there is none."""
+        """The values of the last row of a phase and its number of ``updates``; none if there is none."""
         rows = [row for row in self.read_metrics() if row["phase"] == phase]
         if not rows:
             return {}
-        return {key: float(value) for key, value in rows[-1].items() if value and key not in ("phase", "step")}
+        values = {key: float(value) for key, value in rows[-1].items() if value and key not in ("phase", "step")}
+        return values | {"updates": int(rows[-1]["step"])}
 
     def rewind_metrics(self, phase: str, step: int) -> None:
         """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there."""

@@ -193,6 +193,19 @@ def _success(item: Summary) -> dict[str, str]:
     return {"success (95 %)": text, "n": str(item.episodes), "range of seeds": spread}
 
 
+def result_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """What a terminal shows of a study: success, or the action error, of a method at a share of labels."""
+    found = {}
+    for item in summarise(rows):
+        success, error = item.measures.get("success"), item.mean("relative_action_error")
+        text = "no training done" if success is None else f"success {success.text}, n = {item.episodes}"
+        if item.offline:
+            text = "no action error" if error is None else f"action error {percent(error, 1)} of the mean action's"
+        used = "" if item.demonstrations == 1 else f", {percent(item.demonstrations)} of the demonstrations"
+        found[f"{item.task}, {item.method}, {percent(item.labels)} labels{used}"] = text
+    return found
+
+
 def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
     """Rows of text with the same keys as a markdown table."""
     if not table:

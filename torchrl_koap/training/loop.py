@@ -106,7 +106,7 @@ def train_phase(
         progress (callable, optional): called with the number of updates done and the last logged values.
 
     Returns:
-        dict: the last logged values, ``iterations_per_second`` of the whole phase among them.
+        dict: the last logged values, with ``updates`` and ``iterations_per_second`` of the whole phase.
 
     Raises:
         DivergedError: if a loss is not finite where it is logged, or a parameter is not where a checkpoint is due;
@@ -173,6 +173,7 @@ def train_phase(
             if not all(parameter.isfinite().all() for parameter in loss_module.parameters()):
                 raise DivergedError(f"{phase}: parameters are not finite at step {done}; lower the learning rate")
             save_training_state(checkpoint, state, optimizer, {"phase": phase, "step": done})
+    values["updates"] = done
     if done > start:
         values["iterations_per_second"] = (done - start) / (time.perf_counter() - began)
     return values

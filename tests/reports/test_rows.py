@@ -1,0 +1,64 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a training says at its end: the labels it read, how its parts were trained, why that ended."""
+
+from __future__ import annotations
+
+import pytest
+from run_files import LABELS, run_of
+
+from torchrl_koap.reports.rows import Row, as_text, evaluation_rows, training_rows
+
+CONFIG = {"method": "koap", "planner": {"steps": 500, "source": None}}
+PLANNER = {"updates": 500, "kept_update": 500, "best_held_out_score": 0.263}
+SUMMARY = {
+    "labels": LABELS,
+    "planner_parameters": 9,
+    "planner": PLANNER,
+    "train_seconds": {"planner": 21.7, "controller": 11.2},
+    "controller_updates": 500,
+    "decoder_fit": {"labels_used": 18},
+}
+
+
+def rows_of(config=None, **summary):
+    return as_text(training_rows(run_of(None, summary=SUMMARY | summary, config=CONFIG | (config or {}))))
+
+
+def test_a_training_in_five_rows():
+    assert rows_of() == {
+        "labels": "20 of 40 steps; in 1 of 2 recordings",
+        "planner": "500 updates in 22 s; kept update 500, with plan error 0.263 on held-out recordings"
+        " (standing still: 1)",
+        "training ended": "with its last update; still improving: --steps 1000 may help",
+        "controller": "koap, 500 updates in 11 s; fitted to 18 labels",
+    }
+
+
+@pytest.mark.parametrize(
+    ("updates", "kept", "said"),
+    [
+        (300, 100, "by itself before update 500; plans stopped improving at update 100"),
+        (500, 350, "with its last update; plans stopped improving at update 350"),
+        (500, 450, "with its last update; still improving: --steps 1000 may help"),
+    ],
+)
+def test_why_a_training_ended(updates, kept, said):
+    assert rows_of(planner=PLANNER | {"updates": updates, "kept_update": kept})["training ended"] == said
+
+
+def test_planners_that_nothing_was_held_out_from_or_that_are_no_part_of_the_run():
+    assert rows_of(planner={"updates": 20})["planner"] == "20 updates in 22 s; no recording was held out"
+    assert rows_of({"planner": {"source": "runs/other"}})["planner"] == "that of runs/other; not trained here"
+    assert list(rows_of({"method": "dp"}, planner_parameters=0)) == ["labels", "controller"]
+
+
+def test_labels_that_the_budget_left_out_are_counted():
+    assert rows_of(labels=LABELS | {"available_transitions": 30})["labels"].endswith("; the data have 30 labels")
+
+
+def test_numbers_without_a_unit_are_in_units_of_the_data():
+    row = {"unit": "", "columns": ["q"], "controller": 0.5, "ridge": 0.6, "mean_action": 2.0}
+    errors = {"left_out": {"labels": 1200, "unit": [row]}}
+    (found,) = evaluation_rows(run_of(None, evaluation={"action_errors_on": "left_out", "action_errors": errors}))
+    note = "root mean square in units of the data; ridge regression 0.6, always the mean action 2"
+    assert found == Row("action error, q", "0.5", f"{note}; 1,200 labels of recordings left out of the fit")

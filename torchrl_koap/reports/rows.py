@@ -1,0 +1,204 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a training and an evaluation came to, in rows of words: the same for a terminal and for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torchrl_koap.reports.run_facts import RunFacts, number
+from torchrl_koap.tasks.columns import thousandths
+
+_ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
+_PLAN_BASELINES = {"standing_still": "standing still", "constant_velocity": "constant velocity"}
+_ACTION_BASELINES = {"ridge": "ridge regression", "mean_action": "always the mean action"}
+_LABELS = {"outside_budget": "outside the budget", "left_out": "of recordings left out of the fit"}
+_LATE = 0.8  # share of the updates from which on the best plans say that more may be better
+_NOT_MEASURED = "not measured"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A result and what it is to be compared with.
+
+    Attributes:
+        name: what was measured.
+        value: the result, with its unit.
+        note: what to compare it with, and how it was measured.
+        bar: share and ends of its interval in percent, if it is a share.
+    """
+
+    name: str
+    value: str
+    note: str = ""
+    bar: tuple[float, ...] | None = None
+
+
+def as_text(rows: Iterable[Row]) -> dict[str, str]:
+    """Returns rows as a terminal shows them: value and note by name."""
+    return {row.name: "; ".join(filter(None, (row.value, row.note))) for row in rows}
+
+
+def training_rows(run: RunFacts) -> list[Row]:
+    """Returns what a training read, how its parts were trained, and why the planner's training ended."""
+    return [row for row in (_labels(run), *_planner(run), _controller(run)) if row is not None]
+
+
+def evaluation_rows(run: RunFacts) -> list[Row]:
+    """Returns errors on recorded data, shares of rollouts with their intervals, and times."""
+    found = [*_rates(run), _entropy(run), *_plan_errors(run), *_action_errors(run), _loop(run), _speed(run)]
+    return [row for row in found if row is not None]
+
+
+def _labels(run: RunFacts) -> Row | None:
+    names = ("labelled_transitions", "total_transitions", "trajectories_touched", "total_trajectories")
+    seen, steps, touched, recordings = (_number_in(run.summary.get("labels"), name) for name in names)
+    if seen is None or steps is None:
+        return None
+    where = [] if touched is None or recordings is None else [f"in {touched:,} of {recordings:,} recordings"]
+    there = _number_in(run.summary.get("labels"), "available_transitions")
+    if there is not None and seen < there < steps:
+        where.append(f"the data have {there:,} labels")
+    return Row("labels", f"{seen:,} of {steps:,} steps", "; ".join(where))
+
+
+def _planner(run: RunFacts) -> list[Row]:
+    """How the planner was trained, and why that ended; nothing for a method that has none."""
+    found, asked = run.summary.get("planner"), run.config.get("planner")
+    if not isinstance(asked, Mapping) or not number(run.summary.get("planner_parameters")):
+        return []
+    if asked.get("source") is not None:
+        return [Row("planner", f"that of {asked['source']}", "not trained here")]
+    updates, kept, score = (_number_in(found, name) for name in ("updates", "kept_update", "best_held_out_score"))
+    if updates is None:
+        return []
+    value = f"{updates:,.0f} updates{_seconds(run, 'planner')}"
+    if kept is None or score is None:
+        return [Row("planner", value, "no recording was held out")]
+    note = f"kept update {kept:,.0f}, with plan error {score:.3g} on held-out recordings (standing still: 1)"
+    return [Row("planner", value, note), Row("training ended", *_ending(updates, kept, number(asked.get("steps"))))]
+
+
+def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
+    if most is not None and updates < most:
+        return f"by itself before update {most:,.0f}", f"plans stopped improving at update {kept:,.0f}"
+    if kept < _LATE * updates:
+        return "with its last update", f"plans stopped improving at update {kept:,.0f}"
+    return "with its last update", f"still improving: --steps {2 * updates:.0f} may help"
+
+
+def _controller(run: RunFacts) -> Row | None:
+    method, updates = run.config.get("method"), number(run.summary.get("controller_updates"))
+    if not isinstance(method, str) or updates is None:
+        return None
+    labels = _number_in(run.summary.get("decoder_fit"), "labels_used")
+    trained = f"{method}, {updates:,} updates{_seconds(run, 'controller')}"
+    return Row("controller", trained, "" if labels is None else f"fitted to {labels:,} labels")
+
+
+def _seconds(run: RunFacts, part: str) -> str:
+    seconds = _number_in(run.summary.get("train_seconds"), part)
+    return "" if seconds is None else f" in {seconds:.0f} s"
+
+
+def _number_in(source: Any, name: str) -> float | int | None:
+    return number(source.get(name)) if isinstance(source, Mapping) else None
+
+
+def _plan_errors(run: RunFacts) -> list[Row]:
+    """Errors of plans on recordings that the planner has not seen, a row per unit."""
+    plan, found = run.evaluation.get("plan_errors", {}), []
+    for row in plan.get("unit", ()):
+        shown, factor = thousandths(row["unit"])
+        values = {name: factor * row[name]["energy_score"]["overall"] for name in ("planner", *_PLAN_BASELINES)}
+        others = ", ".join(f"{words} {values[name]:.4g}" for name, words in _PLAN_BASELINES.items())
+        value = f"{values['planner']:.4g} {shown}".rstrip()
+        found.append(Row(f"plan error, {_columns(row)}", value, f"energy score{_plain(shown)}; {others}"))
+    return [*found, *([Row("plan error", _NOT_MEASURED, plan["note"])] if "note" in plan else [])]
+
+
+def _action_errors(run: RunFacts) -> list[Row]:
+    """Errors of actions on labels that the decoder was not fitted on, a row per unit."""
+    split, found = run.evaluation.get("action_errors_on"), []
+    errors = run.action_errors[split] if split else {}
+    for row in errors.get("unit", ()):
+        shown, factor = thousandths(row["unit"])
+        others = ", ".join(f"{words} {factor * row[name]:.4g}" for name, words in _ACTION_BASELINES.items())
+        value = f"{factor * row['controller']:.4g} {shown}".rstrip()
+        labels = f"{errors['labels']:,} labels {_LABELS[split]}"
+        found.append(
+            Row(f"action error, {_columns(row)}", value, f"root mean square{_plain(shown)}; {others}; {labels}")
+        )
+    notes = [part["note"] for part in run.action_errors.values() if "note" in part] if run.offline else []
+    return found or ([Row("action error", _NOT_MEASURED, "; ".join(notes))] if notes else [])
+
+
+def _plain(unit: str) -> str:
+    return "" if unit else " in units of the data"
+
+
+def _columns(row: Mapping[str, Any]) -> str:
+    names = row["columns"]
+    return names[0] if len(names) == 1 else f"{len(names)} columns"
+
+
+def _loop(run: RunFacts) -> Row | None:
+    """How a policy acts on a linear model of the robot."""
+    found = run.evaluation.get("loop")
+    if not isinstance(found, Mapping):
+        return None
+    if "note" in found:
+        return Row("closed loop", _NOT_MEASURED, found["note"])
+    return Row(
+        "largest command in a closed loop",
+        f"{found['largest_command']:.3g} times",
+        f"the largest recorded one, in {found['steps']} steps on a linear model of the robot;"
+        f" {found['largest_command_late']:.3g} times in the last third; {found['limited_commands']:,} of"
+        f" {found['commands']:,} commands limited; states end {found['distance_to_demonstrations']:.2g} standard"
+        " deviations from recorded ones",
+    )
+
+
+def _rates(run: RunFacts) -> list[Row]:
+    """Shares of the rollouts: success, and those that the task's own score adds."""
+    contexts, found = run.evaluated("contexts"), []
+    for name, values in run.rates.items():
+        rate, low, high, total = (number(values.get(key)) for key in ("rate", "low", "high", "episodes"))
+        if rate is None:
+            continue
+        notes, interval = [], None
+        if low is not None and high is not None:
+            notes = [f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"]
+            interval = tuple(100 * min(max(part, 0.0), 1.0) for part in (rate, low, high))
+        if total:
+            among = f" in {contexts:g} contexts" if contexts and name == "success" else ""
+            notes.append(f"{round(rate * total)} of {total:g} rollouts{among}")
+        found.append(Row(name, f"{100 * rate:.1f} %", ", ".join(notes), interval))
+    return found
+
+
+def _entropy(run: RunFacts) -> Row | None:
+    """Entropy of the modes, of tasks that can be done in several ways."""
+    modes = run.modes.number
+    name = next((name for name in _ENTROPIES if run.evaluated(name) is not None), None)
+    if name is None or modes < 2:
+        return None
+    value, low, high = (run.evaluated(name + end) for end in ("", "_low", "_high"))
+    contexts, episodes = run.evaluated("contexts"), run.evaluated("episodes")
+    notes = [] if low is None or high is None else [f"95 % interval {low:.2f} to {high:.2f}"]
+    distinct = run.evaluation.get("distinct_modes")
+    notes += [] if distinct is None else [f"{distinct} of {modes} modes"]
+    if run.successes and contexts and name == "mode_entropy":
+        notes += [f"mean over contexts, {episodes / contexts:g} rollouts each"] if episodes else []
+    elif run.successes:
+        notes.append(f"a uniform choice averages {run.expected_entropy:.2f}, n = {run.successes}")
+    return Row(f"{_ENTROPIES[name]}, base {modes}", f"{value:.2f}", "; ".join(notes))
+
+
+def _speed(run: RunFacts) -> Row | None:
+    plan, control = run.evaluated("plan_ms"), run.evaluated("control_ms")
+    if plan is None or control is None:
+        return None
+    robot = f"; the robot's step has {1000 / run.control_hz:.3g} ms" if run.control_hz else ""
+    return Row("time of a plan", f"{plan:.3g} ms", f"then {control:.3g} ms per control step{robot}")
