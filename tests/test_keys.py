@@ -136,7 +136,7 @@ def test_blanked_commands():
     ("part", "entry"),
     [
         (KoopmanLifting(2, 4), "state"),
-        (CompactLifting(2, 2, num_components=2), "state"),
+        (CompactLifting(2, 2), "state"),
         (KoopmanOperator(4), "lifted_state"),
         (LatentActionMLP(2, 4), "state"),
         (LinearActionDecoder(4, 2), "latent_action"),

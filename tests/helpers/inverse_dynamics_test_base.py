@@ -103,7 +103,8 @@ class InverseDynamicsTestBase:
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_batch_dimensions_types_keys_units_and_state_dict(self, dtype):
-        network = self.fitted(self.make_network(in_key=("in", "x")).to(dtype))
+        network = self.fitted(self.make_network().to(dtype))
+        network.set_keys(state=("in", "x"))
         state = torch.randn(2, 4, T, 3, dtype=dtype)
         written = network(TensorDict({"in": {"x": state}}, [2, 4]))
         action = written["action"]
@@ -133,7 +134,8 @@ class InverseDynamicsTestBase:
         torch.testing.assert_close(network.normalize_action(action, state), network.predict(state))
 
     def test_a_missing_entry_is_named(self):
-        network = self.make_network(in_key=("in", "x"))
+        network = self.make_network()
+        network.set_keys(state=("in", "x"))
         with pytest.raises(KeyError, match=r"reads \('in', 'x'\); there are .*'y'.*; rename with set_keys\(state="):
             network(TensorDict({"y": torch.randn(2, T, 3)}, [2]))
         if any(True for _ in network.parameters()):

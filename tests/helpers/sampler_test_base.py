@@ -49,7 +49,7 @@ class SamplerTestBase:
         sampler = self.fit(self.make_unet(num_steps=3, horizon=6), dtype=torch.float64)
         sampler.to(device=device, dtype=dtype)
         history = torch.randn(*batch, 2, 2, dtype=dtype, device=device)
-        noise = sampler.draw_noise(history)
+        noise = torch.randn(*batch, *sampler.noise_shape, dtype=dtype, device=device)
         sequence = sampler(TensorDict({"history": history, "noise": noise}, batch))[self.out_key]
         assert sequence.shape == (*batch, 6, self.width) and sequence.dtype == dtype and sequence.isfinite().all()
         flat = sampler.sample(history.reshape(-1, 2, 2), noise.reshape(-1, 6, self.width))

@@ -37,9 +37,10 @@ class InverseDynamics(TensorDictModuleBase):
             the distance to it. Default: actions are learned as they are.
         state_normalizer (nn.Module, optional): maps the columns that are read to the networks' units.
         action_normalizer (nn.Module, optional): its ``inverse`` maps predicted actions to raw units.
-        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): raw actions ``[*B, T, act]``, the last out-key; frame ``t`` holds the action from ``x_t``
-            to ``x_{t+1}``. Defaults to ``"action"``.
+
+    It reads the window of raw states ``[*B, T, d]`` from ``"state"`` and writes raw actions ``[*B, T, act]`` to
+    ``"action"``, the last out-key, unless :meth:`set_keys` says otherwise; frame ``t`` holds the action from ``x_t`` to
+    ``x_{t+1}``.
 
     Examples:
         >>> import torch
@@ -66,11 +67,9 @@ class InverseDynamics(TensorDictModuleBase):
         targets: Sequence[int] = (),
         state_normalizer: nn.Module | None = None,
         action_normalizer: nn.Module | None = None,
-        in_key: NestedKey = STATE,
-        out_key: NestedKey = ACTION,
     ):
         super().__init__()
-        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.in_keys, self.out_keys = [STATE], [ACTION]
         self.register_module("reader", reader)  # where a part holds it, a property of the subclass finds it there
         self.columns = None if columns is None else list(columns)
         self.targets = list(targets)
@@ -230,7 +229,7 @@ class LatentInverseDynamics(InverseDynamics):
         action_decoder (nn.Module): maps latents to actions in normalised units.
 
     Keyword Args:
-        **kwargs: columns, normalisers and keys, see :class:`InverseDynamics`.
+        **kwargs: columns and normalisers, see :class:`InverseDynamics`.
 
     Examples:
         >>> import torch

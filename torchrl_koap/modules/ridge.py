@@ -18,6 +18,7 @@ DEFAULT_PENALTY = 0.15
 # variance of the errors of plans that recorded steps do not show, in units of the mean square norm of the inputs: where
 # thousands of steps are labelled, a penalty chosen by them alone was followed by fewer successes in closed loop
 INPUT_NOISE = 1e-8
+SHARED_PENALTY = 0.02  # assumed ratio of noise to signal variance where all axes share one filter
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def ridge(
     return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, best, errors, len(x))
 
 
-def shared_filter(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -> Tensor:
+def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
     r"""Fits one filter ``w [S]`` that all axes share: the prior mean of a decoder that has few labels.
 
     .. math::
@@ -161,13 +162,10 @@ def shared_filter(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -> Te
     Args:
         steps (Tensor): steps ``v`` of each axis' own coordinate, ``[N, S, act]``, raw units.
         action (Tensor): actions ``[N, act]``, raw units.
-
-    Keyword Args:
-        penalty (float): assumed ratio of noise to signal variance. Defaults to ``0.02``.
     """
     rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
     unit = rows.square().sum(-1).mean()
-    gram = rows.mT @ rows + penalty * unit * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
+    gram = rows.mT @ rows + SHARED_PENALTY * unit * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     return torch.linalg.solve(gram, rows.mT @ target)
 
 

@@ -10,6 +10,8 @@ from tensordict import TensorDict
 
 from torchrl_koap.modules import LinearInverseDynamics, PrincipalInverseDynamics
 
+COUNTS = "torchrl_koap.modules.baselines.regression.COUNTS"
+
 
 class TestLinearInverseDynamics(InverseDynamicsTestBase):
     latent = False
@@ -74,8 +76,7 @@ def make_windows(columns=3, num=80):
 class TestPrincipalInverseDynamics(InverseDynamicsTestBase):
     def make_network(self, seed=0, **options):
         torch.manual_seed(seed)
-        sizes = {"counts": (4,), "num_past": 2, "look_ahead": (2, 3)}
-        return PrincipalInverseDynamics(3, 2, **sizes, **normalizers(), **options)
+        return PrincipalInverseDynamics(3, 2, num_past=2, look_ahead=(2, 3), **normalizers(), **options)
 
     def fitted(self, network):
         network = super().fitted(network)
@@ -84,9 +85,10 @@ class TestPrincipalInverseDynamics(InverseDynamicsTestBase):
 
 
 @pytest.mark.parametrize("num", [30, 400])  # fewer windows than columns, and more
-def test_components_are_those_of_the_windows(num):
+def test_components_are_those_of_the_windows(num, monkeypatch):
+    monkeypatch.setattr(COUNTS, (8,))
     states = make_windows(num=num)
-    model = PrincipalInverseDynamics(3, 2, counts=(8,))
+    model = PrincipalInverseDynamics(3, 2)
     model.prepare(states)
     model.finish(states)
     rows = model.reader(states, range(8, 9)).flatten(0, -2).double()
@@ -94,10 +96,11 @@ def test_components_are_those_of_the_windows(num):
     torch.testing.assert_close((model.basis.double() @ expected.mT).abs(), torch.eye(8).double(), atol=1e-3, rtol=0)
 
 
-def test_the_number_of_components_is_chosen_by_labels_left_out():
+def test_the_number_of_components_is_chosen_by_labels_left_out(monkeypatch):
+    monkeypatch.setattr(COUNTS, (2, 48))
     states = make_windows()
     windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [80])
-    model = PrincipalInverseDynamics(3, 2, counts=(2, 48))
+    model = PrincipalInverseDynamics(3, 2)
     model.prepare(states)
     model.finish(states)
     mask = torch.zeros(80, 17, dtype=torch.bool)

@@ -78,7 +78,5 @@ def test_any_batch(batch):
 def test_bad_columns_and_shapes_are_refused():
     with pytest.raises(ValueError, match="'commands': 1"):
         ResponseModel([0, 1], [0], [0, 1])
-    with pytest.raises(ValueError, match="memory must be >= 1, got 0"):
-        ResponseModel([0], [0], [0], memory=0)
     with pytest.raises(ValueError, match=r"wanted coordinates \[n, 1, 5\]"):
         ResponseModel([0], [0], [0]).fit_ridge(torch.zeros(0, 1, 5), torch.zeros(0, 1))

@@ -221,7 +221,7 @@ def test_coordinates_have_unit_spread_the_widest_first_and_what_is_not_there_is_
 
 def test_parts_that_are_far_apart_are_joined():
     points = torch.cat([uniform(100, 2), 50 + uniform(100, 2, seed=1)])
-    coordinates = isomap(points, 2, neighbours=4)
+    coordinates = isomap(points, 2)
     assert coordinates.isfinite().all()
     near, far = coordinates[:100, 0], coordinates[100:, 0]
     assert (near.max() < far.min()) or (far.max() < near.min())

@@ -28,17 +28,11 @@ class FiniteScalarQuantizer(nn.Module):
 
     after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle one: they lie half a level
     lower, and the shift ``s`` keeps 0 at the code 0. There is no codebook to train and no term for it in a loss; a
-    codebook is the ``prod(levels)`` codes there are.
+    codebook is the 1000 codes there are of four entries with 8, 5, 5 and 5 levels; a code has two of them.
 
     Args:
         features (int): size ``m`` of what is quantised; a linear map takes it to the entries of the codes, and a second
             one the codes back to ``m``.
-
-    Keyword Args:
-        levels (sequence of int): levels of every entry, 3 or more. Defaults to two times ``(8, 5, 5, 5)``.
-
-    Raises:
-        ValueError: for fewer than 3 levels.
 
     Examples:
         >>> import torch
@@ -50,24 +44,21 @@ class FiniteScalarQuantizer(nn.Module):
         [-1.0, -1.0, 0.0, 0.0, 0.75, 1.0, 0.0, 0.5]
     """
 
-    def __init__(self, features: int, *, levels: Sequence[int] = LEVELS):
+    def __init__(self, features: int):
         super().__init__()
-        if not levels or min(levels) < 3:
-            raise ValueError(f"every entry of a code needs 3 levels or more, got levels {tuple(levels)}")
-        self.levels = tuple(levels)
-        self.project_in = nn.Linear(features, len(self.levels))
-        self.project_out = nn.Linear(len(self.levels), features)
+        self.project_in = nn.Linear(features, len(LEVELS))
+        self.project_out = nn.Linear(len(LEVELS), features)
 
     def bound(self, values: Tensor) -> Tensor:
-        """Squashes values ``[*B, len(levels)]`` to the range of the levels, which are the whole numbers in it."""
-        levels = torch.tensor(self.levels, dtype=values.dtype, device=values.device)
+        """Squashes values ``[*B, 8]`` to the range of the levels, which are the whole numbers in it."""
+        levels = torch.tensor(LEVELS, dtype=values.dtype, device=values.device)
         half_range, offset = (levels - 1) / 2, (levels % 2 == 0).to(values.dtype) / 2
         return half_range * (values + (offset / half_range).atanh()).tanh() - offset
 
     def quantize(self, values: Tensor) -> Tensor:
-        """Rounds values to codes ``[*B, len(levels)]`` in [-1, 1]; the gradient is that of :meth:`bound`."""
+        """Rounds values to codes ``[*B, 8]`` in [-1, 1]; the gradient is that of :meth:`bound`."""
         bounded = self.bound(values)
-        half = torch.tensor([number // 2 for number in self.levels], device=values.device)
+        half = torch.tensor([number // 2 for number in LEVELS], device=values.device)
         return (bounded + (bounded.round() - bounded).detach()) / half
 
     def forward(self, features: Tensor) -> Tensor:

@@ -70,24 +70,21 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
     """Decodes the leading principal components of what a window holds by ridge regression.
 
     A window is the present frame and the scaled steps around it, those that ``semi_supervised`` reads. The components
-    come from all windows, labelled or not (:meth:`finish`); their number from the held-out labelled error. Args as for
-    :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``, and:
-
-    Keyword Args:
-        counts (sequence of int): numbers of components to choose among. Defaults to ``(2, 4, 8, 16, 32, 64)``.
+    come from all windows, labelled or not (:meth:`finish`); their number, 2, 4, 8, 16, 32 or 64, from the held-out
+    labelled error. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import PrincipalInverseDynamics
         >>> states = torch.randn(60, 17, 3).cumsum(1)
-        >>> model = PrincipalInverseDynamics(3, 2, counts=(4, 48))
+        >>> model = PrincipalInverseDynamics(3, 2)
         >>> model.prepare(states), model.finish(states)
         (None, None)
         >>> windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [60])
         >>> fit = model.fit_labels(windows, torch.ones(60, 17, dtype=torch.bool))
-        >>> int(model.gate.sum()), model(windows.select("state"))["action"].shape
-        (48, torch.Size([60, 17, 2]))
+        >>> model(windows.select("state"))["action"].shape
+        torch.Size([60, 17, 2])
     """
 
     basis: Tensor
@@ -98,13 +95,12 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         state_dim: int,
         action_dim: int,
         *,
-        counts: Sequence[int] = COUNTS,
         num_past: int = 8,
         look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
         **kwargs,
     ):
         reader = WindowReader(state_dim, num_past=num_past, look_ahead=look_ahead)
-        self._counts = tuple(sorted({min(count, reader.num_features) for count in counts}))
+        self._counts = tuple(sorted({min(count, reader.num_features) for count in COUNTS}))
         super().__init__(reader, LinearActionDecoder(self._counts[-1], action_dim), **kwargs)
         self.register_buffer("basis", torch.eye(self._counts[-1], reader.num_features))
         self.register_buffer("gate", torch.ones(self._counts[-1]))

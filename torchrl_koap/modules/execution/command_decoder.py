@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +12,7 @@ from torchrl.modules import MLP
 from torchrl_koap.modules.execution.followers import Follower, blend_plan, command_rest
 from torchrl_koap.modules.normalizer import Normalizer
 
+DEPTH = 3  # hidden layers of the lifting
 FEEDBACK_GAIN = 0.3  # share of the distance to the decoded command that is gone at every step
 
 
@@ -36,7 +36,6 @@ class CommandDecoder(nn.Module):
         features (Module, optional): what the lifting reads besides, such as relative positions: from ``[*B, 1, d]`` to
             ``[*B, num_features]``.
         width (int): of the lifting ``g``, a perceptron, and of ``z``. Defaults to ``256``.
-        depth (int): its hidden layers. Defaults to ``3``.
 
     Raises:
         ValueError: if a size is below 1, or the columns of commands and actions differ in number.
@@ -59,12 +58,11 @@ class CommandDecoder(nn.Module):
         action_dim: int | None = None,
         features: nn.Module | None = None,
         width: int = 256,
-        depth: int = 3,
     ):
         super().__init__()
         if len(commands) != len(actions):
             raise ValueError(f"got {len(commands)} columns of commands and {len(actions)} of actions that change them")
-        for name, size in {"state_dim": state_dim, "commands": len(commands), "width": width, "depth": depth}.items():
+        for name, size in {"state_dim": state_dim, "commands": len(commands), "width": width}.items():
             if size < 1:
                 raise ValueError(f"{name} must be at least 1, got {size}")
         self.commands, self.actions = list(commands), list(actions)
@@ -72,7 +70,7 @@ class CommandDecoder(nn.Module):
         self.features = features
         inputs = state_dim + (0 if features is None else features.num_features)
         self.lifting = MLP(
-            inputs, width, num_cells=[width] * (depth - 1), activation_class=nn.SiLU, activate_last_layer=True
+            inputs, width, num_cells=[width] * (DEPTH - 1), activation_class=nn.SiLU, activate_last_layer=True
         )
         self.decoder = nn.Linear(width, len(actions))
         self.inputs, self.outputs = Normalizer(inputs), Normalizer(len(actions))
@@ -101,19 +99,15 @@ class CommandRegression(Follower):
         a_t = f(p_{t+1}) - f(x_t) + \rho\, (f(x_t) - c_t)
 
     with the decoded command ``f`` (:class:`CommandDecoder`), the plan ``p`` bent into the present state, the last
-    command ``c``, which the policy knows, and the feedback gain ``rho``. The first part moves what is seen; the second
-    keeps what is not seen where demonstrations had it.
+    command ``c``, which the policy knows, and the feedback gain ``rho = 0.3``. The first part moves what is seen; the
+    second keeps what is not seen where demonstrations had it.
 
     Args:
-        decoder (CommandDecoder): the command of a state, and the columns that it is about.
+        controller (CommandDecoder): the command of a state, and the columns that it is about.
 
     Keyword Args:
-        feedback_gain (float): ``rho``. Defaults to ``0.3``.
         **options: ``blend`` and ``action_rule``, which tells the other entries of the action, see
             :class:`~torchrl_koap.modules.Follower`.
-
-    Raises:
-        ValueError: if the feedback gain is not in [0, 1].
 
     Examples:
         >>> import torch
@@ -126,12 +120,6 @@ class CommandRegression(Follower):
 
     knows_command = True
 
-    def __init__(self, decoder: CommandDecoder, *, feedback_gain: float = FEEDBACK_GAIN, **options: Any):
-        super().__init__(decoder, **options)
-        if not 0 <= feedback_gain <= 1:
-            raise ValueError(f"feedback_gain must be in [0, 1], got {feedback_gain}")
-        self.feedback_gain = feedback_gain
-
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
         """The actions of the next steps; arguments as for :class:`Follower`."""
         model, now = self.controller, states[..., -1, :]
@@ -139,7 +127,7 @@ class CommandRegression(Follower):
         decoded = model(torch.cat([now.unsqueeze(-2), bent], -2))
         command, changes = observations[..., -1, model.commands], []
         for step, before in zip(decoded.diff(dim=-2).unbind(-2), decoded.unbind(-2)[:-1], strict=True):
-            changes.append(step + self.feedback_gain * (before - command))
+            changes.append(step + FEEDBACK_GAIN * (before - command))
             command = command + changes[-1]
         actions = command_rest(self.action_rule, states, plan, model.action_dim, steps)
         actions[..., model.actions] = torch.stack(changes, -2).to(actions.dtype)

@@ -27,21 +27,19 @@ class MPC(Follower):
         \min_a \sum_{k=1}^{N} |y_k - p_k|^2 + \gamma^2 |(y_N - y_{N-1}) - (p_N - p_{N-1})|^2
             + \lambda \sum_{k=0}^{N-2} |a_k - a_{k-1}|^2
 
-    with predicted positions ``y``, planned ones ``p`` and the last change ``a_{-1}``. The first change is executed, and
-    the next step looks again (dynamic matrix control: Cutler and Ramaker, 1980).
+    with predicted positions ``y``, planned ones ``p``, the last change ``a_{-1}``, ``lambda = 3``, ``gamma = 5``. The
+    first change is executed, and the next step looks again (dynamic matrix control: Cutler and Ramaker, 1980).
 
     Args:
         response (ResponseModel): the robot's response, fitted: gains are computed once (:meth:`refresh`).
 
     Keyword Args:
         look_ahead (int): ``N``, planned states that are looked at.
-        smoothness (float): ``lambda``.
-        end_speed (float): ``gamma``.
         **options: ``blend`` and ``action_rule``, which tells the entries that the response does not know, see
             :class:`~torchrl_koap.modules.Follower`.
 
     Raises:
-        ValueError: for a look-ahead below 2, or weights out of range.
+        ValueError: for a look-ahead below 2.
 
     Examples:
         >>> import torch
@@ -54,21 +52,11 @@ class MPC(Follower):
 
     knows_command = True
 
-    def __init__(
-        self,
-        response: ResponseModel,
-        *,
-        look_ahead: int,
-        smoothness: float = SMOOTHNESS,
-        end_speed: float = END_SPEED,
-        **options: Any,
-    ):
+    def __init__(self, response: ResponseModel, *, look_ahead: int, **options: Any):
         super().__init__(response, num_frames=response.history, **options)
         if look_ahead < 2:
             raise ValueError(f"look_ahead must be at least 2, got {look_ahead}")
-        if smoothness <= 0 or end_speed < 0:
-            raise ValueError(f"smoothness must be > 0 and end_speed >= 0, got {smoothness} and {end_speed}")
-        self.look_ahead, self.smoothness, self.end_speed = look_ahead, smoothness, end_speed
+        self.look_ahead = look_ahead
         for name in ("follow_gain", "keep_gain"):
             self.register_buffer(name, None, persistent=False)
         self.refresh()
@@ -83,14 +71,14 @@ class MPC(Follower):
         axes, steps = self.controller.num_axes, self.look_ahead
         effect = self.controller.impulse_matrix(steps).reshape(steps * axes, (steps - 1) * axes)
         own = torch.eye(axes).to(effect)
-        end = self.end_speed * torch.cat([-own, own], 1)
+        end = END_SPEED * torch.cat([-own, own], 1)
         measured = torch.eye(steps * axes).to(effect)
         measured = torch.cat([measured, torch.cat([end.new_zeros(axes, (steps - 2) * axes), end], 1)])
         effect = measured @ effect
         rough = torch.eye(steps - 1) - torch.diag(torch.ones(steps - 2), -1)
         rough = torch.kron(rough.to(effect), own)
-        inverse = torch.linalg.inv(effect.T @ effect + self.smoothness * rough.T @ rough)
-        self.follow_gain, self.keep_gain = inverse @ effect.T @ measured, self.smoothness * inverse[:, :axes]
+        inverse = torch.linalg.inv(effect.T @ effect + SMOOTHNESS * rough.T @ rough)
+        self.follow_gain, self.keep_gain = inverse @ effect.T @ measured, SMOOTHNESS * inverse[:, :axes]
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
         """The actions of the next steps, as if the robot answered as predicted; beyond the look-ahead it is held."""

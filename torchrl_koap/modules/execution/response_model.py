@@ -8,15 +8,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-MEMORY = 2  # past steps, and past changes of the command, that the model reads
-
 
 class ResponseModel(nn.Module):
     r"""Predicts measured positions from position commands by linear dynamics of delayed coordinates.
 
     An arm under its tracking law is behind its command, and how far tells where it goes next. The coordinates of the
     model are the last steps of the measured positions ``x``, the distance from there to the command ``c``, and the last
-    changes of the command ``a``:
+    changes of the command ``a``, ``m = 2`` of each:
 
     .. math::
         x_{t+1} = x_t + \sum_{k=0}^{m-1} A_k (x_{t-k} - x_{t-k-1}) + C (c_t - x_t) + \sum_{k=1}^{m} B_k a_{t-k},
@@ -34,7 +32,6 @@ class ResponseModel(nn.Module):
     Keyword Args:
         action_dim (int, optional): entries of an action. Default: those that move an axis.
         absolute (bool): an action is the command itself instead of its change. Defaults to ``False``.
-        memory (int): ``m``.
 
     Raises:
         ValueError: if the numbers of columns differ, or are 0.
@@ -49,6 +46,8 @@ class ResponseModel(nn.Module):
         [4.0, 6.0, 7.0]
     """
 
+    memory = 2  # past steps, and past changes of the command, that are read
+
     def __init__(
         self,
         states: Sequence[int],
@@ -57,18 +56,15 @@ class ResponseModel(nn.Module):
         *,
         action_dim: int | None = None,
         absolute: bool = False,
-        memory: int = MEMORY,
     ):
         super().__init__()
         sizes = {"states": len(states), "commands": len(commands), "actions": len(actions)}
         if len(set(sizes.values())) > 1 or not len(states):
             raise ValueError(f"states, commands and actions need one column per axis each, got {sizes}")
-        if memory < 1:
-            raise ValueError(f"memory must be >= 1, got {memory}")
         self.states, self.commands, self.actions = list(states), list(commands), list(actions)
         self.action_dim = len(self.actions) if action_dim is None else action_dim
-        self.absolute, self.memory = absolute, memory
-        self.register_buffer("weight", torch.zeros(len(states), len(states), 2 * memory + 1))
+        self.absolute = absolute
+        self.register_buffer("weight", torch.zeros(len(states), len(states), 2 * self.memory + 1))
 
     @property
     def num_axes(self) -> int:

@@ -21,6 +21,8 @@ MOST_WINDOWS = 2000  # for the covariance of the noise; neighbouring windows hol
 MIN_NOISE = 0.5  # no sum of columns is believed to have less than so much of the noise that independent columns give it
 MIN_RATIO = 2.0  # a component with less variance than so many times the noise's is left out
 AVERAGED, MEANS = 5, 2000  # frames of each mean, and means, that Isomap finds coordinates of
+NEIGHBOURS, LANDMARKS = 12, 200  # points that each is joined to at first, and points from which ways are measured
+COMPONENTS = 64  # at most
 PRETRAINING_UPDATES, PRETRAINING_RATE = 1000, 3e-3  # with which the networks learn these coordinates
 BATCH = 2048  # windows that are lifted at once
 GAIN = 0.7  # twice the coordinates are read if they leave less than this share of the reconstruction error
@@ -102,7 +104,7 @@ def _credible(noise: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def isomap(points: Tensor, dims: int, *, neighbours: int = 12, landmarks: int = 200) -> Tensor:
+def isomap(points: Tensor, dims: int) -> Tensor:
     r"""Computes coordinates whose straight distances are those along the surface, as nearly as so many can be.
 
     .. math::
@@ -113,12 +115,8 @@ def isomap(points: Tensor, dims: int, *, neighbours: int = 12, landmarks: int = 
     landmarks (de Silva and Tenenbaum 2003). Where the graph falls apart it gets more neighbours until it does not.
 
     Args:
-        points (Tensor): ``[N, d]``; the first ``landmarks`` of them are the landmarks, so they should be in no order.
+        points (Tensor): ``[N, d]``; the first 200 of them are the landmarks, so they should be in no order.
         dims (int): number ``m`` of coordinates. Those that the landmarks do not span are 0.
-
-    Keyword Args:
-        neighbours (int): nearest points that each is joined to. Defaults to ``12``.
-        landmarks (int): points from which ways are measured. Defaults to ``200``.
 
     Returns:
         Tensor: ``[N, m]``, the one of widest spread first, each at unit spread.
@@ -128,8 +126,8 @@ def isomap(points: Tensor, dims: int, *, neighbours: int = 12, landmarks: int = 
     """
     if len(points) < 2:
         raise ValueError(f"coordinates along a surface need at least two points, got {len(points)}")
-    chosen = min(landmarks, len(points))
-    ways = _shortest_ways(points.double(), neighbours, chosen) ** 2  # [landmarks, N]
+    chosen = min(LANDMARKS, len(points))
+    ways = _shortest_ways(points.double(), chosen) ** 2  # [landmarks, N]
     own = ways[:, :chosen]
     centred = own - own.mean(0) - own.mean(1, keepdims=True) + own.mean()
     values, vectors = np.linalg.eigh(-centred / 2)
@@ -144,9 +142,9 @@ def isomap(points: Tensor, dims: int, *, neighbours: int = 12, landmarks: int = 
     return torch.nn.functional.pad(torch.from_numpy(coordinates), (0, dims - count)).to(points)
 
 
-def _shortest_ways(points: Tensor, neighbours: int, landmarks: int) -> np.ndarray:
+def _shortest_ways(points: Tensor, landmarks: int) -> np.ndarray:
     """Lengths ``[landmarks, N]`` of the shortest ways over the graph, from the first points to all."""
-    distances, count = torch.cdist(points, points), len(points)
+    distances, count, neighbours = torch.cdist(points, points), len(points), NEIGHBOURS
     while True:
         near, index = distances.topk(min(neighbours + 1, count), largest=False)
         row = torch.arange(count)[:, None].expand_as(index)
@@ -175,7 +173,6 @@ class CompactLifting(TensorDictModuleBase):
         coordinates (int): ``m``; a lifted state has ``3 m`` entries.
 
     Keyword Args:
-        num_components (int): number of components at most. Defaults to ``64``.
         hidden_dims (sequence of int): widths of all networks. Defaults to ``(128, 128)``.
         in_key (NestedKey): states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): lifted states ``[*B, T, 3 m]``. Defaults to ``"lifted_state"``.
@@ -189,7 +186,6 @@ class CompactLifting(TensorDictModuleBase):
         state_dim: int,
         coordinates: int,
         *,
-        num_components: int = 64,
         hidden_dims: Sequence[int] = (128, 128),
         in_key: NestedKey = STATE,
         out_key: NestedKey = LIFTED_STATE,
@@ -197,7 +193,7 @@ class CompactLifting(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.state_dim, self.coordinates, self.latent_dim = state_dim, coordinates, 3 * coordinates
-        self.components = NoiseAdjustedComponents(state_dim, min(num_components, state_dim))
+        self.components = NoiseAdjustedComponents(state_dim, min(COMPONENTS, state_dim))
         count = len(self.components.weights)
         self.small = KoopmanLifting(count, coordinates, hidden_dims=hidden_dims, linear_skip=True)
         self.large = KoopmanLifting(count, 2 * coordinates, hidden_dims=hidden_dims, linear_skip=True)

@@ -160,11 +160,6 @@ class ConditionalSampler(TensorDictModuleBase):
             predicted = self.denoiser(noisy, time, condition)
         return (predicted - sequence).square()
 
-    def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Draws start noise ``[*B, H, width]`` for histories ``[*B, h, d]``, standard normal."""
-        shape = (*history.shape[:-2], *self.noise_shape)
-        return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
-
     def sample(
         self,
         history: Tensor,
@@ -186,8 +181,9 @@ class ConditionalSampler(TensorDictModuleBase):
             ValueError: for a history, noise or prefix of another shape.
         """
         condition = self.encode_history(history)
-        noise = self.draw_noise(history, generator) if noise is None else noise
         expected = (*history.shape[:-2], *self.noise_shape)
+        if noise is None:
+            noise = torch.randn(expected, dtype=history.dtype, device=history.device, generator=generator)
         if noise.shape != expected:
             raise ValueError(
                 f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, columns]), got {list(noise.shape)}"
