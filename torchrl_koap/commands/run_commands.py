@@ -36,6 +36,7 @@ from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies.table import result_rows
 from torchrl_koap.tasks import Task
 from torchrl_koap.training import TrainConfig, Trained, train
+from torchrl_koap.training.lerobot_folder import write_lerobot_folder
 
 
 @dataclass(kw_only=True)
@@ -164,16 +165,18 @@ class Latency(Command):
 
 @dataclass(kw_only=True)
 class Export(Command):
-    """Write a policy for torch.export, ONNX Runtime or AOTInductor.
+    """Write a policy for torch.export, ONNX Runtime, AOTInductor or LeRobot.
 
-    Each part is compared with the original (1e-5); policy.json says how to call it.
+    Each part is compared with the original (1e-5); policy.json says how to call it. For LeRobot the weights stay as
+    they are.
 
     Example: `koap export runs/arm --format onnx`
 
     Attributes:
         run: run directory of `koap train`, or pretrained:NAME.
         out: folder to write (default: RUN/exported).
-        format: "torch" (torch.export), "onnx" (ONNX Runtime) or "aoti" (AOTInductor, needs a C++ compiler).
+        format: "torch" (torch.export), "onnx" (ONNX Runtime), "aoti" (AOTInductor, needs a C++ compiler) or "lerobot"
+            (a folder for lerobot-eval and lerobot-record).
         threads: torch threads.
         latency: time the exported parts against eager ones.
     """
@@ -186,11 +189,13 @@ class Export(Command):
 
     def __call__(self) -> dict[str, Any]:
         """Exports, compares, times."""
-        suffix = lookup(SUFFIXES, self.format, "export format")
+        suffix = lookup(SUFFIXES | {"lerobot": None}, self.format, "export format")
         set_up_torch(self.threads, "cpu")
         trained = Trained.load(self.run)
-        policy = load_policy(trained)
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
+        if suffix is None:
+            return write_lerobot_folder(trained, out)
+        policy = load_policy(trained)
         out.mkdir(parents=True, exist_ok=True)
         parts = [part for part in PARTS if part != "controller" or isinstance(policy.follower, InverseDynamicsFollower)]
         columns, result, about = _columns(trained.task), dict[str, Any](), dict[str, Any]()

@@ -240,3 +240,12 @@ def test_without_pyarrow_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pyarrow" else find_spec(name))
     with pytest.raises(RuntimeError, match=r"pip install 'torchrl_koap\[lerobot\]'"):
         read_lerobot(root)
+
+
+def test_columns_of_the_surroundings_are_told_by_their_names(tmp_path):
+    named = {"dtype": "float32", "shape": [1], "names": {"keypoints": ["x"]}}
+    features = {("observation.environment_state" if "force" in key else key): value for key, value in FEATURES.items()}
+    features["observation.environment_state"] = named
+    change = {"observation.environment_state": pa.array(np.arange(12.0))}
+    recordings = read_lerobot(write(tmp_path, features=features, change=change))
+    assert recordings.state_names == (*JOINTS, "environment_state_x")

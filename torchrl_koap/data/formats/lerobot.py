@@ -28,6 +28,7 @@ from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, some
 
 PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
+SURROUNDINGS = "observation.environment_state"  # its columns are told by their names, which begin like it
 EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
 IMAGES = ("image", "video")
 _INFO = "meta/info.json"
@@ -240,7 +241,7 @@ def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
     if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
         given = given[0]
     if isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given):
-        return given
+        return given if name != SURROUNDINGS else [f"{short}_{label}" for label in given]
     return [short] if width == 1 else [f"{short}_{index}" for index in range(width)]
 
 
