@@ -25,7 +25,7 @@ import torch
 from torchrl_koap.envs import ManipulationEnv
 from torchrl_koap.envs.registry import make_env
 
-# control steps per second of the original on one core (docs/d3il.md, Repeatability)
+# control steps per second of the original on one core (docs/appendix/d3il.md, Repeatability)
 ANCHORS = {"avoiding": 26.0, "aligning": 27.5, "sorting": 19.0, "stacking": 80.5}
 
 

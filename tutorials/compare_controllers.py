@@ -5,18 +5,18 @@ Which controller? What labels and unlabelled data add
 
 **What you will learn**
 
-* how the same budget of labels is spent by a ridge, by supervised networks and by KOAP,
-* which controls tell *why* a method works: KOAP untrained, KOAP without the unlabelled data, a ridge on KOAP's inputs,
-* where on the path the differences lie, and how a controller of your own takes part.
+* how ridge regression, supervised networks and KOAP compare on the same labels,
+* which controls show *why* a method works: random features, no unlabelled data, ridge regression on KOAP's inputs,
+* how to compare a controller of your own.
 
-Run it with ``python tutorials/compare_controllers.py``; it leaves ``compare_controllers.png`` behind.
+Run it with ``python tutorials/compare_controllers.py``; it writes ``compare_controllers.png``.
 """
 
 # %%
 # One set of demonstrations, several budgets
 # ------------------------------------------
-# ``LabelBudget`` hides every action outside the budget. With one seed a larger budget contains every smaller one, so
-# that curves do not depend on the draw. Three seeds show how much of a difference is chance.
+# ``LabelBudget`` hides every action outside the budget. A larger budget of the same seed contains the smaller ones.
+# Three seeds show how large chance is.
 
 import statistics
 
@@ -47,8 +47,8 @@ def rmse_mm(predicted, true):
 # %%
 # A controller of your own
 # ------------------------
-# Any module with these four attributes is a controller: it works in ``make_policy`` and below. This one says that
-# the command moves as fast as the arm will, times one number that it fits to the labels.
+# Any module with these four attributes is a controller for ``make_policy``. This one assumes that the command moves as
+# fast as the arm will. It fits one factor to the labels.
 
 
 class Proportional(TensorDictModuleBase):
@@ -80,8 +80,7 @@ def proportional(data):
 # %%
 # The comparison
 # --------------
-# ``fit`` is the recipe of ``koap train`` in memory, for every method by its name. Errors are measured on
-# trajectories of which no label was in the budget; those labels are read here and nowhere else.
+# ``fit`` trains in memory as ``koap train`` does. Errors are measured on trajectories without a label in the budget.
 
 titles = {
     "linear": "ridge on raw frames",
@@ -119,9 +118,8 @@ for name, title in titles.items():
 # %%
 # What did the unlabelled data add?
 # ---------------------------------
-# Read the last lines in pairs, draw by draw. ``koap`` against ``koap_labelled_only``: the same network, with and
-# without the 47 demonstrations that have no labels. ``koap`` against ``koap_untrained``: the same features, random
-# instead of trained. Where an interval crosses 0 there is no significant difference.
+# Compare the last lines draw by draw. ``koap_labelled_only`` is ``koap`` without the 47 unlabelled demonstrations.
+# ``koap_untrained`` has random features. Where an interval contains 0 there is no significant difference.
 
 print("\ndifference to KOAP in mm, draw by draw (below 0: better than KOAP)")
 for name in ("koap_untrained", "koap_labelled_only", "linear_steps", "dd_lookahead"):
@@ -154,11 +152,10 @@ figure.savefig("compare_controllers.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# The three lines of KOAP lie on each other: with its features random, or without the 47 demonstrations that have no
-# labels, it is as good. On Avoiding the scaled inputs, the Fourier features and the closed-form decoder do the work;
-# the Koopman loss and the unlabelled data add nothing that is seen here. They are shown 150 updates, but the committed
-# study with 1,000 says the same. A comparison without these controls would have credited the loss with all of it.
-# Supervised networks and the plain ridge need more labels for less. Small actions or large ones make no difference.
+# The three lines of KOAP coincide. Random features do as well, and so does KOAP without the unlabelled demonstrations.
+# On Avoiding the scaled inputs, the Fourier features and the closed-form decoder decide. Trainings here have 150
+# updates; the study with 1,000 agrees. Supervised networks and ridge regression on raw frames need more labels. The
+# size of the actions makes no difference.
 #
-# An action error is not a success rate: ``koap curve`` puts planner, controller and environment together, over seeds,
-# with intervals and paired comparisons. Unlabelled data train the *planner*.
+# An action error is not a success rate. ``koap curve`` measures success, with intervals and paired comparisons.
+# Unlabelled data train the *planner*.

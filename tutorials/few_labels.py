@@ -5,18 +5,18 @@ Imitation with few action labels.
 
 **What you will learn**
 
-* how demonstrations with and without action labels lie in one replay buffer,
-* how a Koopman inverse dynamics model turns state sequences into latent actions, and a handful of labels into actions,
+* how demonstrations with and without actions share one replay buffer,
+* how a Koopman inverse dynamics model maps states to latent actions, and latent actions to actions,
 * how planner and controller become one policy in a TorchRL environment.
 
-Run it with ``python tutorials/few_labels.py``; it takes about a minute and leaves ``few_labels.png`` behind.
+Run it with ``python tutorials/few_labels.py``; it takes about a minute and writes ``few_labels.png``.
 """
 
 # %%
 # Demonstrations, most of them without actions
 # --------------------------------------------
-# Scripted players steer the Panda's rod around six cylinders. The label budget keeps the actions of two of the 48
-# trajectories. Everywhere else the action is NaN and ``has_action`` is False: a leak gives NaN losses.
+# Scripted experts steer the rod around six cylinders. The label budget keeps the actions of two of the 48 trajectories.
+# Elsewhere the action is NaN and ``has_action`` is False, so a leak gives NaN losses.
 
 from pathlib import Path
 
@@ -53,8 +53,8 @@ print(f"labels: {report.labelled_transitions} of {report.total_transitions} tran
 # %%
 # Latent actions from states alone
 # --------------------------------
-# ``KOAPLoss`` trains lifting, operator and latent actions on *all* windows; without labels its action term is exactly
-# zero. Normalisers see states of all trajectories, but actions only within the budget.
+# ``KOAPLoss`` trains lifting, operator and latent actions on *all* windows. Without labels its action term is zero.
+# Normalisers read all states, but only actions of the budget.
 
 inverse_dynamics = make_koopman_inverse_dynamics(
     2,
@@ -73,7 +73,7 @@ for _ in range(200):
     optimizer.zero_grad()
 
 # %%
-# The labels are spent last: the linear decoder is fitted to them in closed form.
+# Last, the linear decoder is fitted to the labels in closed form.
 
 fit = fit_closed_form(inverse_dynamics, data, axes=task.moved_columns())
 print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
@@ -81,7 +81,7 @@ print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 # %%
 # A planner over states
 # ---------------------
-# It never sees an action. Recovery augmentation shows it states off the demonstrated path, and the way back.
+# It reads no action. The augmentation displaces states from the demonstrated path and adds the way back.
 
 planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, relative=False, num_steps=5)
 extended = extrapolate_ends(data, 13)
@@ -101,8 +101,8 @@ planner_loss.target_network_params.to_module(planner)
 # %%
 # Rollouts
 # --------
-# One episode per environment, all in one batch, each with its own seed. A thousand updates make a planner that is far
-# from finished: compare the picture with the one that ``make demo`` draws.
+# Every environment of the batch runs one episode with its own seed. The planner has 1,000 updates; ``make demo`` trains
+# longer.
 
 policy = make_policy(planner, inverse_dynamics, state_of=task.state_columns)
 seeds = list(range(24))
@@ -117,7 +117,7 @@ print(f"success {rate:.1f} % ({low:.0f}-{high:.0f}) of {len(seeds)} rollouts")
 print(f"{result['distinct_modes']} of {task.num_modes} ways taken, entropy {result['mode_entropy']:.2f}")
 
 # %%
-# Every module works alone as well: the latent actions of any window of states are one call away.
+# Every module works alone as well, for example to compute latent actions of a window.
 
 latent = inverse_dynamics(TensorDict({"state": extended["state"][None, :16]}, batch_size=[1]))["latent_action"]
 print("latent actions of a window:", tuple(latent.shape))
@@ -125,8 +125,7 @@ print("latent actions of a window:", tuple(latent.shape))
 # %%
 # Conclusion
 # ----------
-# Two labelled trajectories out of 48 were enough to act on plans made from states alone. ``result`` holds the success
-# rate with its Wilson interval, ``report`` every label that was touched, ``fit`` the penalty of the decoder.
+# Two labelled trajectories out of 48 were enough. ``result`` holds the success rate with its interval. ``report``
+# counts the labels that were used.
 #
-# Further reading: ``koap train --help`` for the same in one command, ``docs/results.md`` for what each choice
-# brings.
+# ``koap train --help`` does the same in one command. ``docs/results.md`` shows what each choice brings.

@@ -8,14 +8,14 @@ A Gymnasium environment with most actions hidden
 * how recordings of any Gymnasium environment become a data set, most of them without actions,
 * how a policy trained on them is rolled out in that environment, and what success is there.
 
-Run it with ``python tutorials/gymnasium_robot.py``; it leaves ``gymnasium_robot.png`` behind.
+Run it with ``python tutorials/gymnasium_robot.py``; it writes ``gymnasium_robot.png``.
 """
 
 # %%
 # The environment
 # ---------------
-# ``PointMaze`` of gymnasium-robotics: a ball in a U-shaped maze, pushed by a force. A policy sees one flat row of
-# columns, so a wrapper lays position, velocity and goal side by side and repeats every force for four steps (25 Hz).
+# ``PointMaze`` of gymnasium-robotics has a ball in a U-shaped maze, pushed by a force. A policy reads one flat row of
+# columns. The wrapper lays position, velocity and goal side by side. It repeats every force for four steps (25 Hz).
 
 import tempfile
 from pathlib import Path
@@ -69,8 +69,8 @@ gymnasium.register("FlatMaze-v0", entry_point=FlatMaze, max_episode_steps=150)
 # %%
 # Demonstrations
 # --------------
-# A scripted player goes from corner to corner; how wide it takes the turns differs from episode to episode. Forty
-# episodes are recorded, and the forces of three of them are kept.
+# A scripted expert goes from corner to corner and takes its turns differently in each episode. Forty episodes are
+# recorded. Three of them keep their forces.
 
 
 def demonstrate(env, seed):
@@ -102,8 +102,8 @@ print(f"{sum(map(len, filter(lambda a: a is not None, actions)))} of {sum(steps)
 # %%
 # Training and rollouts
 # ---------------------
-# The folder holds names, units and what the actions move; the run directory holds everything else. ``koap convert``,
-# ``koap train`` and ``koap eval RUN --env FlatMaze-v0`` do the same from the shell.
+# The folder holds names, units and what the actions move. From the shell, use ``koap convert``, ``koap train`` and
+# ``koap eval RUN --env FlatMaze-v0``.
 
 folder = Path(tempfile.mkdtemp())
 data = save_demonstrations(
@@ -154,5 +154,5 @@ figure.savefig("gymnasium_robot.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# The orange paths are all that ever had actions; the route is known from the blue ones. Any environment with a flat box
-# of the task's columns can be rolled out in; one that reports success under another name takes ``--success-key``.
+# Only the orange paths had actions; the blue ones show the route. Any environment with a flat box of the task's columns
+# works. ``--success-key`` names what reports success.

@@ -5,19 +5,19 @@ A label curve on a cluster of two workers
 
 **What you will learn**
 
-* how methods, shares of labels and seeds become cells that run wherever there is a processor,
-* how to read the table: intervals, paired differences, and what a few seeds cannot tell.
+* how to train methods, shares of labels and seeds on several workers,
+* how to read the table: intervals and paired differences.
 
-Run it with ``python tutorials/label_curve.py``; it leaves ``label_curve.png`` behind. With ``ray`` installed
-(``pip install 'torchrl_koap[ray]'``) the cells are tasks of a Ray cluster on this machine, else local processes: the
-results are the same.
+Run it with ``python tutorials/label_curve.py``; it writes ``label_curve.png``. With ``ray`` installed (``pip install
+'torchrl_koap[ray]'``) the trainings are tasks of a Ray cluster on this machine, else local processes. The results are
+the same.
 """
 
 # %%
 # A small curve
 # -------------
-# Two workers, three methods, two shares of labels, two seeds: twelve cells on one planner. Networks, rollouts and
-# demonstrations are kept few so that it takes minutes; ``koap curve`` asks for the same with options of the same names.
+# Three methods, two shares of labels and two seeds make twelve trainings, called cells. They share one planner. Few
+# updates and rollouts keep the time to minutes. ``koap curve`` has options of the same names.
 
 import importlib.util
 import tempfile
@@ -91,5 +91,4 @@ if __name__ == "__main__":  # workers import this file
 # %%
 # Conclusion
 # ----------
-# On a cluster that runs already: ``koap curve --launcher ray --address auto``. Workers write to the folder of the
-# curve, which has to be one that all of them see.
+# On a running cluster, call ``koap curve --launcher ray --address auto``. All workers must see the folder of the curve.

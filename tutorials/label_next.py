@@ -5,10 +5,10 @@ Which demonstration to label next
 
 **What you will learn**
 
-* why the next labels can be chosen before anybody has made them,
-* how much a chosen label lowers the error against one drawn at random, and how much of that is chance.
+* why the next labels can be chosen before they are made,
+* how much chosen labels lower the error, compared with random ones.
 
-Run it with ``python tutorials/label_next.py``; it leaves ``label_next.png`` behind.
+Run it with ``python tutorials/label_next.py``; it writes ``label_next.png``.
 """
 
 # %%
@@ -47,9 +47,9 @@ def fit(episodes):
 # %%
 # The choice reads no label
 # -------------------------
-# The covariance of a ridge does not depend on the *values* of labels, only on where they are. ``a_optimal`` takes the
-# demonstration that lowers the decoder's mean uncertainty over all steps the most, greedily: each choice takes those
-# before it into account. ``random`` takes any.
+# The uncertainty of a ridge regression depends on the labelled states, not on the *values* of labels. ``a_optimal``
+# takes the demonstration that lowers the decoder's mean uncertainty most. It then repeats this with the chosen ones
+# added. ``random`` takes any.
 
 
 def choose(criterion, first, count):
@@ -71,8 +71,8 @@ def choose(criterion, first, count):
 # %%
 # What it gains
 # -------------
-# Errors are measured on demonstrations that no method was given labels of: the same twelve for all, kept out of every
-# choice. Six different first labels show how much is chance.
+# Errors are measured on twelve demonstrations that no method has labels of. Six different first labels show how large
+# chance is.
 
 judged = every[-12:]
 pool = torch.isin(demonstrations["episode"], torch.tensor(every[:-12]))
@@ -110,6 +110,6 @@ figure.savefig("label_next.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# ``koap suggest RUN --count 5`` does this for a trained run and prints the command that labels exactly those. On
-# Avoiding the choice lowers the error by a few percent, as most demonstrations show the same motions; read the
-# spread of the pale lines before believing more. Where demonstrations differ widely there is more to choose.
+# ``koap suggest RUN --count 5`` does this for a run and prints the command that uses the labels. On Avoiding the error
+# falls by a few percent, because most demonstrations show the same motions. The pale lines show the spread between
+# first labels.

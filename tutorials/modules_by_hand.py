@@ -5,17 +5,17 @@ The modules by hand
 
 **What you will learn**
 
-* how lifting, operator, latent action and action decoder fit together, each a TensorDict module of its own,
-* how losses, a TorchRL replay buffer and a TorchRL collector work with them, nothing of ``koap train`` in between.
+* how lifting, operator, latent action and action decoder fit together as TensorDict modules,
+* how they work with losses, a replay buffer and a collector of TorchRL.
 
-Run it with ``python tutorials/modules_by_hand.py``; it leaves ``modules_by_hand.png`` behind.
+Run it with ``python tutorials/modules_by_hand.py``; it writes ``modules_by_hand.png``.
 """
 
 # %%
 # Four parts and a model
 # ----------------------
-# The latent action ``u_t = f(x_{t-1}, x_t, x_{t+2}, x_{t+3})`` is inferred from states alone. Lifting ``z = g(x)`` and
-# operator ``z' = K z + u`` are there to give it a meaning; the decoder ``a = D u`` is all that ever needs labels.
+# The latent action ``u_t = f(x_{t-1}, x_t, x_{t+2}, x_{t+3})`` is computed from states. The loss asks lifting ``z =
+# g(x)`` and operator for ``z' = K z + u``. Only the decoder ``a = D u`` needs labels.
 
 import torch
 from matplotlib.figure import Figure
@@ -64,8 +64,8 @@ for name, part in {
 # %%
 # A replay buffer of windows, and the losses
 # ------------------------------------------
-# Windows are plain TensorDicts ``[N, 16]``, so any buffer of TorchRL holds them. ``has_action`` says where a label is;
-# elsewhere the action is NaN and reaches no gradient.
+# Windows are TensorDicts ``[N, 16]``, so any buffer of TorchRL holds them. ``has_action`` marks labels. Elsewhere the
+# action is NaN and reaches no gradient.
 
 windows = cut_windows(data, 16, select=["state", "action", "has_action"], pad_before=model.num_past)
 buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(windows)), batch_size=128)
@@ -86,7 +86,7 @@ for update in range(400):
 print(f"labels: {report.labelled_transitions} of {report.total_transitions} transitions")
 
 # %%
-# What the model says about one window: its latent actions, and how well the operator predicts the next lifted state.
+# The latent actions of one window, and how well the operator predicts the next lifted state.
 
 with torch.no_grad():
     window = model(TensorDict({"state": windows["state"][:1]}, [1]))
@@ -97,8 +97,8 @@ print("largest eigenvalues of K:", [round(value, 3) for value in radii[:4].tolis
 # %%
 # A policy in a TorchRL collector
 # -------------------------------
-# The planner is fitted shortly; ``PolicyEnv`` gives the policy the frames and the noise it reads. What comes out of the
-# collector are ordinary TorchRL batches.
+# The planner is trained for a short time. ``PolicyEnv`` adds the frames and the noise that the policy reads. The
+# collector returns ordinary TorchRL batches.
 
 planner = fit(data, task, method="linear", planner={"steps": 600}, progress=False).planner
 policy = make_policy(planner, model.eval(), state_of=task.state_columns)
@@ -128,5 +128,5 @@ figure.savefig("modules_by_hand.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# Every part can be replaced: ``make_koopman_inverse_dynamics`` builds the same model from a preset. The default one has
-# Fourier features, a nearer look-ahead and a decoder in closed form, which needs fewer labels than the gradient did.
+# Every part can be replaced. ``make_koopman_inverse_dynamics`` builds the default model: Fourier features, a nearer
+# look-ahead and a decoder in closed form. It needs fewer labels than gradients do.

@@ -5,19 +5,19 @@ Your robot's arrays to a control loop
 
 **What you will learn**
 
-* how plain arrays, most of them without actions, become a planner, a controller and a policy in memory,
-* how the policy is saved, loaded and called once per tick, and what that costs in time,
-* what can be said before it ever moves the robot.
+* how arrays, most of them without actions, become a policy,
+* how to save it, load it and call it once per tick, and how long that takes,
+* what to measure before it moves the robot.
 
-Run it with ``python tutorials/own_robot.py``; it leaves ``own_robot.png`` behind.
+Run it with ``python tutorials/own_robot.py``; it writes ``own_robot.png``.
 """
 
 # %%
 # What was recorded
 # -----------------
-# Put your own recordings here: frames ``[T, d]`` of every trajectory, and commands ``[T - 1, a]`` of the few that have
-# them. In this example the robot is an arm of two joints that follows velocity commands with a lag. A person moved it
-# to a goal, around an upright pole, on either side.
+# Put your own recordings here: frames ``[T, d]`` of every trajectory, and commands ``[T - 1, a]`` of a few. The example
+# is an arm of two joints that follows velocity commands with a lag. A person moved it to a goal, around an upright
+# pole, on either side.
 
 import tempfile
 from pathlib import Path
@@ -70,7 +70,7 @@ actions = [commands if index < 3 else None for index, (_, commands) in enumerate
 # %%
 # Planner, controller, policy
 # ---------------------------
-# ``robot`` names the columns that the commands move; the goal is planned for, not commanded.
+# ``robot`` names the columns that the commands move. The goal is planned, not commanded.
 
 data, task = torchrl_koap.make_demonstrations(
     states, actions, control_hz=30, state_names=NAMES, state_units="rad", action_units="rad/s", robot=NAMES[:2]
@@ -86,8 +86,8 @@ for name in ("linear", "dd", "koap"):
 # %%
 # Before it moves
 # ---------------
-# Without a simulator the commands decoded from *recorded* joints are compared with the recorded ones. The training was
-# given no labels of these trajectories; here their commands happen to be known.
+# Commands predicted from *recorded* joints are compared with recorded commands. The training had no labels of these
+# trajectories; in this example they are known.
 
 columns = list(task.controller_columns("robot"))
 for name, controller in ((name, each.controller) for name, each in trained.items()):
@@ -104,8 +104,8 @@ for name, controller in ((name, each.controller) for name, each in trained.items
 # %%
 # The control loop
 # ----------------
-# One file holds weights, statistics and the task. ``act`` takes what the robot reads and returns the command of this
-# tick; frames, plans and random numbers are kept inside.
+# One file holds weights, statistics and the task. ``act`` takes the measured state and returns the command of this
+# tick.
 
 file = Path(tempfile.mkdtemp()) / "arm.safetensors"
 trained["koap"].save(file)
@@ -147,7 +147,6 @@ figure.savefig("own_robot.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# Sixty trajectories showed where to go and three how to get there. For the trials that miss, a longer training of the
-# planner (the default is more than ten times as long) is the first thing to try. The time per tick is that of the
-# machine that made this page. An ``AsynchronousAgent`` plans in a thread. From the shell it is ``koap convert``, ``koap
-# train`` and ``koap eval``. They report errors of plans and commands on held-out trajectories.
+# Three of sixty trajectories had commands. If trials miss, train the planner longer first; the default is more than ten
+# times as long. An ``AsynchronousAgent`` plans in a thread. From the shell, use ``koap convert``, ``koap train`` and
+# ``koap eval``. The time per tick is that of the machine that made this page.

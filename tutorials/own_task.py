@@ -5,18 +5,18 @@ A task of your own, with an object
 
 **What you will learn**
 
-* what a task is: columns, units, goal, modes and a scene in one place, environment and expert named by import strings,
-* how little an environment and a scripted expert have to offer,
-* that everything else then works: balanced demonstrations, contexts, training, rollouts, pictures.
+* what a task holds: columns, units, goal, modes and a scene,
+* what an environment and a scripted expert must provide,
+* how to record demonstrations, train, roll out and draw with them.
 
-Run it with ``python tutorials/own_task.py``; it leaves ``own_task.png`` behind.
+Run it with ``python tutorials/own_task.py``; it writes ``own_task.png``.
 """
 
 # %%
 # The task
 # --------
-# A robot pushes a puck past a post, on the left or on the right, into a goal. Facts and rules only, no simulator. In a
-# package of yours this would be ``my_package/task.py``, and ``koap train --plugin my_package.task`` would know it.
+# A robot pushes a puck past a post, on the left or on the right, into a goal. A task holds facts, no simulator. In a
+# package of yours this is ``my_package/task.py``, for ``koap train --plugin my_package.task``.
 
 import sys
 import tempfile
@@ -89,8 +89,8 @@ print(f"the planner sees {task.state_names}, the controller {[task.state_names[c
 # %%
 # The environment
 # ---------------
-# A native-batch TorchRL environment. Besides ``observation``, reward and done it writes ``success``, ``mode`` and the
-# ``context`` it began in: the place of the puck, drawn from the task's start regions or handed over.
+# A native-batch TorchRL environment. It also writes ``success``, ``mode`` and the ``context`` of the episode, which is
+# the place of the puck. Contexts are drawn from the task's start regions or given.
 
 
 class PushEnv(EnvBase):
@@ -149,7 +149,7 @@ class PushEnv(EnvBase):
 # %%
 # The expert
 # ----------
-# It is told a mode per episode, and says what to do and when it is done. What it fails at is discarded and counted.
+# It gets a mode per episode, returns actions and says when it is done. Failed episodes are discarded and counted.
 
 
 class PushExpert(Expert):
@@ -184,7 +184,7 @@ class PushExpert(Expert):
 # %%
 # Everything else is there
 # ------------------------
-# Demonstrations balanced over modes, a training with 5 % of the labels, rollouts from places the training never saw.
+# Now record demonstrations balanced over modes, train with 5 % of the labels and roll out from new places.
 
 folder = Path(tempfile.mkdtemp())
 print(record_to_folder(folder / "demos", task, task.defaults.demonstrations))
@@ -215,5 +215,5 @@ figure.savefig("own_task.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# Task, environment and expert are the three files to write. A robot with data and no simulator needs none of them:
+# Write three files: task, environment and expert. For recordings without a simulator you need none:
 # ``save_demonstrations`` writes the task beside the data.

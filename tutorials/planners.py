@@ -5,18 +5,18 @@ Planners: solvers, steps, temperature, modes
 
 **What you will learn**
 
-* how many solver steps a plan needs, and what is lost first when there are too few,
+* how many solver steps a plan needs,
 * what a lower temperature does to success and to the variety of modes,
-* how to ask a planner alone, without controller or simulator, whether it knows several ways.
+* how to see without a simulator whether a planner knows several ways.
 
-Run it with ``python tutorials/planners.py``; it leaves ``planners.png`` behind.
+Run it with ``python tutorials/planners.py``; it writes ``planners.png``.
 """
 
 # %%
 # A trained planner
 # -----------------
-# The repository holds a policy for Avoiding. Nothing is trained here: solver, steps and temperature are choices of the
-# *evaluation*.
+# The repository holds a policy for Avoiding. Solver, steps and temperature are options of the *evaluation*, so nothing
+# is trained here.
 
 import time
 
@@ -36,8 +36,8 @@ planner = load_policy(run).planner
 # %%
 # One situation, many plans
 # -------------------------
-# The rod stands below the middle of the second row. 200 plans from the same two frames: how many go left, how many
-# right, and how many through a cylinder?
+# The rod stands below the middle of the second row. Of 200 plans from the same two frames, how many go left, and how
+# many through a cylinder?
 
 here = torch.tensor([[0.5, -0.02], [0.5, -0.013]]).expand(200, 2, 2)
 
@@ -65,7 +65,7 @@ for solver in ("ddim", "dpm++2m"):
 # %%
 # The same in closed loop
 # -----------------------
-# 24 rollouts each, of the same seeds. Success alone does not tell: look at the entropy of the modes too.
+# Each setting has 24 rollouts with the same seeds. Read the entropy of the modes beside the success.
 
 seeds = list(range(24))
 
@@ -114,7 +114,6 @@ figure.savefig("planners.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# A single step draws the *mean* of the ways, the same for all; with ten the plans fan out. In closed loop few steps
-# cost variety before they cost much success: the entropy of the modes is lower and fewer ways are taken, while most
-# rollouts still succeed. The two solvers hardly differ here. What a temperature does to success cannot be told from 24
-# rollouts, whose intervals are 25 points wide. Times are those of the machine that made this page, beside other work.
+# One solver step gives the *mean* of all ways; with ten the plans differ. In closed loop, few steps lower the entropy
+# more than the success. The two solvers hardly differ. 24 rollouts are too few to see what the temperature does to
+# success: their intervals are 25 points wide. Times are those of the machine that made this page.

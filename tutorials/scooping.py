@@ -5,20 +5,20 @@ From videos without actions to a scooping robot
 
 **What you will learn**
 
-* how videos of a robot and of a hand become one data set of embeddings, by a network that nobody trained for it,
-* how a planner learns from all of them, and how five demonstrations with joint targets are enough to follow its plans,
-* what a small set like this one reaches, and what it does not tell.
+* how a frozen network turns videos of a robot and of a hand into one data set of embeddings,
+* how a planner learns from all videos, and a controller from five demonstrations with joint targets,
+* what a small set like this one reaches, and what it does not show.
 
-Run it with ``python tutorials/scooping.py``; it needs the extra ``vision`` and an OpenGL library, and leaves
-``scooping.png`` behind.
+Run it with ``python tutorials/scooping.py``; it needs the extra ``vision`` and an OpenGL library, and writes
+``scooping.png``.
 """
 
 # %%
 # Two kinds of videos
 # -------------------
-# A spoon takes pieces out of a bowl, ten frames a second. The robot's recordings come with joint targets. They will be
-# hidden in all but five demonstrations. The hand has neither joints nor labels. It differs in look, speed and
-# approach. From the shell this is ``koap demos --task scooping --embodiment robot``, or ``hand``.
+# A spoon takes pieces out of a bowl, filmed at ten frames a second. The robot's recordings have joint targets. All but
+# five demonstrations lose them. The hand has neither joints nor labels, and differs in look, speed and approach. From
+# the shell: ``koap demos --task scooping --embodiment robot``, or ``hand``.
 
 import tempfile
 from pathlib import Path
@@ -50,10 +50,9 @@ for embodiment in ("robot", "hand"):
 # %%
 # Frames to embeddings
 # --------------------
-# EfficientNet-Lite0 has seen ImageNet and nothing else. Averages over a coarse grid keep where things are; their
-# principal components are fitted on these frames, without any label. A linear map from embeddings to the spoon's
-# position tells what they keep of it. It is fitted on three quarters of the robot's videos and tested on the others.
-# The policy never sees the position.
+# EfficientNet-Lite0 was trained on ImageNet. Averages over a coarse grid keep positions. Principal components are
+# fitted on these frames, without labels. To test them, a linear map from embeddings to the spoon's position is fitted
+# on 75 % of the robot's videos. The policy never reads the position.
 
 sources, _ = read_sources([folder / embodiment for embodiment in ("robot", "hand")], task)
 report = embed_recordings(sources, task, folder / "data")[CAMERA]
@@ -71,9 +70,9 @@ print(f"{EMBEDDING_DIM} components keep {report.kept:.0%} of the variance: the s
 # %%
 # A planner of all videos, controllers of five demonstrations
 # ------------------------------------------------------------
-# The planner reads no action, so the hand's videos count as much as the robot's. Controllers read the embeddings of all
-# videos and the joint targets of the five. There are three of them: ridge on raw frames, KOAP, and the control, KOAP
-# with random features.
+# The planner reads no action, so it learns from the hand's videos as well. Controllers read the embeddings of all
+# videos and the joint targets of five. There are three: ridge regression on raw frames, KOAP, and KOAP with random
+# features.
 
 data, labels = LabelBudget(episodes=range(LABELLED)).apply(stored)
 print(f"labels: {labels.labelled_transitions} of {labels.total_transitions} steps")
@@ -87,8 +86,8 @@ for name, steps in updates.items():
 # %%
 # Scooping
 # --------
-# Fifteen trials from the three start positions. Joint targets are decoded once per plan
-# (``task.defaults.execution``). Read off every frame anew, an error of a position would act as a velocity.
+# There are fifteen trials from the three start positions. Joint targets are decoded once per plan
+# (``task.defaults.execution``). Decoded at every frame, an error of a position would act as a velocity.
 
 
 def trials(trained):
@@ -111,8 +110,7 @@ for name, each in trained.items():
     print(f"{name:14} over the rim {over} of {TRIALS}, with a piece {taken}: {rate:.0f} % ({low:.0f}-{high:.0f})")
 
 # %%
-# Films above: a hand's video, a robot's, and a trial of KOAP. It takes a piece if any trial did. Below: success with
-# 95 % intervals, and how high KOAP's spoon was.
+# Above: films of a hand, of a robot and of KOAP. Below: success with 95 % intervals, and the height of KOAP's spoon.
 
 tried = sorted(episodes["koap"], key=lambda episode: not episode["next", "success"].any())
 videos = sources.cameras[CAMERA]
@@ -142,11 +140,9 @@ figure.savefig("scooping.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# The network was trained on other pictures, and five demonstrations have labels. The spoon comes over the bowl, and it
-# leaves with a piece in most trials. A set of this size does not tell which controller is best: the intervals
-# overlap. Random features do about as well as trained ones, also in the study with four times the videos,
-# ``docs/results/scooping.md``.
+# The spoon takes a piece in most trials, with labels of five demonstrations. This set is too small to rank controllers:
+# the intervals overlap. Random features do about as well as trained ones, also with four times the videos
+# (``docs/results/scooping.md``).
 #
-# From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``. Then ``koap
-# embed robot hand --task scooping --out data``, ``koap train --dataset data --labels.episodes 0 1 2 3 4`` and ``koap
-# eval``.
+# From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``, then ``koap
+# embed robot hand --task scooping --out data``, ``koap train`` and ``koap eval``.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Aligning: push a tray, from inside or outside its walls, into a target pose (docs/d3il.md, Aligning)."""
+"""Aligning: push a tray, from inside or outside its walls, into a target pose (docs/appendix/d3il.md, Aligning)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Avoiding: steer a rod between six cylinders to the finish line, in any of 24 ways (docs/d3il.md, Avoiding)."""
+"""Avoiding: steer a rod between six cylinders to the finish, in any of 24 ways (docs/appendix/d3il.md, Avoiding)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Base environment of D3IL's tasks: the order of events in one control step (docs/d3il.md, Simulator).
+"""Base environment of D3IL's tasks: the order of events in one control step (docs/appendix/d3il.md, Simulator).
 
 One control step of the original, kept as it is because a policy experiences it::
 
@@ -328,7 +328,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         super().close(**kwargs)
 
     def raw_log(self) -> dict[str, np.ndarray]:
-        """Returns what D3IL's recorder logs for the last control step (docs/d3il.md, Recordings).
+        """Returns what D3IL's recorder logs for the last control step (docs/appendix/d3il.md, Recordings).
 
         It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins, ``des_c_pos`` its command.
         Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s; an array ``[n, ...]`` each.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Sorting: push cubes over the far edge of a platform into bins of their colour (docs/d3il.md, Sorting)."""
+"""Sorting: push cubes over the far edge of a platform into bins of their colour (docs/appendix/d3il.md, Sorting)."""
 
 from __future__ import annotations
 

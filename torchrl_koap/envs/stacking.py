@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Stacking: pile three boxes on a target zone with the gripper, in any order (docs/d3il.md, Stacking)."""
+"""Stacking: pile three boxes on a target zone with the gripper, in any order (docs/appendix/d3il.md, Stacking)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Forward kinematics of the Panda in torch (docs/d3il.md, Robot): joints to the position of the tool."""
+"""Forward kinematics of the Panda in torch (docs/appendix/d3il.md, Robot): joints to the position of the tool."""
 
 from __future__ import annotations
 

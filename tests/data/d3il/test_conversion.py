@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Raw episodes of every task become the columns of docs/d3il.md; D3IL's folders and lists; files of another task."""
+"""Raw episodes become the columns of docs/appendix/d3il.md; D3IL's folders and lists; files of another task."""
 
 from __future__ import annotations
 

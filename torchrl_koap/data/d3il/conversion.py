@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From a folder of D3IL's raw pickles to trajectories (docs/d3il.md, Recordings), by the task in :data:`CONVERTERS`.
+"""From D3IL's raw pickles to trajectories (docs/appendix/d3il.md, Recordings), by the task in :data:`CONVERTERS`.
 
 One pickle per demonstration, one row per control step, ``T`` rows::
 

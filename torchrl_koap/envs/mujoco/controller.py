@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The compiled controller: inverse kinematics, joint PD and finger force every millisecond (docs/d3il.md, Controller).
+"""Compiled controller: inverse kinematics, joint PD, finger force each millisecond (docs/appendix/d3il.md, Controller).
 
 One call advances one simulation by all substeps of a control step without coming back to Python: the compiled loop
 computes the motor commands and calls ``mj_step`` of the MuJoCo library through its address. It holds no interpreter

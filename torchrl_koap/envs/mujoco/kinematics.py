@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Compiled kinematics of the Panda arm: the pose of its tool centre point (TCP), and damped steps towards a pose.
 
-Plain float64 arithmetic in a fixed order (docs/d3il.md, Controller), which LAPACK would not have on every machine.
+Plain float64 arithmetic in a fixed order (docs/appendix/d3il.md, Controller), which LAPACK does not have everywhere.
 """
 
 from __future__ import annotations

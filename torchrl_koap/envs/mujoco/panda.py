@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Franka Panda arm of the D3IL benchmark as a `dm_control.mjcf` model (docs/d3il.md, Robot).
+"""The Franka Panda arm of the D3IL benchmark as a `dm_control.mjcf` model (docs/appendix/d3il.md, Robot).
 
 The numbers are D3IL's, not those of the Panda that ships with ``gymnasium-robotics``: only the ten meshes are taken
 from that package. Lengths in m, masses in kg, inertias in kg m^2, angles in rad, quaternions (w, x, y, z).

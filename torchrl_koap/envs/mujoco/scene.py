@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all tasks share around the arm: simulator settings, table, ground, lights, cameras (docs/d3il.md, Simulator)."""
+"""What all tasks share: simulator settings, table, ground, lights, cameras (docs/appendix/d3il.md, Simulator)."""
 
 from __future__ import annotations
 

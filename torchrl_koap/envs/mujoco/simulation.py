@@ -152,7 +152,7 @@ class SimulationBatch(Simulations):
         *,
         width: float = controller.FINGER_RESET,
     ) -> None:
-        """Puts simulations into their start state (docs/d3il.md, Reset), one substep included.
+        """Puts simulations into their start state (docs/appendix/d3il.md, Reset), one substep included.
 
         Args:
             rows (np.ndarray): indices of the simulations.
