@@ -56,7 +56,7 @@ def write_task_pages() -> None:
         "tasks/index",
         heading("Every task in numbers"),
         "Made from the registry of tasks, ``torchrl_koap/tasks``. What the simulator does, fact by fact, and how it "
-        "was compared with the original one: :doc:`/d3il`.",
+        "was compared with the original one: :doc:`/appendix/d3il`.",
         table(("task", "columns observed / planned", "actions", "modes", "limit"), rows),
         toctree(names, hidden=True),
     )
