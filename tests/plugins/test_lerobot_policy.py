@@ -14,6 +14,7 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, load_policy
 from torchrl_koap.data import read_recordings
+from torchrl_koap.modules import NoiseStreams
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
 INSTALL = "is not installed: pip install ./integrations/lerobot_policy_koap (docs/howto/lerobot.md)"
@@ -29,7 +30,9 @@ from lerobot.processor import PolicyProcessorPipeline  # noqa: E402
 from lerobot.scripts.lerobot_eval import rollout  # noqa: E402
 from lerobot.utils.control_utils import predict_action  # noqa: E402
 from lerobot.utils.import_utils import register_third_party_plugins  # noqa: E402
-from lerobot_policy_koap import KoapConfig, KoapPolicy, make_koap_pre_post_processors  # noqa: E402
+from lerobot_policy_koap import KoapConfig  # noqa: E402
+from lerobot_policy_koap.modeling_koap import KoapPolicy  # noqa: E402
+from lerobot_policy_koap.processor_koap import make_koap_pre_post_processors  # noqa: E402
 
 ENV = PushtEnv(obs_type="environment_state_agent_pos")
 NAMES = ("x", "y", *(f"environment_state_{index}" for index in range(16)))
@@ -140,8 +143,8 @@ def test_actions_for_recorded_observations_as_lerobot_record_asks(run, exported)
 def test_a_chunk_begins_with_the_first_action_of_an_episode(run, exported):
     policy, *_ = loaded(exported)
     batch = {"observation.state": torch.ones(3, 2), "observation.environment_state": torch.ones(3, 16)}
-    agent = Agent(policy.policy, seed=0)
-    chunk = policy.predict_action_chunk(batch, noise=agent._noise(3))
+    streams = NoiseStreams(range(3), policy.policy.noise_shape, block=policy.policy.max_steps)
+    chunk = policy.predict_action_chunk(batch, noise=streams.draw())
     assert chunk.shape == (3, policy.policy.execution.replan_interval, 2)
     torch.testing.assert_close(chunk[:, 0], policy.select_action(batch))
     assert not torch.equal(policy.predict_action_chunk(batch), policy.predict_action_chunk(batch))

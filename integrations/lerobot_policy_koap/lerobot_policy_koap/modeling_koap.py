@@ -132,7 +132,7 @@ class KoapPolicy(PreTrainedPolicy):
         seen = given if isinstance(given, Tensor) else policy.observe(given)
         like = next(policy.parameters())
         history = policy.from_robot(seen).to(like).unsqueeze(-2).expand(-1, policy.history, -1)
-        noise = torch.randn(len(history), *policy.noise_shape) if noise is None else noise
+        noise = torch.randn(*history.shape[:-2], *policy.noise_shape) if noise is None else noise
         return policy.to_robot(policy.decode_ahead(history, noise.to(like))[0])
 
     def forward(self, batch: dict[str, Any]) -> NoReturn:
@@ -163,11 +163,12 @@ class KoapPolicy(PreTrainedPolicy):
             )
         for feature, columns in self._numbers.items():
             _check_width(feature, batch[feature].shape[-1], columns)
-        numbers = torch.cat([batch[feature] for feature in self._numbers], -1) if self._numbers else None
+        given = {feature: batch[feature].cpu() for feature in wanted}  # where frames are embedded; the agent moves them
+        numbers = torch.cat([given[feature] for feature in self._numbers], -1) if self._numbers else None
         if not self._cameras:
             return numbers
         frames = {
-            camera: (batch[feature] * 255).round().to(torch.uint8).movedim(-3, -1)
+            camera: (given[feature] * 255).round().to(torch.uint8).movedim(-3, -1)
             for camera, feature in self._cameras.items()
         }
         return frames if numbers is None else {STATE: numbers, **frames}
