@@ -165,10 +165,9 @@ class Latency(Command):
 
 @dataclass(kw_only=True)
 class Export(Command):
-    """Write a policy for torch.export, ONNX Runtime, AOTInductor or LeRobot.
+    """Write a policy for torch.export, ONNX, AOTInductor or LeRobot.
 
-    Each part is compared with the original (1e-5); policy.json says how to call it. For LeRobot the weights stay as
-    they are.
+    Each part is compared with the original (1e-5); policy.json says how to call it.
 
     Example: `koap export runs/arm --format onnx`
 
