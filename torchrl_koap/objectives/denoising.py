@@ -72,8 +72,8 @@ class DenoisingLoss(NetworkLoss):
         """Reads raw histories and sequences of a batch, and which of their steps count.
 
         Returns:
-            tuple: histories ``[*B, h, d]``, sequences ``[*B, H, width]`` (finite also where steps do not count) and
-            the steps that count, bool ``[*B, H, 1]``, or None where all do.
+            tuple: histories ``[*B, h, d]``, sequences ``[*B, H, width]`` and the steps that count, bool ``[*B, H, 1]``,
+            or None where all do.
         """
         raise NotImplementedError
 
@@ -85,7 +85,7 @@ class DenoisingLoss(NetworkLoss):
         with self.network_params.to_module(network, preserve_module_state=False):
             with torch.no_grad():
                 condition, clean = network.encode_history(history), network.encode(history, sequence)
-                if counts is not None:
+                if counts is not None:  # before the network: masking afterwards would leave NaN in the gradient
                     clean = torch.where(counts, clean, 0.0)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
             error = network.denoising_error(condition, clean, noise, time, dtype=self.dtype)  # [*B, H, width]
@@ -186,6 +186,5 @@ class DiffusionPolicyLoss(DenoisingLoss):
         if action.shape != wanted:
             raise ValueError(f"{names.action!r} must be {list(wanted)} ([*B, T, act]), got {list(action.shape)}")
         labelled = self._read_mask(tensordict, "has_action", state)[..., now:-1]
-        counts = (labelled & self._recorded(tensordict, state)[..., now:]).unsqueeze(-1)
-        # zeroed before the network and the residual: masking afterwards would leave NaN in the gradient
-        return history, torch.where(counts, action[..., now:-1, :], 0.0), counts
+        counts = labelled & self._recorded(tensordict, state)[..., now:]
+        return history, action[..., now:-1, :], counts.unsqueeze(-1)
