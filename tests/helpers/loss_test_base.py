@@ -84,17 +84,6 @@ class LossTestBase:
             assert getattr(loss.tensor_keys, name) == old
         self.assert_same(loss(batch), expected)
 
-    def test_all_keys_are_renamed_at_once(self):
-        loss, batch = self.make_loss(), self.make_batch(4)
-        expected = loss(batch)
-        names = {name: ("nest", name) for name in self.default_keys}
-        loss.set_keys(**names)
-        renamed = TensorDict(batch_size=batch.batch_size)
-        for name, old in self.default_keys.items():
-            if old in batch.keys(True):
-                renamed[names[name]] = batch[old]
-        self.assert_same(loss(renamed), expected)
-
     def test_keys_of_one_loss_are_not_those_of_another(self):
         loss, other = self.make_loss(), self.make_loss()
         loss.set_keys(**dict.fromkeys(self.in_names, "elsewhere"))

@@ -55,13 +55,6 @@ class SamplerTestBase:
         flat = sampler.sample(history.reshape(-1, 2, 2), noise.reshape(-1, 6, self.width))
         torch.testing.assert_close(sequence.reshape(-1, 6, self.width), flat)
 
-    def test_given_noise_makes_samples_independent_of_the_batch(self):
-        sampler = self.make(num_steps=5)
-        history, noise = torch.randn(6, 2, 2), torch.randn(6, *sampler.noise_shape)
-        together = sampler(TensorDict({"history": history, "noise": noise}, [6]))[self.out_key]
-        for row in range(6):
-            torch.testing.assert_close(sampler.sample(history[row], noise[row]), together[row], atol=1e-5, rtol=1e-4)
-
     @pytest.mark.parametrize("exploration", ExplorationType)
     def test_without_noise_every_sample_is_another_unless_a_generator_repeats_it(self, exploration):
         sampler, history = self.make(), torch.randn(3, 2, 2)

@@ -7,7 +7,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safetensors.torch import load, save
 from torch import nn
 
 from torchrl_koap.modules import Normalizer
@@ -120,20 +119,6 @@ def test_wrong_input():
     for offset, scale in ((torch.zeros(2), torch.ones(1)), (torch.zeros(1), torch.zeros(1))):
         with pytest.raises(ValueError, match="offset"):
             Normalizer(1, offset=offset, scale=scale)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_state_dict_round_trip(dtype):
-    normalizer = Normalizer.fit(torch.randn(30, 3, dtype=dtype), mode="standard")
-    restored = Normalizer(3).to(dtype)
-    restored.load_state_dict(load(save(normalizer.state_dict())))
-    assert restored.scale.dtype == dtype
-    assert torch.equal(restored.offset, normalizer.offset) and torch.equal(restored.scale, normalizer.scale)
-    fitted = Normalizer.fit(torch.randn(30, 3, dtype=dtype))
-    fitted.load_state_dict(normalizer.state_dict())
-    assert torch.equal(fitted.scale, normalizer.scale)
-    with pytest.raises(RuntimeError, match="size mismatch"):
-        Normalizer.fit(torch.randn(30, 4)).load_state_dict(normalizer.state_dict())
 
 
 def test_without_statistics_nothing_changes_until_they_are_loaded():

@@ -110,28 +110,6 @@ def test_what_counts_are_labelled_recorded_transitions_from_now_on():
     assert counted(padded=(frames < 2)[None]) == [1, 2, 3, 4, 5]
 
 
-@pytest.mark.parametrize("poison", [float("nan"), 1e30])
-def test_what_is_stored_at_unlabelled_and_padded_steps_reaches_neither_value_nor_gradient(poison):
-    data = batch_of(6)
-    data["padded"] = torch.zeros(6, 8, dtype=torch.bool)
-    data["padded"][:3, 5:] = True
-    hidden = ~data["has_action"].squeeze(-1) | data["padded"]
-    outcomes = []
-    for stored in (0.0, poison):
-        poisoned = data.clone()
-        poisoned["action"][hidden] = stored
-        loss = make_loss()
-        value = loss(poisoned)["loss_policy"]
-        value.backward()
-        gradients = {name: p.grad.clone() for name, p in loss.named_parameters() if p.requires_grad}
-        outcomes.append((value.detach(), gradients))
-    (clean, gradients), (value, poisoned) = outcomes
-    assert value.isfinite() and torch.equal(value, clean)
-    for name, gradient in gradients.items():
-        assert torch.equal(gradient, poisoned[name]), name
-        assert gradient.abs().max() > 0, name
-
-
 def test_the_future_states_are_not_read():
     data, loss = batch_of(4), make_loss()
     other = data.clone()

@@ -127,15 +127,6 @@ def test_reset_forgets_the_episode_before():
     assert agent.latency()["steps"] == 12 and agent.latency()["p50"] <= agent.latency()["p99"] <= agent.latency()["max"]
 
 
-def test_seeds_make_a_difference():
-    actions = []
-    for seed in (0, 1):
-        agent = Agent(policy_of(), seed=seed)
-        agent.reset()
-        actions.append(agent.act(np.zeros(2)))
-    assert not np.allclose(*actions)
-
-
 def test_refusals():
     agent = Agent(policy_of())
     with pytest.raises(RuntimeError, match="reset.. the agent before the first act"):

@@ -40,21 +40,6 @@ def test_actions_within_the_lead_are_left_alone():
     assert torch.equal(limits(seen((0.5, 0.3), (0.45, 0.33), [1000]), action)[0], action)  # bit by bit
 
 
-def test_a_blocked_robot_turns_back_as_soon_as_its_policy_does():
-    turned = {}
-    for name, limits in {"free": None, "held": CommandLimits([0, 1], lead=0.05, **COLUMNS)}.items():
-        command, place = torch.zeros(2), torch.zeros(2)
-        for step in range(60):
-            action = torch.tensor([0.01 if step < 30 else -0.01, 0.0])  # forwards for 30 steps, then backwards
-            command = command + (
-                action if limits is None else limits(torch.cat([command, place]).expand(1, 4), action)[0]
-            )
-            place = torch.minimum(place + 0.5 * (command - place), torch.tensor([0.02, 1.0]))  # a wall
-            if step >= 30 and place[0] < 0.019 and name not in turned:
-                turned[name] = step - 30
-    assert turned["held"] <= 6 < 20 < turned["free"]
-
-
 def test_a_gain_multiplies_changes_of_a_command_alone():
     assert CommandLimits([0, 2], gain=1.5)(torch.zeros(1, 1), torch.ones(4, 3))[0].tolist() == [[1.5, 1.0, 1.5]] * 4
     both, _ = CommandLimits([0, 1], gain=3.0, lead=0.1, **COLUMNS)(seen((0, 0), (0, 0)), torch.tensor([0.02, 0.05]))

@@ -9,7 +9,6 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.utils import ExplorationType
 from toy_policies import (
     CountingPlanner,
     CountingSampler,
@@ -18,19 +17,10 @@ from toy_policies import (
     state_number,
 )
 
-from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
-from torchrl_koap.evaluation.latency import measure_latency
-from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.modules import (
-    DiffusionPolicy,
     Execution,
     InverseDynamicsFollower,
-    MLPDenoiser,
     PlanningPolicy,
-    StatePlanner,
-    TemporalUnet,
-    make_koopman_inverse_dynamics,
-    make_policy,
     policy_transforms,
 )
 
@@ -237,91 +227,4 @@ def test_every_action_of_parallel_workers_that_reset_by_themselves(copied_proces
     env.close()
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-@pytest.mark.parametrize("kind", KINDS)
-def test_batches_of_any_shape_agree_with_the_flat_one_noise_included(kind, batch):
-    torch.manual_seed(0)
-    denoiser = MLPDenoiser(2, 4, horizon=14, width=8)
-    if kind == "chunks":
-        policy = make_policy(DiffusionPolicy(denoiser, state_dim=2, action_dim=2), state_of=(0, 1))
-    else:
-        planner = StatePlanner(denoiser, state_dim=2)
-        policy = make_policy(planner, EchoController(), state_of=(0, 1), execution=Execution(kind))
-    observed, noise = torch.randn(*batch, 2, 2), torch.randn(*batch, 14, 2)
-    shaped = step_input(observed, noise=noise)
-    flat = shaped.reshape(-1) if batch else shaped.unsqueeze(0)
-    with torch.no_grad():
-        for _ in range(6):
-            shaped, flat = policy(shaped), policy(flat)
-            assert shaped.batch_size == torch.Size(batch)
-            for key in (*policy.out_keys, "counter"):
-                torch.testing.assert_close(shaped[key], flat[key].reshape(*batch, *flat[key].shape[1:]))
-            for td in (shaped, flat):
-                td["is_init"] = torch.zeros_like(td["is_init"])
-
-
 # ---- real networks
-
-
-def diffusion_policy():
-    """Untrained."""
-    torch.manual_seed(0)
-    policy = DiffusionPolicy(TemporalUnet(2, 6, channels=(8, 16)), state_dim=3, action_dim=2, num_steps=3)
-    actions = torch.stack([0.004 * torch.randn(200), 0.01 * torch.rand(200)], -1)
-    policy.fit_normalizers(0.01 * torch.randn(50, 16, 3).cumsum(1), actions)
-    return policy.eval()
-
-
-@pytest.mark.parametrize("kind", ["feedback", "open_loop"])
-def test_a_real_policy_collects_from_sixty_avoiding_environments(kind):
-    """Plans are made at steps 0, 4, ... only, and all environments, equal at the start, go their own ways."""
-    torch.manual_seed(0)
-    env = TransformedEnv(AvoidingEnv(60), policy_transforms(5))
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
-    planner.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1))
-    controller = make_koopman_inverse_dynamics(2, 2)
-    policy = make_policy(planner, controller, state_of=(2, 3), execution=Execution(kind))
-    calls = []
-    planner.denoiser.register_forward_hook(lambda module, arguments, _: calls.append(len(arguments[0])))
-    collector = Collector(
-        env, policy, frames_per_batch=60 * 6, total_frames=60 * 6, exploration_type=ExplorationType.DETERMINISTIC
-    )
-    calls.clear()  # the collector tries the policy once
-    (data,) = collector
-    assert data.shape == (60, 6) and data["action"].isfinite().all()
-    assert calls == [60] * 4  # two solver steps of two plans
-    assert torch.equal(data["observation_history"][:, 0], data["observation"][:, :1].expand(60, 5, 4))
-    assert torch.equal(data["observation_history"][:, 5, 1:], data["observation"][:, 2:])
-    chunks = data[policy.out_keys[1]]
-    assert all(torch.equal(chunks[:, step], chunks[:, 0]) for step in range(4))
-    assert not torch.equal(chunks[:, 4], chunks[:, 0])
-    assert data["action"][:, 0].unique(dim=0).shape[0] == 60
-    collector.shutdown()
-
-
-def test_evaluations_of_chunks_do_not_depend_on_the_batch_size():
-    policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
-    seeds = [100, 101, 102, 103]
-    together, apart = (roll_out(policy, AvoidingEnv, seeds, max_steps=10, batch_size=size) for size in (None, 1))
-    for one, other in zip(apart, together, strict=True):
-        for key in (("next", "observation"), "action"):
-            torch.testing.assert_close(one[key], other[key], rtol=1e-3, atol=1e-4)
-    assert not torch.allclose(together[0]["action"], together[1]["action"])
-    chunks = together[0]["action_chunk"]
-    for step in range(10):
-        assert torch.equal(together[0]["action"][step], chunks[step, step % 4])
-        assert torch.equal(chunks[step], chunks[step - step % 4])
-    assert not torch.equal(chunks[4], chunks[0])
-    again = roll_out(policy, AvoidingEnv, seeds[:1], max_steps=10)
-    assert torch.equal(again[0]["action"], apart[0]["action"])
-
-
-def test_pictures_and_latency_need_no_plans():
-    policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
-    episodes = roll_out(policy, AvoidingEnv, [1, 2], max_steps=6)
-    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=mode_index, interval=4)
-    assert tensors["plan"].shape == (2, 0, 1, 2) and tensors["plan_step"].shape == (2, 0)
-    assert tensors["action"].shape == (2, 6, 2) and tensors["position"].shape == (2, 7, 2)
-    result = measure_latency(policy, 4, repeats=5)
-    assert result["plan_ms"] > result["control_ms"] > 0
-    assert result["control_hz"] == pytest.approx(1e3 / (result["control_ms"] + result["plan_ms"] / 4))

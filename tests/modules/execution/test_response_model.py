@@ -64,17 +64,6 @@ def test_impulses_add_up_to_the_prediction():
     assert not matrix[0].any()  # what is commanded now is not in the next measurement
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_any_batch(batch):
-    system = a_system()
-    x, a = torch.randn(*batch, 3, AXES).double(), torch.randn(*batch, 2, AXES).double()
-    future = torch.randn(*batch, 5, AXES).double()
-    out = system.predict(x, x[..., -1, :], a, future)
-    assert out.shape == (*batch, 5, AXES)
-    first = (0,) * len(batch)
-    torch.testing.assert_close(out[first], system.predict(x[first], x[first][-1], a[first], future[first]))
-
-
 def test_bad_columns_and_shapes_are_refused():
     with pytest.raises(ValueError, match="'commands': 1"):
         ResponseModel([0, 1], [0], [0, 1])

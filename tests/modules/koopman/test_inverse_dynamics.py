@@ -48,26 +48,6 @@ def windows(*batch, num_frames=9):
     return torch.randn(*batch, num_frames, 3, generator=generator).cumsum(-2)
 
 
-def test_inference_is_normalise_infer_decode_denormalise():
-    model, state = make_model(), windows(2, 5)
-    td = model(TensorDict({"state": state}, [2, 5]))
-    x = (state - STATE_NORMALIZER["offset"]) / STATE_NORMALIZER["scale"]
-    for t in range(1, 6):
-        read = torch.cat([x[..., t, :] - x[..., t - 1, :], x[..., t, :], x[..., t + 3, :] - x[..., t, :]], -1)
-        u = model.latent_action.network(read)
-        torch.testing.assert_close(td["latent_action"][..., t, :], u)
-        a = u @ model.action_decoder.linear.weight.T + model.action_decoder.linear.bias
-        a = a * ACTION_NORMALIZER["scale"] + ACTION_NORMALIZER["offset"]
-        torch.testing.assert_close(td["action"][..., t, :], a)
-    torch.testing.assert_close(model.raw_action(model.decode(model.infer(state)), state), td["action"])
-    torch.testing.assert_close(model.infer(state, range(2, 4)), td["latent_action"][..., 2:4, :])
-    torch.testing.assert_close(model.lift(state), model.lifting.encode(x))
-    torch.testing.assert_close(
-        model.normalize_action(td["action"], state)[..., 1:, :],
-        model.action_decoder.linear(td["latent_action"])[..., 1:, :],
-    )
-
-
 class TestKoopmanInverseDynamics(InverseDynamicsTestBase):
     def make_network(self, seed=0, **options):
         torch.manual_seed(seed)
@@ -295,13 +275,6 @@ def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held()
 def test_parts_that_do_not_fit_are_refused(parts, message):
     with pytest.raises(ValueError, match=message):
         make_model(normalizers=False, parts=parts)
-
-
-def test_weights_are_drawn_anew():
-    model, state = make_model(), windows(4)
-    before = model.predict(state)
-    model.reset_parameters_recursive()
-    assert not torch.allclose(model.predict(state), before)
 
 
 def test_the_inference_path_compiles():

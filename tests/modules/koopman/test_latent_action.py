@@ -44,15 +44,6 @@ def test_keys_and_wrong_width(kind):
         network.gather(windows(3, d=5))
 
 
-def test_relative_latent_actions_of_a_shifted_window_differ_by_the_current_frame_alone():
-    network = LatentActionFourier(2, 8, position_scale=1e9)
-    state = windows(4)
-    moved = state + torch.tensor([3.0, -2.0])
-    torch.testing.assert_close(network.infer(network.gather(state)), network.infer(network.gather(moved)))
-    near = LatentActionFourier(2, 8, position_scale=1.0)
-    assert not torch.allclose(near.infer(near.gather(state)), near.infer(near.gather(moved)), atol=1e-3)
-
-
 def test_the_lstm_reads_its_frames_in_order():
     network = LatentActionLSTM(2, 3, hidden_dim=5, num_past=2, look_ahead=4)
     reference = torch.nn.LSTM(2, 5, batch_first=True)
@@ -95,20 +86,6 @@ def test_inner_products_approach_the_kernel_as_the_features_grow():
     assert errors[16384] < 0.02 * 0.3
     for number in (64, 1024):  # 16 times the features, a quarter of the error
         assert 2.5 < errors[number] / errors[16 * number] < 6.5, errors
-
-
-def test_variance_of_the_curved_part_is_the_curvature():
-    error, curvature = fourier_parts(16384)
-    assert error.diagonal().abs().max() < 0.1 * curvature  # the kernel's diagonal is |v|^2 / D + c
-
-
-def test_a_small_curvature_leaves_linear_regression():
-    network = LatentActionFourier(2, 32, curvature=0.0)
-    latent = network.infer(network.gather(windows(5)))
-    assert (latent[..., network.motion_dim :] == 0).all()
-    read = network.gather(windows(5))
-    motion = torch.cat([read[..., :1, :], read[..., 2:, :]], -2).flatten(-2)
-    torch.testing.assert_close(latent[..., : network.motion_dim], motion / math.sqrt(network.motion_dim))
 
 
 def test_frequencies_are_drawn_anew_and_trained():
