@@ -11,59 +11,18 @@ __version__ = "0.1.0"
 import_mujoco()
 
 # imported when first asked for: a network or a task costs no simulator, a version no torch
-_LAZY = {
-    "Agent": "torchrl_koap.modules",
-    "AsynchronousAgent": "torchrl_koap.modules",
-    "ControllerConfig": "torchrl_koap.runs.config",
-    "Study": "torchrl_koap.studies",
-    "EvalConfig": "torchrl_koap.evaluation",
-    "Execution": "torchrl_koap.modules",
-    "ExecutionConfig": "torchrl_koap.modules",
-    "LabelConfig": "torchrl_koap.runs.config",
-    "PlannerConfig": "torchrl_koap.runs.config",
-    "RunConfig": "torchrl_koap.runs.config",
-    "Task": "torchrl_koap.tasks",
-    "TrainConfig": "torchrl_koap.runs.config",
-    "Trained": "torchrl_koap.training",
-    "evaluate": "torchrl_koap.evaluation",
-    "fit": "torchrl_koap.training",
-    "get_task": "torchrl_koap.tasks",
-    "load_policy": "torchrl_koap.evaluation",
-    "make_demonstrations": "torchrl_koap.data",
-    "register_method": "torchrl_koap.training",
-    "register_task": "torchrl_koap.tasks",
-    "run_study": "torchrl_koap.studies",
-    "save_demonstrations": "torchrl_koap.data",
-    "train": "torchrl_koap.training",
+_OFFERS = {
+    "data": ("make_demonstrations", "save_demonstrations"),
+    "evaluation": ("EvalConfig", "evaluate", "load_policy"),
+    "modules": ("Agent", "AsynchronousAgent", "Execution", "ExecutionConfig"),
+    "runs.config": ("ControllerConfig", "LabelConfig", "PlannerConfig", "RunConfig", "TrainConfig"),
+    "studies": ("Study", "run_study"),
+    "tasks": ("Task", "get_task", "register_task"),
+    "training": ("Trained", "fit", "register_method", "train"),
 }
+_LAZY = {name: f"{__name__}.{room}" for room, names in _OFFERS.items() for name in names}
 
-__all__ = [  # noqa: F822 - __getattr__ finds them
-    "Agent",
-    "AsynchronousAgent",
-    "ControllerConfig",
-    "EvalConfig",
-    "Execution",
-    "ExecutionConfig",
-    "LabelConfig",
-    "PlannerConfig",
-    "RunConfig",
-    "Study",
-    "Task",
-    "TrainConfig",
-    "Trained",
-    "__version__",
-    "evaluate",
-    "fit",
-    "get_task",
-    "load_policy",
-    "make_demonstrations",
-    "register_method",
-    "register_task",
-    "run_study",
-    "save_demonstrations",
-    "train",
-]
-
+__all__ = ["__version__", *_LAZY]
 
 __getattr__ = exports(__name__, _LAZY)
 

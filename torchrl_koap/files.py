@@ -139,17 +139,6 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
 
     Raises:
         OSError: naming the file, if the disk is full or refuses; what was there before is kept.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from torchrl_koap.files import replacing_file
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "report.txt"
-        ...     with replacing_file(path) as aside:
-        ...         _ = aside.write_text("complete")
-        ...     path.read_text(), len(list(Path(folder).iterdir()))
-        ('complete', 1)
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

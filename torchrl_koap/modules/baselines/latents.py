@@ -144,11 +144,7 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         >>> import torch
         >>> from torchrl_koap.modules import VariationalInverseDynamics
         >>> model = VariationalInverseDynamics(2, 2)
-        >>> window = torch.randn(1, 16, 2)
-        >>> changed = torch.cat([window[:, :-1], window[:, -1:] + 1], 1)
-        >>> bool((model.infer(window)[:, 1] != model.infer(changed)[:, 1]).any())  # the whole window is read
-        True
-        >>> model.sample(window).shape
+        >>> model.sample(torch.randn(1, 16, 2)).shape
         torch.Size([1, 16, 16])
     """
 

@@ -27,15 +27,7 @@ RAW_SHARE = 0.85
 class LiftedInverseDynamics(LatentInverseDynamics):
     """Base class of models of lifted states ``z = g(x)`` that latent actions move on: what ``KOAPLoss`` trains.
 
-    A subclass says how (:meth:`predict_next`).
-
-    Args:
-        latent_action (LatentActionModule): the network ``f``.
-        action_decoder (nn.Module): maps latent actions to actions in normalised units.
-        lifting (KoopmanLifting or CompactLifting): the networks ``g``.
-
-    Keyword Args:
-        **kwargs: columns and normalisers, see :class:`~torchrl_koap.modules.InverseDynamics`.
+    A subclass says how (:meth:`predict_next`). Arguments as for :class:`KoopmanInverseDynamics`.
     """
 
     def __init__(

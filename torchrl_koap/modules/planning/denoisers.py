@@ -110,9 +110,7 @@ class MLPDenoiser(Denoiser):
     On Avoiding its plans touch obstacles more often than those of
     :class:`~torchrl_koap.modules.planning.unet.TemporalUnet`.
 
-    Args:
-        state_dim (int): number ``d`` of state columns.
-        condition_dim (int): number ``c`` of condition columns.
+    Args and errors as for :class:`Denoiser`.
 
     Keyword Args:
         horizon (int): number ``H`` of planned steps.

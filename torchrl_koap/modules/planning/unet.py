@@ -22,13 +22,7 @@ class TemporalUnet(Denoiser):
     last halves the number of steps; plans of any horizon are padded at the end by repeating the last step, and cut
     again.
 
-    Speed on a CPU (one core): ``nn.Conv1d`` reaches 90 % of the matrix-product rate from 64 channels on and beats
-    unfolding; group norm costs as much as layer norm, but its gradient ten times that on fewer than 8 steps, hence
-    the padding.
-
-    Args:
-        state_dim (int): number ``d`` of state columns.
-        condition_dim (int): number ``c`` of condition columns.
+    Args and errors as for :class:`~torchrl_koap.modules.planning.denoisers.Denoiser`.
 
     Keyword Args:
         channels (sequence of int): channels per level, multiples of 8. Defaults to ``(32, 64)``.
@@ -50,7 +44,8 @@ class TemporalUnet(Denoiser):
         channels = tuple(channels)
         if not channels or any(width < 1 or width % GROUPS for width in channels):
             raise ValueError(f"channels must be multiples of {GROUPS}, got {channels}")
-        self.multiple = max(8, 2 ** (len(channels) - 1))  # steps that plans are padded to a multiple of
+        # steps that plans are padded to a multiple of: the gradient of group norm is slow on fewer than 8
+        self.multiple = max(8, 2 ** (len(channels) - 1))
 
         def block(width_in: int, width_out: int) -> nn.ModuleList:
             return nn.ModuleList([_Block(width_in, width_out)])  # of one: pretrained weights are named so
