@@ -102,12 +102,6 @@ def test_wrong_values(change, message):
     assert any(message in problem for problem in problems(data))
 
 
-def test_one_step_with_a_wrong_count():
-    data = flat((1,))
-    data["step_count"][0] = 3
-    assert any("step_count" in problem for problem in problems(data))
-
-
 def test_widths_must_agree():
     data = flat()
     data["next", "observation"] = data["next", "observation"][:, :3].clone()

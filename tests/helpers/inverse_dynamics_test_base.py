@@ -141,7 +141,3 @@ class InverseDynamicsTestBase:
         if any(True for _ in network.parameters()):
             with pytest.raises(ValueError, match="is torch.float64, .* torch.float32: cast one of them"):
                 network(TensorDict({"in": {"x": torch.randn(2, T, 3).double()}}, [2]))
-
-    def test_states_of_another_width_are_refused(self):
-        with pytest.raises(ValueError, match="columns, got shape"):
-            self.make_network()(TensorDict({"state": torch.randn(2, T, 4)}, [2]))

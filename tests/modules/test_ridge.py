@@ -51,22 +51,6 @@ def test_weights_against_the_normal_equations(n, m, penalty, bias):
     assert result.penalty == penalty and result.num_labels == n
 
 
-def test_input_noise_is_the_fit_to_many_noisy_copies():
-    latent, action = make_data(60, 4, noise=0.1)
-    noise = 0.02
-    result = fit(latent, action, penalties=(1e-9,), input_noise=noise)
-    rng = np.random.default_rng(1)
-    centred, target = latent - latent.mean(0), action - action.mean(0)
-    sigma = np.sqrt(noise * unit_of(latent))
-    rows = rng.integers(60, size=60_000)
-    seen = centred[rows] + sigma * rng.normal(size=(len(rows), 4))
-    expected = np.linalg.lstsq(seen, target[rows], rcond=None)[0]
-    without = np.linalg.lstsq(centred, target, rcond=None)[0]
-    found = result.weight.numpy().T
-    assert np.abs(found - expected).max() < 0.1 * np.abs(without - expected).max()
-    assert result.penalty == pytest.approx(noise * 60)
-
-
 def test_input_noise_leaves_out_smaller_penalties_alone():
     latent, action = make_data(200, 4, noise=0.1)
     free, floored = (fit(latent, action, input_noise=noise) for noise in (0.0, 1e-6))

@@ -13,7 +13,6 @@ from command_calls import fails
 from tiny_runs import TINY, koap, read_csv
 
 from torchrl_koap.runs.plugins import PluginError, load_plugins
-from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.methods import METHODS, register_method
@@ -53,13 +52,6 @@ def test_a_run_of_a_plugin_s_method(run):
     assert config["run"]["plugins"] == [NAME] and config["method"] == NAME
     remembered = load_tensors(run / "controller.safetensors")[0]["actions"]
     assert len(remembered) == summary["decoder_fit"]["labels_used"] > 20
-
-
-def test_log_columns_follow_from_what_is_logged(run):
-    rows = RunDirectory(run).read_metrics()
-    assert [row["phase"] for row in rows] == ["planner", "controller"]
-    assert float(rows[1]["loss_neighbours"]) > 0 and rows[0]["loss_neighbours"] == ""
-    assert RunDirectory(run).last_metrics("controller")["loss_neighbours"] == float(rows[1]["loss_neighbours"])
 
 
 def test_what_reads_the_run_imports_the_plugin_by_itself(run, tmp_path, monkeypatch, search_path, capsys):

@@ -101,16 +101,6 @@ def test_the_command_is_held_back_as_in_the_policy_itself():
     agent.close()
 
 
-def test_actions_have_the_gain_of_the_policy():
-    plain, gained = make_agent(), make_agent(gain=2.0)
-    for agent in (plain, gained):
-        agent.reset()
-    first, second = (agent.act(np.array([7.0, 1.0])) for agent in (plain, gained))
-    assert np.any(first) and np.allclose(second, first * [2.0, 1.0, 1.0, 1.0])
-    for agent in (plain, gained):
-        agent.close()
-
-
 def test_another_rate_than_that_of_the_data_is_warned_of(recwarn):
     networks = make_agent().policy
     policy = make_policy(networks.planner, networks.follower.controller, state_of=(0, 1), control_hz=20.0)

@@ -17,10 +17,16 @@ from toy_policies import (
     state_number,
 )
 
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
+from torchrl_koap.evaluation.latency import measure_latency
+from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.modules import (
+    DiffusionPolicy,
     Execution,
     InverseDynamicsFollower,
     PlanningPolicy,
+    TemporalUnet,
+    make_policy,
     policy_transforms,
 )
 
@@ -228,3 +234,23 @@ def test_every_action_of_parallel_workers_that_reset_by_themselves(copied_proces
 
 
 # ---- real networks
+
+
+def diffusion_policy():
+    """Untrained."""
+    torch.manual_seed(0)
+    policy = DiffusionPolicy(TemporalUnet(2, 6, channels=(8, 16)), state_dim=3, action_dim=2, num_steps=3)
+    actions = torch.stack([0.004 * torch.randn(200), 0.01 * torch.rand(200)], -1)
+    policy.fit_normalizers(0.01 * torch.randn(50, 16, 3).cumsum(1), actions)
+    return policy.eval()
+
+
+def test_pictures_and_latency_need_no_plans():
+    policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
+    episodes = roll_out(policy, AvoidingEnv, [1, 2], max_steps=6)
+    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=mode_index, interval=4)
+    assert tensors["plan"].shape == (2, 0, 1, 2) and tensors["plan_step"].shape == (2, 0)
+    assert tensors["action"].shape == (2, 6, 2) and tensors["position"].shape == (2, 7, 2)
+    result = measure_latency(policy, 4, repeats=5)
+    assert result["plan_ms"] > result["control_ms"] > 0
+    assert result["control_hz"] == pytest.approx(1e3 / (result["control_ms"] + result["plan_ms"] / 4))

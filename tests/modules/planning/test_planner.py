@@ -53,16 +53,6 @@ def test_statistics_are_those_of_every_step(relative):
     assert planner.encode_history(history).abs().max() == pytest.approx(1, abs=1e-5)
 
 
-def test_relative_coordinates_do_not_move_with_the_data():
-    planner = make_planner()
-    history, plan = planner.split_window(walks(4))
-    shifted = torch.tensor([0.3, -0.2])
-    torch.testing.assert_close(planner.encode(history, plan), planner.encode(history + shifted, plan + shifted))
-    condition = planner.encode_history(history)
-    torch.testing.assert_close(condition[:, :2], history[:, 0] - history[:, 1])
-    torch.testing.assert_close(condition[:, 2:], history[:, 1])
-
-
 @pytest.mark.parametrize("exploration", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
 def test_both_modes_of_a_bimodal_future_appear(exploration):
     planner = StatePlanner(Bimodal(), state_dim=1, history=1, horizon=1, relative=False, num_steps=40)
