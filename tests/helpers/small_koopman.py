@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import torch
+from inverse_dynamics_test_base import normalizers
 from tensordict import TensorDict
 
 from torchrl_koap.modules import (
@@ -14,7 +15,6 @@ from torchrl_koap.modules import (
     LatentActionLSTM,
     LatentActionMLP,
     LinearActionDecoder,
-    Normalizer,
 )
 from torchrl_koap.objectives import KOAPLoss, KoopmanDynamicsLoss, KoopmanReconstructionLoss, LatentActionLoss
 
@@ -23,7 +23,7 @@ LOSSES = (KoopmanReconstructionLoss, KoopmanDynamicsLoss, LatentActionLoss, KOAP
 NETWORKS = ("mlp", "lstm", "fourier")
 
 
-def make_network(kind="mlp", *, clamped=False, normalizers=True, seed=0):
+def make_network(kind="mlp", *, clamped=False, seed=0):
     torch.manual_seed(seed)
     frames = {"num_past": HISTORY, "look_ahead": K, "clamped": clamped}
     if kind == "mlp":
@@ -35,17 +35,13 @@ def make_network(kind="mlp", *, clamped=False, normalizers=True, seed=0):
     operator = KoopmanOperator(4, input_dim=latent_action.latent_dim if kind == "fourier" else None)
     if kind == "fourier":
         torch.nn.init.normal_(operator.input, std=0.1)
-    state = Normalizer(3, offset=torch.tensor([0.1, -0.2, 0.0]), scale=torch.tensor([2.0, 1.0, 3.0]))
-    action = Normalizer(2, offset=torch.tensor([0.3, 0.0]), scale=torch.tensor([0.5, 2.0]))
-    normalized = {"state_normalizer": state, "action_normalizer": action} if normalizers else {}
-    network = KoopmanInverseDynamics(
+    return KoopmanInverseDynamics(
         latent_action,
         LinearActionDecoder(latent_action.latent_dim, 2),
         lifting=KoopmanLifting(3, 4, hidden_dims=(16,), include_state=kind == "fourier"),
         operator=operator,
-        **normalized,
+        **normalizers(),
     )
-    return network
 
 
 def make_batch(*batch, dtype=torch.float32, share=0.5, num_frames=T):

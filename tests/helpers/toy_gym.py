@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gymnasium
 import numpy as np
+from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedEnv
 
 NAMES = ("q1", "q2", "goal_1", "goal_2")
 
@@ -61,6 +62,15 @@ for _id, _options in {
     "ToyReachLost-v0": {"terminates": "lost"},
 }.items():
     gymnasium.register(_id, entry_point=Reach, kwargs=_options)
+
+
+def reach(robots: int | None = None, **options) -> EnvBase:
+    """The robot in TorchRL, in float32; of several a batch."""
+
+    def one():
+        return TransformedEnv(GymEnv("ToyReach-v0", **options), DoubleToFloat(in_keys=["observation"]))
+
+    return one() if robots is None else SerialEnv(robots, one)
 
 
 class Seen(gymnasium.Env):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase
+from toy_gym import reach
 
 from torchrl_koap.modules import (
     Agent,
@@ -25,31 +24,6 @@ from torchrl_koap.modules import (
 from torchrl_koap.modules.execution.noise import NoiseStreams
 
 STEPS = 13
-
-
-class Drift(EnvBase):
-    """A point that is moved by its action; nothing is random."""
-
-    def __init__(self, num_envs):
-        super().__init__(batch_size=[num_envs])
-        self.observation_spec = Composite(observation=Unbounded((num_envs, 2)), shape=(num_envs,))
-        self.action_spec = Unbounded((num_envs, 2))
-        self.reward_spec = Unbounded((num_envs, 1))
-
-    def _reset(self, tensordict):
-        self.place = torch.arange(2.0 * self.batch_size[0]).reshape(-1, 2) / 10
-        return self._seen()
-
-    def _step(self, tensordict):
-        self.place = self.place + 0.1 * tensordict["action"]
-        return self._seen().set("reward", torch.zeros(*self.batch_size, 1))
-
-    def _seen(self):
-        flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("done", "terminated")}
-        return self.full_observation_spec.zero().update({"observation": self.place.clone(), **flags})
-
-    def _set_seed(self, seed):
-        pass
 
 
 def small_planner(**options):
@@ -75,7 +49,7 @@ POLICIES = [lambda: policy_of(), lambda: policy_of("open_loop"), chunks]
 @pytest.mark.parametrize("robots", [1, 3])
 def test_the_actions_of_a_rollout_bit_for_bit(make, robots):
     policy = make()
-    env = PolicyEnv(Drift(robots), policy)
+    env = PolicyEnv(reach(robots, length=20), policy)
     env.set_seed(7)
     with torch.no_grad():
         rollout = env.rollout(STEPS, policy)
@@ -209,7 +183,7 @@ def test_a_compiled_policy_makes_every_plan_that_is_due(make, backend):
         return np.stack([agent.act(row) for row in path])
 
     def collected(compiled):
-        env = PolicyEnv(Drift(2), policy)
+        env = PolicyEnv(reach(2, length=20), policy)
         env.set_seed(7)
         options = {"frames_per_batch": 2 * STEPS, "total_frames": 2 * STEPS, "compile_policy": compiled}
         collector = Collector(env, policy, **options)
@@ -241,4 +215,4 @@ def test_an_origin_is_subtracted_and_added_in_float64(offset):
         assert moved.dtype == np.float64
         np.testing.assert_allclose(moved - [0, offset], near, rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="act with one"):
-        PolicyEnv(Drift(1), far)
+        PolicyEnv(reach(1), far)

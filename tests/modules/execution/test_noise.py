@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-import toy_gym  # noqa: F401 - registers
 from tensordict import TensorDict
-from torchrl.envs import DoubleToFloat, GymEnv, TransformedEnv
+from toy_gym import reach
 
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.modules import (
@@ -61,10 +60,7 @@ def test_agent_environment_and_evaluation_act_alike_bit_for_bit(horizon, tempera
         execution=Execution(replan_interval=2, temperature=temperature),
     )
 
-    def bare(*_):
-        return TransformedEnv(GymEnv("ToyReach-v0"), DoubleToFloat(in_keys=["observation"]))
-
-    env = PolicyEnv(bare(), policy)
+    env = PolicyEnv(reach(), policy)
     env.set_seed(3)
     with torch.no_grad():
         rollout = env.rollout(6, policy)

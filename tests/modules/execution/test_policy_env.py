@@ -7,10 +7,10 @@ from functools import partial
 
 import pytest
 import torch
-import toy_gym  # noqa: F401 - registers
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import DoubleToFloat, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import ParallelEnv, SerialEnv
+from toy_gym import reach
 
 from torchrl_koap.modules import (
     DiffusionPolicy,
@@ -48,13 +48,8 @@ def chunks():
     return build(diffusion, state_of=range(4))
 
 
-def bare():
-
-    return TransformedEnv(GymEnv("ToyReach-v0"), DoubleToFloat(in_keys=["observation"]))
-
-
 def make_env(make_policy):
-    return PolicyEnv(bare(), make_policy())
+    return PolicyEnv(reach(), make_policy())
 
 
 POLICIES = pytest.mark.parametrize("make_policy", [feedback, chunks])
@@ -67,9 +62,9 @@ def two_of(make_policy):
 LAYOUTS = {
     "single": lambda make_policy: make_env(make_policy),
     "inside": lambda make_policy: SerialEnv(2, partial(make_env, make_policy)),
-    "outside": lambda make_policy: PolicyEnv(SerialEnv(2, bare), make_policy()),
+    "outside": lambda make_policy: PolicyEnv(SerialEnv(2, reach), make_policy()),
     "inside, [2, 2]": lambda make_policy: SerialEnv(2, partial(two_of, make_policy)),
-    "outside, [2, 2]": lambda make_policy: PolicyEnv(SerialEnv(2, partial(SerialEnv, 2, bare)), make_policy()),
+    "outside, [2, 2]": lambda make_policy: PolicyEnv(SerialEnv(2, partial(SerialEnv, 2, reach)), make_policy()),
 }
 
 
@@ -121,9 +116,9 @@ def alone(make_policy, rollout):
 
 PARALLEL = {
     "inside": lambda make_policy: ParallelEnv(2, partial(make_env, make_policy)),
-    "outside": lambda make_policy: PolicyEnv(ParallelEnv(2, bare), make_policy()),
+    "outside": lambda make_policy: PolicyEnv(ParallelEnv(2, reach), make_policy()),
     "inside, [2, 2]": lambda make_policy: ParallelEnv(2, partial(two_of, make_policy)),
-    "outside, [2, 2]": lambda make_policy: PolicyEnv(ParallelEnv(2, partial(SerialEnv, 2, bare)), make_policy()),
+    "outside, [2, 2]": lambda make_policy: PolicyEnv(ParallelEnv(2, partial(SerialEnv, 2, reach)), make_policy()),
 }
 
 
@@ -172,5 +167,5 @@ def test_the_environment_writes_what_a_policy_of_other_keys_reads():
     planner = StatePlanner(TemporalUnet(4, 8, channels=(8, 16)), state_dim=4, num_steps=2, noise_key=None)
     follower = InverseDynamicsFollower(make_koopman_inverse_dynamics(4, 2))
     policy = PlanningPolicy(planner, follower, state_of=range(4), history_key="frames")
-    start = PolicyEnv(bare(), policy).reset()
+    start = PolicyEnv(reach(), policy).reset()
     assert start["frames"].shape[-2:] == (5, 4) and "observation_history" not in start.keys()
