@@ -193,9 +193,7 @@ def test_features_that_are_not_those_of_the_run_are_named(exported):
     with pytest.raises(ValueError, match="observation.environment_state has 15 columns, the policy has 16"):
         policy.select_action(given)
     del given["observation.environment_state"]
-    with pytest.raises(
-        ValueError, match="has no observation.environment_state: .* it has observation.state; see --env"
-    ):
+    with pytest.raises(ValueError, match="has no observation.environment_state: .* got observation.state; see --env"):
         policy.select_action(given)
     three = PushtEnv(features={"action": PolicyFeature(FeatureType.ACTION, (3,))})
     with pytest.raises(ValueError, match="action has 3 columns, the policy has 2: vx, vy"):

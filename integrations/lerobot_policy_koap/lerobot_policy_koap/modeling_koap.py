@@ -158,17 +158,17 @@ class KoapPolicy(PreTrainedPolicy):
         if missing:
             given = [name for name in batch if name.startswith(OBS_PREFIX)]
             raise ValueError(
-                f"the observation has no {missing[0]}: the policy takes {', '.join(wanted)}, it has"
+                f"the observation has no {missing[0]}: the policy takes {', '.join(wanted)}, got"
                 f" {', '.join(given) or 'none'}; see --env.obs_type and --rename_map"
             )
         for feature, columns in self._numbers.items():
             _check_width(feature, batch[feature].shape[-1], columns)
-        given = {feature: batch[feature].cpu() for feature in wanted}  # where frames are embedded; the agent moves them
-        numbers = torch.cat([given[feature] for feature in self._numbers], -1) if self._numbers else None
+        seen = {feature: batch[feature].cpu() for feature in wanted}  # where frames are embedded; the agent moves them
+        numbers = torch.cat([seen[feature] for feature in self._numbers], -1) if self._numbers else None
         if not self._cameras:
             return numbers
         frames = {
-            camera: (given[feature] * 255).round().to(torch.uint8).movedim(-3, -1)
+            camera: (seen[feature] * 255).round().to(torch.uint8).movedim(-3, -1)
             for camera, feature in self._cameras.items()
         }
         return frames if numbers is None else {STATE: numbers, **frames}
