@@ -99,20 +99,6 @@ def test_every_action_in_a_collector_with_auto_reset(kind, interval, num_envs):
         assert made == plans  # the planner runs for rows that need a plan, and for no others
 
 
-def test_the_plan_is_kept_once_and_its_last_state_is_repeated_when_it_runs_out():
-    policy, td = policy_of(interval=6), step_input(torch.zeros(1, 2, 3))
-    for age in range(6):
-        td = policy(td)
-        assert td["plan"][0, :, 0].tolist() == [1000.0 * frame for frame in range(1, 7)]
-        assert td["planned_state"].tolist() == [[1000.0 * (age + 1), 0.0]]
-        assert td["action"][0, 2] == 1000.0 * (age + 1)
-        td["is_init"] = torch.zeros(1, 1, dtype=torch.bool)
-    seen = []
-    policy.follower.register_forward_hook(lambda module, arguments, _: seen.append(arguments[2][0, :, 0].tolist()))
-    policy.act(torch.zeros(1, 2, 3), td["plan"], torch.tensor([3]))
-    assert seen == [[4000.0, 5000.0, 6000.0, 6000.0, 6000.0, 6000.0]]
-
-
 @pytest.mark.parametrize("kind", ["feedback", "open_loop"])
 def test_longer_histories_reach_the_follower_shorter_ones_the_planner(kind):
     policy = policy_of(kind, num_past=4)
