@@ -114,7 +114,9 @@ def test_export_and_latency(run, tmp_path, capsys, monkeypatch):
     assert (observed["columns"], acted["columns"]) == (["q1", "q2", "goal1", "goal2"], ["dq1", "dq2"])
     assert acted["units"] == ["rad", "rad"] and facts["policy"]["control_hz"] == 20
     assert koap("latency", run, "--steps", 10) == 0
-    assert "late_steps" in capsys.readouterr().out
+    late, times = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"late steps +\d+ of 10; a step may take 50 ms", late)
+    assert re.fullmatch(r"time per step +median \S+ ms, 99 % below \S+ ms, longest \S+ ms", times)
     assert koap("latency", run, "--steps", 10, "--async-replan") == 0
 
 

@@ -129,7 +129,7 @@ def test_suggest_from_the_shell(copied_run, capsys):
     assert all(row["steps"] == 29 + row["episode"] for row in rows)
     assert [line.split()[1] for line in lines[1:4]] == [str(row["episode"]) for row in rows]
     # what to call next keeps the labels that are there
-    assert lines[4].split("--labels.episodes ")[1].split()[:-1] == [
+    assert lines[4].split("--labels.episodes ")[1].removesuffix(" --out NEW").split() == [
         str(episode) for episode in [*written["labelled_episodes"], *(row["episode"] for row in rows)]
     ]
     assert len(written["labelled_episodes"]) == labels["trajectories_touched"]

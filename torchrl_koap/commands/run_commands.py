@@ -158,9 +158,14 @@ class Latency(Command):
     run: tyro.conf.Positional[str]
     config: Options[LatencyConfig]
 
-    def __call__(self) -> dict[str, Any]:
+    def __call__(self) -> dict[str, str]:
         """Measures."""
-        return measure_control_loop(self.run, self.config)
+        found = measure_control_loop(self.run, self.config)
+        median, most, longest = (f"{found[name]:.3g} ms" for name in ("p50", "p99", "max"))
+        return {
+            "late steps": f"{found['late_steps']} of {found['steps']:,}; a step may take {found['step_ms']:.4g} ms",
+            "time per step": f"median {median}, 99 % below {most}, longest {longest}",
+        }
 
 
 @dataclass(kw_only=True)

@@ -179,7 +179,7 @@ class SuggestedLabels:
         >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels
         >>> row = {"rank": 1, "episode": 57, "steps": 120, "score": 0.31}
         >>> print(str(SuggestedLabels(0.1, 80, [3], [row])).splitlines()[-1])
-        with these labelled: koap train --labels.episodes 3 57 ...
+        with these labelled: koap train --labels.episodes 3 57 --out NEW
     """
 
     penalty: float
@@ -194,7 +194,7 @@ class SuggestedLabels:
             lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {row['score']:>10.4g}")
         every = [*self.labelled_episodes, *(row["episode"] for row in self.suggestions)]
         words = ["koap", "train", *self.data, "--labels.episodes", *map(str, every)]
-        lines.append(f"with these labelled: {shlex.join(words)} ...")
+        lines.append(f"with these labelled: {shlex.join(words)} --out NEW")
         return "\n".join(lines)
 
 
