@@ -123,6 +123,8 @@ def test_inspect_from_the_shell(copied_run, capsys):
     assert koap("inspect", run, "--episodes", "2", "--threads", "1") == 0
     written = json.loads((run / "inspect.json").read_text())
     assert {"planner_alone", "controller_alone", "both", "plan_to_execution", "findings"} <= set(written)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].split(maxsplit=2)[2] == str(run / "inspect.json") and max(map(len, lines[:-2])) < 200
     assert written["both"]["episodes"] == 2 and (run / "plots" / "inspect.png").exists()
     assert "episodes must be >= 1, got 0" in fails(capsys, "inspect", run, "--episodes", "0")
 

@@ -118,7 +118,8 @@ class Inspect(Command):
         draw_pictures(folder, names=("inspect.png", "latent.png"))
         if (folder / "index.html").exists():
             write_report(folder, draw=False)
-        return result
+        shown = {name: value for name, value in result.items() if name != "latent"}  # told by the findings
+        return shown | {"all numbers": str(folder / "inspect.json")}
 
 
 @dataclass(kw_only=True)

@@ -17,6 +17,7 @@ NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 GOOD = 0.9  # a success rate of a part that is not at fault
 MORE = "train longer (--steps) or record more"  # what to do about plans
 KIND = "check --action-kind, or label a recording that moves it"  # about an action
+_NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, leave it"
 _LEFT = 0.1  # share of recorded paths that a controller may leave
 _WORSE = 2.0  # from here on a latent model's error is no longer that of a comparable model
 
@@ -132,7 +133,7 @@ def _describe_latent(latent: Mapping[str, Any], task: Task) -> str:
     shown, factor = error_unit(part, task)
     ahead = {model: f"{factor * errors[model][part][-1]:.3g} {shown}".rstrip() for model in MODELS}
     faults = latent_faults(errors)
-    said = f"A fault to look into: {'; '.join(faults)}. " if faults else ""
+    said = f"Of the latent model: {'; '.join(faults)}. {_NO_STATES}. " if faults else ""
     return said + (
         f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
         f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
