@@ -103,17 +103,9 @@ def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
         raise OSError(f"{path} has {about.st_size:,} bytes; more than {largest:,} are not read")
 
 
-def read_bytes(path: str | Path, *, largest: int = LARGEST) -> bytes:
-    """Reads a plain file.
-
-    Args:
-        path (str or Path): the file.
-        largest (int): bytes it may have.
-
-    Raises:
-        OSError: as :func:`check_file`, or if it cannot be read.
-    """
-    check_file(path, largest=largest)
+def read_bytes(path: str | Path) -> bytes:
+    """Reads a plain file; an OSError refuses it as :func:`check_file` does, or if it cannot be read."""
+    check_file(path)
     return Path(path).read_bytes()
 
 

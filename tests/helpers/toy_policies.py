@@ -36,7 +36,7 @@ class CountingPlanner(nn.Module):
 class CountingSampler(CountingPlanner):
     """Entry ``k`` of a chunk sampled at state ``x`` is ``(k, x, x of the frame before, second column of x)``."""
 
-    sample_shape = noise_shape = (6, 4)
+    noise_shape = (6, 4)
 
     def sample(self, history, noise=None):
         assert history.shape[-2:] == (2, 2)

@@ -33,7 +33,6 @@ class RunDirectory:
 
     Args:
         path (str or Path): the folder; it need not exist yet.
-
     """
 
     def __init__(self, path: str | Path):
