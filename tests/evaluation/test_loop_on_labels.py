@@ -57,7 +57,7 @@ def test_labels_that_say_little_are_named():
     noisy = data.copy()
     noisy["next", "observation"] = noisy["observation"] + torch.randn(noisy["observation"].shape)
     found = check_loop(fit(data, task, **TINY, progress=False), noisy, noisy)
-    assert "of how states follow actions, linearly" in found["note"] and found["faults"] == []
+    assert "of its motion, which is too little" in found["note"] and found["faults"] == []
 
 
 def test_an_expert_that_knew_the_states_without_noise_is_no_alarm():

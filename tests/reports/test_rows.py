@@ -48,6 +48,8 @@ def test_why_a_training_ended(updates, kept, said):
 
 def test_planners_that_nothing_was_held_out_from_or_that_are_no_part_of_the_run():
     assert rows_of(planner={"updates": 20})["planner"] == "20 updates in 22 s; no recording was held out"
+    resumed = {"planner": 0.1, "controller": 0.1}
+    assert rows_of(train_seconds=resumed)["controller"] == "koap, 500 updates; fitted to 18 labels"
     assert rows_of({"planner": {"source": "runs/other"}})["planner"] == "that of runs/other; not trained here"
     assert list(rows_of({"method": "dp"}, planner_parameters=0)) == ["labels", "controller"]
 

@@ -72,7 +72,10 @@ def check_loop(
     response = _fit(data)
     if response.explained < _EXPLAINED:
         share = f"{max(response.explained, 0):.0%}"
-        return {"note": f"labels explain {share} of how states follow actions, linearly", "faults": []}
+        return {
+            "note": f"a linear model of the robot explains {share} of its motion, which is too little",
+            "faults": [],
+        }
     if not _replay_error(response, data) < _DRIFT:
         return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
     free = trained_policy(trained, ExecutionConfig(**vars(asked) | {"limits": math.inf}))

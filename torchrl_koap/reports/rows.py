@@ -99,7 +99,7 @@ def _controller(run: RunFacts) -> Row | None:
 
 def _seconds(run: RunFacts, part: str) -> str:
     seconds = _number_in(run.summary.get("train_seconds"), part)
-    return "" if seconds is None else f" in {seconds:.0f} s"
+    return "" if seconds is None or seconds < 1 else f" in {seconds:.0f} s"  # a finished part takes none when resumed
 
 
 def _number_in(source: Any, name: str) -> float | int | None:
