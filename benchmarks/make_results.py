@@ -14,6 +14,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import ground_rows
 import page_rows
 import paper_rows
 import pictures
@@ -32,7 +33,7 @@ def pages() -> dict[Path, str]:
     environment = Environment(
         loader=FileSystemLoader(tables.SOURCE), undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
-    for module in (tables, paper_rows, unlabelled_rows, page_rows):
+    for module in (tables, paper_rows, unlabelled_rows, ground_rows, page_rows):
         environment.globals.update(vars(module))
     made = {}
     for template in sorted(tables.SOURCE.rglob("*.md.jinja")):

@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from paper_rows import count_by_observations, count_successes, finished_cells, label_shares, paper_cells_beside
-from tables import SOURCE, fact, percent, planner_rows, pooled_rewards, read_rows, table
+from tables import SOURCE, fact, percent, planner_rows, read_rows, table
 from unlabelled_rows import REGIMES, followed
 
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -197,12 +197,6 @@ def followed_rollouts(labels: int, regimes: Sequence[str]) -> str:
         cell = row["regime"], row["method"]
         sizes[cell] = sizes.get(cell, 0) + int(row["n"])
     return " or ".join(map(str, sorted({size for (_, name), size in sizes.items() if name in FOLLOWED.values()})))
-
-
-def mean_reward(ground: str, method: str, execution: str = "default") -> str:
-    """Formats the mean largest reward of a method on a proving ground, all training seeds together."""
-    ((_, mean, _),) = pooled_rewards(ground=ground, method=method, execution=execution)
-    return f"{mean:.2f}"
 
 
 def requirement(name: str) -> str:

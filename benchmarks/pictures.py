@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ground_rows import draw_grounds
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.ticker import FixedLocator, NullLocator
 from paper_rows import count_by_observations, count_successes, draw_bench_average, label_shares
-from tables import fact, planner_rows, pooled_rewards, read_rows
+from tables import fact, planner_rows, read_rows
 from unlabelled_rows import draw_unlabelled
 
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -44,10 +45,6 @@ def draw_all(folder: Path) -> list[Path]:
     errors = [(name, [float(row[f"{key}_error_rad"]) for row in robot]) for name, key in _ROBOT.items()]
     latent = {"Koopman model": "latent_koopman", "linear model on states": "latent_linear", "no motion": "latent_still"}
     ways = [(row["way"], float(row["p50_ms"]), float(row["p99_ms"])) for row in read_rows("exported_policy")]
-    scores = [
-        (f"{rows[0]['method']}, {rows[0]['execution'].replace('_', ' ')}", mean, error)
-        for rows, mean, error in pooled_rewards(ground="pusht")
-    ]
     return [
         draw_label_curves(label_curves(), folder / "success_and_entropy.png"),
         *(draw_pipeline(folder / f"pipeline.{kind}") for kind in ("svg", "png")),
@@ -70,11 +67,7 @@ def draw_all(folder: Path) -> list[Path]:
             folder / "latent_space.png",
             log=True,
         ),
-        draw_bars(
-            [(name, mean, mean - 1.96 * error, mean + 1.96 * error) for name, mean, error in scores],
-            "mean largest reward on Push-T",
-            folder / "proving_grounds.png",
-        ),
+        draw_grounds(folder / "proving_grounds.png"),
         draw_bars(
             [(way, median, median, worst) for way, median, worst in ways],
             "plan and actions of seven joints (ms), median and 99th percentile",

@@ -172,35 +172,6 @@ def kills(rows: Sequence[Row]) -> list[dict[str, str]]:
     return total(made, command="all")
 
 
-def pooled_rewards(**wanted: str) -> list[tuple[list[dict[str, str]], float, float]]:
-    """Lists rows of proving grounds by method and execution, with mean and standard error over all training seeds."""
-    cells: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for row in read_rows("proving_grounds", **wanted):
-        cells.setdefault((row["method"], row["execution"]), []).append(row)
-    return [
-        (
-            rows,
-            sum(float(row["largest_reward"]) for row in rows) / len(rows),
-            sum(float(row["standard_error"]) ** 2 for row in rows) ** 0.5 / len(rows),
-        )
-        for rows in cells.values()
-    ]
-
-
-def grounds_table(ground: str) -> str:
-    """Formats a row per method and way to execute its plans on a proving ground, all training seeds together."""
-    body = []
-    for rows, mean, error in pooled_rewards(ground=ground):
-        method, execution = rows[0]["method"], rows[0]["execution"]
-        counts = {key: sum(int(row[key]) for row in rows) for key in ("successes", "n")}
-        updates = ", ".join(f"{int(row['kept_update']):,}" for row in rows if row["kept_update"])
-        seconds = ", ".join(row["train_core_seconds"] for row in rows)
-        cell = [f"`{method}`", execution.replace("_", " "), rows[0]["labels"], str(len(rows)), str(counts["n"])]
-        body.append([*cell, f"{mean:.3f} +- {error:.3f}", percent(counts), updates, seconds])
-    head = ["method", "execution", "labelled", "training seeds", "n", "largest reward", "success (95 %)"]
-    return table([*head, "kept updates", "core seconds"], body)
-
-
 def every(rows: Sequence[Row], count: int = 4) -> list[Row]:
     """Picks the first row, the last, and a few between."""
     return [*rows[: -1 : max(1, len(rows) // count)], rows[-1]]

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations of others become data sets; rows of the table are those of the rollouts."""
+"""Grounds become data sets; rows of the table are those of rollouts, or of errors on recordings."""
 
 from __future__ import annotations
 
@@ -8,81 +8,169 @@ import csv
 import numpy as np
 import pytest
 import torch
-from shared_data import SHARED
+from proving_grounds import adroit_door, meta_world, pusht, run
+from proving_grounds.ground import Ground
 from tensordict import TensorDict
 
 from torchrl_koap.data import open_dataset
+from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
 from torchrl_koap.vision import Observer, cameras_of, load_backbone
 
 OWN = "tiny_network:random_layer"
+GROUNDS = run.grounds()
 
 
-def test_the_angle_of_the_block_becomes_cosine_and_sine(benchmark_script):
-    columns = benchmark_script("proving_grounds").six_columns(np.array([[1.0, 2.0, 3.0, 4.0, np.pi / 2]]))
+def needed(name):
+    """A ground whose packages and data are here."""
+    if lacks := GROUNDS[name].missing():
+        pytest.skip(f"{name}: {lacks}")
+    return GROUNDS[name]
+
+
+def test_the_angle_of_the_block_becomes_cosine_and_sine():
+    columns = pusht.six_columns(np.array([[1.0, 2.0, 3.0, 4.0, np.pi / 2]]))
     np.testing.assert_allclose(columns, [[1, 2, 3, 4, 0, 1]], atol=1e-6)
 
 
-def test_missing_demonstrations_are_named(benchmark_script, monkeypatch, tmp_path):
-    script = benchmark_script("proving_grounds")
-    monkeypatch.setattr(script, "DATA", tmp_path / "pusht.npz")
-    with pytest.raises(FileNotFoundError, match="pusht.npz is not there"):
-        script.write_data_set(tmp_path / "data")
+# data set: recordings, steps, columns of the state, of the robot, targets
+WRITTEN = {
+    "pusht": (206, 25_650 - 206, 6, (0, 1), (0, 1)),
+    "unitree_g1": (100, 35_865, 26, tuple(range(26)), tuple(range(26))),
+    "adroit_door": (25, 6_729 - 25, 39, (*range(27), 29, 30, 31), ()),
+}
 
 
-def test_push_t_becomes_a_data_set(benchmark_script, monkeypatch, tmp_path):
-    data = SHARED / "proving_grounds" / "pusht_human_206.npz"
-    if not data.is_file():
-        pytest.skip(f"{data} is not there")
-    script = benchmark_script("proving_grounds")
-    monkeypatch.setattr(script, "DATA", data)
-    script.write_data_set(tmp_path / "data")
+@pytest.mark.parametrize("name", WRITTEN)
+def test_recordings_become_a_data_set(name, tmp_path):
+    ground = GROUNDS[name]
+    if not ground.data.exists():
+        pytest.skip(ground.missing())
+    ground.write(tmp_path / "data")
     steps, task = open_dataset(str(tmp_path / "data"))
-    assert len(steps["episode"].unique()) == 206 and len(steps) == 25_650 - 206
-    assert task.targets == (0, 1) and task.robot == (0, 1) and task.state_dim == 6
+    recordings = len(steps["episode"].unique())
+    assert (recordings, len(steps), task.state_dim, task.robot, task.targets) == WRITTEN[name]
+    assert steps["has_action"].all()
 
 
-def test_frames_of_recorded_states_become_columns(benchmark_script, monkeypatch, tmp_path):
+@pytest.mark.parametrize("task", meta_world.TASKS)
+def test_scripted_policies_succeed_again_in_the_simulator(task, tmp_path):
+    needed(f"meta_world_{task}")
+    states, actions = meta_world.record(task, 2)
+    env = meta_world.make_env(task)
+    for frames, taken in zip(states, actions, strict=True):
+        assert len(frames) == len(taken) + 1 <= meta_world.STEPS and np.abs(taken).max() <= 1
+        assert frames.shape[1] == len(meta_world.STATE) == env.observation_space.shape[0]
+    np.testing.assert_array_equal(env.reset(seed=0)[0], env.reset(seed=0)[0])
+    assert np.abs(states[0][0] - states[1][0]).max() > 0.01  # things lie elsewhere
+    np.testing.assert_array_equal(env.reset(seed=0)[0], states[0][0])  # no first attempt failed
+    ends = [env.step(action)[2] for action in actions[0]]
+    assert ends == [False] * (len(ends) - 1) + [True]
+
+
+def test_replayed_humans_open_as_many_doors_as_published():
+    needed("adroit_door")
+    assert sum(adroit_door.replay()) == 8
+
+
+def test_frames_of_recorded_states_become_columns(monkeypatch, tmp_path):
     pytest.importorskip("gym_pusht")
-    script = benchmark_script("proving_grounds")
     states = np.random.default_rng(0).uniform(150, 350, (3, 30, 5))
-    monkeypatch.setattr(script, "read_episodes", lambda: (list(states), [frames[:, :2] for frames in states]))
+    monkeypatch.setattr(pusht, "read_episodes", lambda: (list(states), [frames[:, :2] for frames in states]))
     monkeypatch.setattr("torchrl_koap.vision.embedding.load_backbone", lambda network: load_backbone(OWN))
-    script.write_pixels(tmp_path / "data")
+    pusht.write_pixels(tmp_path / "data")
     steps, task = open_dataset(str(tmp_path / "data"))
     assert len(steps) == 87 and task.robot == (0, 1) and task.targets == (0, 1) and task.state_dim == 2 + 64
-    env, other = script.make_pixels(), script.make_pixels()
+    env, other = pusht.make_pixels(), pusht.make_pixels()
     env.reset(seed=3), other.reset(seed=1)
     for step in range(40):  # the agent runs into the block
         seen, *_ = env.step(np.array(env.unwrapped.block.position))
         agent, block = env.unwrapped.agent, env.unwrapped.block
-        drawn = script.draw(other.unwrapped, np.array([*agent.position, *block.position, block.angle]))
+        drawn = pusht.draw(other.unwrapped, np.array([*agent.position, *block.position, block.angle]))
         np.testing.assert_array_equal(drawn, seen["pixels"], str(step))
-    frame = script.draw(other.unwrapped, states[1, 4])
+    frame = pusht.draw(other.unwrapped, states[1, 4])
     seen = Observer(task, cameras_of(tmp_path / "data"))({"state": states[1, 4, :2].astype(np.float32), "top": frame})
     torch.testing.assert_close(seen, steps["observation"][29 + 4], rtol=1e-4, atol=1e-4)
 
 
-def test_a_row_is_the_mean_largest_reward(benchmark_script, monkeypatch, tmp_path):
-    script, asked = benchmark_script("proving_grounds"), []
+def test_what_is_missing_is_skipped_by_name(monkeypatch, capsys, tmp_path):
+    away = Ground(lambda folder: None, "success", (5,), 1, data=tmp_path / "away.npz")
+    bare = Ground(lambda folder: None, "success", (5,), 1, package="no_such_simulator", install="pip install it")
+    monkeypatch.setattr(run, "grounds", lambda: {"away": away, "bare": bare})
+    run.main(results=tmp_path / "table.csv")
+    one, other = capsys.readouterr().out.splitlines()
+    assert one.startswith("away is skipped: ") and "away.npz is not there" in one
+    assert other == "bare is skipped: no module no_such_simulator: pip install it"
 
-    class Ran:
-        task, results = None, {"planner": {"best_held_out_score": 0.25, "kept_update": 700}}
 
-    def episodes(policy, make_env, seeds, **options):
-        asked.append(seeds)
-        rewards = torch.tensor([[0.1], [0.4 if seeds[0] % 2 else 1.0]])
-        return [TensorDict({"next": {"reward": rewards}}, [2]) for _ in seeds]
+@pytest.mark.parametrize(
+    "asked", [{"methods": ("koap", "kaop")}, {"methods": ("dp",)}, {"executions": ("slow",)}], ids=str
+)
+def test_unknown_names_end_with_a_sentence(asked, tmp_path):
+    with pytest.raises(SystemExit, match="unknown"):
+        run.main(results=tmp_path / "table.csv", **asked)
 
-    monkeypatch.setattr(script, "write_data_set", lambda folder: folder.mkdir())
-    monkeypatch.setattr(script, "train", lambda config: asked.append(config) or Ran)
-    monkeypatch.setattr(script, "load_policy", lambda *args, **options: None)
-    monkeypatch.setattr(script, "roll_out", episodes)
-    table = tmp_path / "table.csv"
-    for _ in range(2):  # the second finds everything done
-        script.main(seeds=1, n=2, methods=("koap",), folder=tmp_path, results=table)
-    assert [type(each).__name__ for each in asked] == ["TrainConfig", "list", "list", "list"]
+
+class Ran:
+    """A run that was not trained."""
+
+    folder, task, cameras, results = "run", None, None, {"planner": {"best_held_out_score": 0.25, "kept_update": 700}}
+
+
+@pytest.fixture
+def table_of(monkeypatch, tmp_path):
+    """Runs a ground twice, of which the second finds everything done; returns what was asked for, and the rows."""
+
+    def runs(score, **options):
+        asked = []
+
+        def episodes(policy, make_env, seeds, **options):
+            asked.append(seeds)
+            ends = {"reward": torch.tensor([[0.1], [1.0]]), "success": torch.tensor([[False], [seeds[0] % 2 == 0]])}
+            return [TensorDict({"next": ends}, [2]) for _ in seeds]
+
+        ground = Ground(lambda folder: (folder / "ted").mkdir(parents=True), score, (10,), 12, env="Toy-v0")
+        if score == "errors":
+            ground = Ground(ground.write, score, (10,), 12)
+        monkeypatch.setattr(run, "grounds", lambda: {"toy": ground})
+        monkeypatch.setattr(run, "train", lambda config: asked.append(config) or Ran)
+        monkeypatch.setattr(run, "load_policy", lambda *args, **options: None)
+        monkeypatch.setattr(run, "roll_out", episodes)
+        errors = {"relative_plan_error": 0.5, "action_errors": {"outside_budget": {"relative_of_ridge": 0.75}}}
+        monkeypatch.setattr(run, "evaluate", lambda folder, config: errors)
+        monkeypatch.setattr(run.Observer, "of", lambda *args: None)
+        for _ in range(2):
+            run.main(("toy",), seeds=1, methods=("koap",), folder=tmp_path, results=tmp_path / "table.csv", **options)
+        with (tmp_path / "table.csv").open() as file:
+            return asked, list(csv.DictReader(file))
+
+    return runs
+
+
+def test_a_row_is_the_mean_largest_reward(table_of):
+    asked, rows = table_of("reward", n=2, executions=("default", "open_loop_8"))
+    assert [type(each).__name__ for each in asked] == ["TrainConfig", "list", "list"]
     assert asked[0].labels.count == 10 and asked[1] == [100_000, 100_001]
-    with table.open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["execution"] for row in rows] == ["default", "open_loop_8", "temperature_1"]
+    assert [row["execution"] for row in rows] == ["default", "open_loop_8"]
     assert {(row["largest_reward"], row["successes"], row["kept_update"]) for row in rows} == {("1.0000", "2", "700")}
+
+
+def test_a_row_counts_what_the_simulator_calls_success(table_of):
+    _, (row,) = table_of("success")
+    assert (row["successes"], row["n"], row["largest_reward"]) == ("12", "12", "")
+
+
+def test_a_row_has_errors_on_recordings_without_a_simulator(table_of):
+    asked, (row,) = table_of("errors")
+    assert len(asked) == 1 and (row["plan_error"], row["action_error"]) == ("0.5000", "0.7500")
+    assert row["n"] == "2" and row["successes"] == ""  # those without labels
+
+
+@pytest.mark.parametrize("name", [name for name, ground in GROUNDS.items() if ground.env and "pixels" not in name])
+def test_simulators_give_the_columns_of_the_data(name, tmp_path, monkeypatch):
+    ground = needed(name)
+    monkeypatch.setattr(meta_world.record, "__defaults__", (2,))
+    ground.write(tmp_path / "data")
+    steps, task = open_dataset(str(tmp_path / "data"))
+    env = GymnasiumBatch(ground.env, task, 1, max_steps=ground.max_steps)
+    env.seed_episodes([0])
+    assert env.reset()["observation"].shape == (1, steps["observation"].shape[-1])

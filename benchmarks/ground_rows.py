@@ -1,0 +1,173 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Proving grounds in the README and on their page: pooled scores, the table and the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from tables import fact, percent, read_rows, table
+
+from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, tidy
+
+TITLES = {
+    "pusht": "Push-T",
+    "adroit_door": "Adroit door",
+    "meta_world_button-press": "Meta-World button-press",
+    "meta_world_assembly": "Meta-World assembly",
+    "meta_world_bin-picking": "Meta-World bin-picking",
+    "meta_world_peg-insert-side": "Meta-World peg-insert-side",
+    "meta_world_shelf-place": "Meta-World shelf-place",
+    "unitree_g1": "Unitree G1",
+}
+COMPARED = {
+    "koap": ("KOAP", BLUE),
+    "koap_untrained": ("random features", PALE_BLUE),
+    "linear_steps": ("ridge regression", ORANGE),
+    "dp": ("Diffusion Policy", MUTED),
+}
+
+
+@dataclass(frozen=True)
+class Score:
+    """A method on a ground, all training seeds together: counts, and means of what the rows have.
+
+    Args:
+        seeds (int): training seeds.
+        n (int): rollouts or recordings of all of them.
+        successes (int): rollouts that succeed.
+        reward (float, optional): mean largest reward.
+        error (float): its standard error.
+        plan, action (float, optional): error of plans as a share of standing still's, of actions as one of a ridge's.
+    """
+
+    seeds: int
+    n: int
+    successes: int
+    reward: float | None
+    error: float
+    plan: float | None
+    action: float | None
+
+    @property
+    def interval(self) -> tuple[float, float, float]:
+        """Mean largest reward, or share of successes where there is none, with its 95 % interval."""
+        if self.reward is not None:
+            return self.reward, self.reward - 1.96 * self.error, self.reward + 1.96 * self.error
+        return self.successes / self.n, *wilson_interval(self.successes, self.n)
+
+    @property
+    def text(self) -> str:
+        """The score in words."""
+        if self.reward is not None:
+            return f"{self.reward:.2f}"
+        if self.plan is not None or self.action is not None:
+            return " / ".join("none" if share is None else f"{share:.2f}" for share in (self.action, self.plan))
+        return percent({"successes": self.successes, "n": self.n}, 0)
+
+
+def ground_score(ground: str, method: str, labels: int | None = None, execution: str = "default") -> Score | None:
+    """Pools the rows of a method on a ground; None if there are none.
+
+    Args:
+        ground (str): its name.
+        method (str): a name of ``koap methods``.
+        labels (int, optional): labelled demonstrations. Default: the fewest that were run.
+        execution (str): how plans were executed.
+    """
+    count = labels or min(label_counts(ground), default=0)
+    rows = read_rows("proving_grounds", ground=ground, method=method, execution=execution, labels=count)
+    if not rows:
+        return None
+
+    def mean(column: str) -> float | None:
+        values = [float(row[column]) for row in rows if row[column]]
+        return sum(values) / len(values) if values else None
+
+    return Score(
+        seeds=len(rows),
+        n=sum(int(row["n"]) for row in rows),
+        successes=sum(int(row["successes"] or 0) for row in rows),
+        reward=mean("largest_reward"),
+        error=sum(float(row["standard_error"] or 0) ** 2 for row in rows) ** 0.5 / len(rows),
+        plan=mean("plan_error"),
+        action=mean("action_error"),
+    )
+
+
+def label_counts(ground: str) -> list[int]:
+    """Lists the numbers of labelled demonstrations that a ground was run with."""
+    return sorted({int(row["labels"]) for row in read_rows("proving_grounds", ground=ground)})
+
+
+def ground_text(ground: str, method: str, labels: int | None = None, execution: str = "default") -> str:
+    """Formats the score of a method on a ground, or says that it was not run."""
+    score = ground_score(ground, method, labels, execution)
+    return "not run" if score is None else score.text
+
+
+def _cells() -> Iterator[tuple[str, int]]:
+    for ground in TITLES:
+        for labels in label_counts(ground):
+            yield ground, labels
+
+
+def grounds_table() -> str:
+    """Formats a row per ground and number of labelled demonstrations, a column per method."""
+    published = {row["key"] for row in read_rows("facts")}
+    body = []
+    for ground, labels in _cells():
+        scores = [ground_score(ground, method, labels) for method in COMPARED]
+        first = next(score for score in scores if score is not None)
+        key = f"{ground}_published_mean"
+        row = [TITLES[ground], str(labels), f"{first.seeds} x {first.n // first.seeds}"]
+        row += ["not run" if score is None else score.text for score in scores]
+        body.append([*row, fact(key) if key in published else "none"])
+    heads = [name for name, _ in COMPARED.values()]
+    return table(["ground", "labelled", "training seeds x n", *heads, "published, all labels"], body)
+
+
+def draw_grounds(path: Path) -> Path:
+    """Draws bars of every method per ground: scores of rollouts, and errors on recordings.
+
+    Args:
+        path (Path): png to write.
+    """
+    cells = list(_cells())
+    rolled = [cell for cell in cells if (score := ground_score(cell[0], "koap", cell[1])) and score.plan is None]
+    judged = [cell for cell in cells if cell not in rolled]
+    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[max(2, len(rolled)), 2 * max(1, len(judged))])
+    for number, (method, (name, color)) in enumerate(COMPARED.items()):
+        for place, (ground, labels) in enumerate(rolled):
+            score = ground_score(ground, method, labels)
+            if score is not None:
+                _bar(left, place + 0.2 * number, *score.interval, color, name)
+        for place, (ground, labels) in enumerate(judged):
+            score = ground_score(ground, method, labels)
+            for step, share in enumerate(() if score is None else (score.action, score.plan)):
+                if share is not None:
+                    _bar(right, 2 * place + step + 0.2 * number, share, share, share, color, name)
+    texts = [f"{TITLES[ground].replace(' ', chr(10), 1)}\n{labels} labelled" for ground, labels in rolled]
+    left.set_xticks([place + 0.3 for place in range(len(rolled))], texts, fontsize=8)
+    left.set(ylim=(0, 1.05), ylabel="largest reward, or success")
+    kinds = ("actions,\nridge = 1", "plans,\nstanding still = 1")
+    texts = [f"{TITLES[ground]}\n{kind}" for ground, _ in judged for kind in kinds]
+    right.set_xticks([place + 0.3 for place in range(len(texts))], texts, fontsize=8)
+    right.axhline(1, color=MUTED, linewidth=0.7, linestyle=":")
+    right.set_ylabel("error on recordings")
+    handles = {text: handle for handle, text in zip(*left.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    for axes in (left, right):
+        tidy(axes)
+    figure.savefig(path, dpi=130, facecolor="white", metadata={"Software": None})
+    return path
+
+
+def _bar(axes, place: float, mean: float, low: float, high: float, color: str, name: str) -> None:
+    axes.bar(place, mean, width=0.18, color=color, label=name)
+    axes.plot([place, place], [low, high], color=INK, linewidth=1)
+    axes.annotate(f"{mean:.2f}", (place, high), ha="center", va="bottom", fontsize=7, color=INK)

@@ -1,0 +1,79 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Adroit door: a hand of 28 actuators unlatches and opens a door; 25 human demonstrations with a data glove.
+
+The demonstrations are those of Rajeswaran et al. 2018 (Apache-2.0). Actions are normalised targets of the actuators.
+The hand's first joint is in no column; the place of the palm shows it. Replayed open loop 8 of 25 succeed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from proving_grounds.ground import SHARED, Ground
+
+from torchrl_koap.data import save_demonstrations
+
+DATA = SHARED / "adroit_door_human_25.npz"
+ENV, STEPS = "torchrl_koap/AdroitDoor-v0", 300
+JOINTS, PALM = [f"joint_{number}" for number in range(1, 28)], ["palm_x", "palm_y", "palm_z"]
+DOOR = ["latch", "hinge"]
+HANDLE = ["handle_x", "handle_y", "handle_z", "to_palm_x", "to_palm_y", "to_palm_z", "is_open"]
+STATE = [*JOINTS, *DOOR, *PALM, *HANDLE]
+
+
+def split(values: np.ndarray, ends: np.ndarray) -> list[np.ndarray]:
+    """Splits steps ``[N, d]`` into episodes."""
+    return np.split(values, ends[:-1])
+
+
+def write(folder: Path) -> None:
+    """Writes the demonstrations as a data set; actions are cut to the range that the simulator executes."""
+    raw = np.load(DATA)
+    save_demonstrations(
+        folder,
+        split(raw["observations"], raw["episode_ends"]),
+        split(raw["actions"].clip(-1, 1), raw["episode_ends"]),
+        control_hz=100,
+        state_names=STATE,
+        action_names=[f"actuator_{number}" for number in range(28)],
+        robot=[*JOINTS, *PALM],
+        action_kind="raw",
+        max_steps=STEPS,
+    )
+
+
+def make_env(**options: Any) -> gymnasium.Env:
+    """Makes the simulator."""
+    import gymnasium_robotics  # noqa: F401  # registers it
+
+    return gymnasium.make("AdroitHandDoor-v1", max_episode_steps=STEPS, disable_env_checker=True, **options)
+
+
+def replay() -> list[bool]:
+    """Replays the human's actions from the recorded starts; returns which episodes open the door."""
+    raw, env, opened = np.load(DATA), make_env(), []
+    for number, actions in enumerate(split(raw["actions"], raw["episode_ends"])):
+        env.reset(seed=0)
+        start = {"qpos": raw["initial_qpos"][number], "qvel": raw["initial_qvel"][number]}
+        env.unwrapped.set_env_state(start | {"door_body_pos": raw["door_body_position"][number]})
+        opened.append(any(bool(env.step(action)[4]["success"]) for action in actions))
+    return opened
+
+
+gymnasium.register(ENV, make_env, max_episode_steps=STEPS, disable_env_checker=True)
+GROUNDS = {
+    "adroit_door": Ground(
+        write,
+        "success",
+        (5, 25),
+        100,
+        env=ENV,
+        max_steps=STEPS,
+        data=DATA,
+        package="gymnasium_robotics",
+        install="pip install --no-deps gymnasium-robotics==1.4.2",
+    )
+}

@@ -1,0 +1,51 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a proving ground is: demonstrations of others as a data set, where policies are judged, and how."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "proving_grounds"
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Demonstrations of others and how policies that learned from them are judged.
+
+    Args:
+        write (callable): writes all demonstrations with their actions into a folder, as a data set of ``koap train``.
+        score (str): ``"reward"``, the largest of a rollout, or ``"success"``, both in a simulator; ``"errors"`` of
+            plans and actions on recordings.
+        labels (tuple of int): demonstrations whose actions may be seen, unless told otherwise.
+        n (int): rollouts per cell; for ``"errors"`` all recordings, of which those without labels judge actions.
+        env (str, optional): id of the simulator, which the module of the ground registers.
+        max_steps (int): control steps of a rollout.
+        data (Path, optional): what has to be there.
+        package (str, optional): module of the simulator.
+        install (str): the command that brings that package.
+    """
+
+    write: Callable[[Path], None]
+    score: Literal["reward", "success", "errors"]
+    labels: tuple[int, ...]
+    n: int
+    env: str | None = None
+    max_steps: int = 0
+    data: Path | None = None
+    package: str | None = None
+    install: str = ""
+
+    def missing(self) -> str | None:
+        """Says what has to be fetched before this ground can be run, and how; None if all is there."""
+        if self.data is not None and not self.data.exists():
+            return (
+                f"{self.data} is not there: set KOAP_SHARED to the folder that holds proving_grounds/{self.data.name}"
+            )
+        if self.package is not None and importlib.util.find_spec(self.package) is None:
+            return f"no module {self.package}: {self.install}"
+        return None

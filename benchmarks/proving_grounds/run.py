@@ -1,0 +1,185 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Proving grounds, demonstrations and simulators of others: the default command of each method, without any tuning.
+
+    python benchmarks/proving_grounds/run.py pusht --labels 10 --seeds 3
+    python benchmarks/proving_grounds/run.py  # every ground whose packages and data are here
+
+Trains and judges every method with every training seed, and appends rows to ``benchmarks/results/proving_grounds.csv``.
+What is there already is not run again. The planner is that of the first method. Seconds are those of one core, with the
+time to write the data set. A ground is a file beside this one with its ``GROUNDS``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import tyro
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+
+from proving_grounds.ground import Ground  # noqa: E402
+from tables import open_table  # noqa: E402
+
+from torchrl_koap import (  # noqa: E402
+    EvalConfig,
+    LabelConfig,
+    PlannerConfig,
+    RunConfig,
+    TrainConfig,
+    Trained,
+    evaluate,
+    load_policy,
+    train,
+)
+from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch  # noqa: E402
+from torchrl_koap.evaluation.rollouts import roll_out  # noqa: E402
+from torchrl_koap.keys import SUCCESS  # noqa: E402
+from torchrl_koap.lookup import lookup  # noqa: E402
+from torchrl_koap.modules import ExecutionConfig  # noqa: E402
+from torchrl_koap.training.methods import METHODS, get_method  # noqa: E402
+from torchrl_koap.vision.observer import Observer  # noqa: E402
+
+RESULTS = HERE.parent / "results" / "proving_grounds.csv"
+FIRST_SEED = 100_000
+KEYS = ("ground", "method", "labels", "seed", "execution", "n")
+SCORES = ("largest_reward", "standard_error", "successes", "plan_error", "action_error")
+COLUMNS = (*KEYS, *SCORES, "held_out_score", "kept_update", "train_core_seconds")
+EXECUTIONS = {
+    "default": ExecutionConfig(),
+    "open_loop_8": ExecutionConfig(strategy="open_loop", replan_interval=8),
+    "temperature_1": ExecutionConfig(temperature=1.0),
+}
+
+
+def grounds() -> dict[str, Ground]:
+    """Every proving ground by its name."""
+    found: dict[str, Ground] = {}
+    for file in sorted(HERE.glob("*.py")):
+        if file.stem not in ("run", "ground"):
+            found |= importlib.import_module(f"proving_grounds.{file.stem}").GROUNDS
+    return found
+
+
+def roll(ground: Ground, trained: Trained, execution: ExecutionConfig, n: int) -> dict[str, Any]:
+    """Scores a policy in the simulator of a ground."""
+    observe = Observer.of(trained.task, trained.cameras)
+    episodes = roll_out(
+        load_policy(trained, **{key: value for key, value in vars(execution).items() if value is not None}),
+        lambda count: GymnasiumBatch(ground.env, trained.task, count, observe=observe, max_steps=ground.max_steps),
+        list(range(FIRST_SEED, FIRST_SEED + n)),
+        max_steps=ground.max_steps,
+        batch_size=25,
+    )
+    if ground.score == "success":
+        return {"successes": sum(bool(episode["next", SUCCESS].any()) for episode in episodes)}
+    rewards = np.array([episode["next", "reward"].max().item() for episode in episodes])
+    return {
+        "largest_reward": f"{rewards.mean():.4f}",
+        "standard_error": f"{rewards.std() / n**0.5:.4f}",
+        "successes": int((rewards >= 0.999).sum()),
+    }
+
+
+def judge(trained: Trained) -> dict[str, Any]:
+    """Scores a run on recordings: of plans as a share of standing still's, of actions as a share of the ridge's."""
+    result = evaluate(trained.folder, EvalConfig(threads=1))
+    errors = {
+        "plan_error": result["relative_plan_error"],
+        "action_error": result["action_errors"]["outside_budget"].get("relative_of_ridge"),
+    }
+    return {name: "" if error is None else f"{error:.4f}" for name, error in errors.items()}
+
+
+def run_cell(
+    name: str, ground: Ground, config: TrainConfig, executions: dict[str, ExecutionConfig], n: int
+) -> list[tuple[object, ...]]:
+    """Trains one method and scores it in each way to execute its plans; returns the rows."""
+    began = time.process_time()
+    trained = train(config)
+    seconds = time.process_time() - began
+    part = trained.results["planner" if get_method(config.method).plans else "controller"]
+    held_out = part.get("best_held_out_score")
+    rows = []
+    for way, execution in executions.items():
+        row = {"ground": name, "method": config.method, "labels": config.labels.count, "seed": config.run.seed}
+        row |= {"execution": way, "n": n}
+        row |= judge(trained) if ground.env is None else roll(ground, trained, execution, n)
+        row["held_out_score"] = "" if held_out is None else f"{held_out:.4f}"
+        row |= {"kept_update": part.get("kept_update", ""), "train_core_seconds": f"{seconds:.0f}"}
+        rows.append(tuple(row.get(column, "") for column in COLUMNS))
+    return rows
+
+
+def main(
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    /,
+    *,
+    methods: tuple[str, ...] = ("koap", "koap_untrained", "linear_steps", "dp"),
+    labels: tuple[int, ...] | None = None,
+    seeds: int = 3,
+    executions: tuple[str, ...] = ("default",),
+    n: int | None = None,
+    folder: Path = Path("runs/proving_grounds"),
+    results: Path = RESULTS,
+) -> None:
+    """Runs the cells that the table lacks.
+
+    Args:
+        names: grounds; all of them if none is named.
+        methods: what is compared; the first one plans, and the others share its planner.
+        labels: numbers of demonstrations whose actions may be seen, one after the other. Default: the ground's own.
+        seeds: number of training seeds, from 0.
+        executions: ways to execute plans: default, open_loop_8, temperature_1.
+        n: rollouts per cell, with the seeds from 100,000 on. Default: the ground's own.
+        folder: where to train.
+        results: the table.
+    """
+    known = grounds()
+    try:
+        asked = {name: lookup(known, name, "proving ground") for name in names or known}
+        for method in methods:
+            get_method(method)
+        lookup([name for name in METHODS if get_method(name).plans], methods[0], "first method, which plans")
+        ways = {name: lookup(EXECUTIONS, name, "execution") for name in executions}
+    except ValueError as error:
+        sys.exit(str(error))
+    torch.set_num_threads(1)
+    done, write = open_table(results, COLUMNS, KEYS)
+    for name, ground in asked.items():
+        if lacks := ground.missing():
+            print(f"{name} is skipped: {lacks}")
+            continue
+        for seed in range(seeds):
+            for count in labels or ground.labels:
+                trials = (n or ground.n) - count * (ground.env is None)
+                for method in methods:
+                    cell = (name, method, count, seed)
+                    own = ways if get_method(method).plans else {"default": EXECUTIONS["default"]}  # sampled actions
+                    own = {way: each for way, each in own.items() if tuple(map(str, (*cell, way, trials))) not in done}
+                    if not own:
+                        continue
+                    if not (folder / name / "ted").is_dir():
+                        ground.write(folder / name)
+                    first = None if method == methods[0] else folder / f"{name}-{methods[0]}-{count}-{seed}"
+                    config = TrainConfig(
+                        dataset=str(folder / name),
+                        out=folder / "-".join(map(str, cell)),
+                        method=method,
+                        labels=LabelConfig(count=count),
+                        planner=PlannerConfig(source=first if get_method(method).plans else None),
+                        run=RunConfig(seed=seed, resume=True),
+                    )
+                    for row in run_cell(name, ground, config, own, trials):
+                        write(row)
+                        print(*row, flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
