@@ -55,6 +55,7 @@ PLAN = "plan"
 
 SUCCESS = "success"
 COLLISION = "collision"
+FAILED = "failed"
 MODE = "mode"
 CONTEXT = "context"
 

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from toy_gym import NAMES, Reach
 
-from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
+from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, load_backbone
 from torchrl_koap.vision.backbones import MEAN, STD
@@ -30,8 +30,8 @@ def run(env, steps, seeds=None):
     env.reset()
     frames = []
     for _ in range(steps):
-        action = torch.full((len(env.envs), 2), PUSH)
-        frames.append(env.step(TensorDict({"action": action}, [len(env.envs)]))["next"])
+        action = torch.full((*env.batch_size, 2), PUSH)
+        frames.append(env.step(TensorDict({"action": action}, env.batch_size))["next"])
     return torch.stack(frames, 1)
 
 
@@ -66,12 +66,6 @@ def test_what_counts_as_success(name, key, wanted):
     over = rollout["done"][0].flatten().tolist()
     ends = name in ("ToyReachWon-v0", "ToyReachLost-v0")
     assert over == ([False, False, True, True, True, True] if ends else [False] * 5 + [True])
-
-
-@pytest.mark.parametrize(("said", "wanted"), [("False", False), ("true", True), (np.array([True]), True), (0, False)])
-def test_success_may_be_said_in_words(said, wanted):
-    env = GymnasiumBatch("ToyReach-v0", TASK, 1)
-    assert env._succeeded({"is_success": said}, 0.0, False, False) is wanted
 
 
 def test_who_is_done_waits():
@@ -128,4 +122,35 @@ def test_refusals():
     with pytest.raises(ValueError, match="the action of environment 'CartPole-v1' is Discrete.*, task 'arm' has 2 col"):
         GymnasiumBatch("CartPole-v1", TASK)
     with pytest.raises(ValueError, match="info of environment 'ToyReach-v0' has no 'arrived', it has is_success"):
-        run(GymnasiumBatch("ToyReach-v0", TASK, success_key="arrived"), 6)
+        GymnasiumBatch("ToyReach-v0", TASK, success_key="arrived")  # before any episode
+    with pytest.raises(ValueError, match="cannot be made: .*unexpected keyword argument 'wide'"):
+        GymnasiumBatch("ToyReach-v0", TASK, env_kwargs={"wide": 3})
+
+
+def test_arguments_of_the_environment():
+    env = GymnasiumBatch("ToyReach-v0", TASK, env_kwargs={"max_episode_steps": 2})
+    assert env.own_limit == env.max_steps == 2 and env.success_key == "is_success"
+    assert GymnasiumBatch("ToyReach-v0", TASK).own_limit is None
+    assert GymnasiumBatch("ToyReachOwnKey-v0", TASK).success_key is None
+
+
+def test_processes_of_their_own_give_the_same_numbers():
+    asked = ("ToyReach-v0", TASK, 2)
+    one, several = (run(GymnasiumBatch(*asked, processes=apart), 3, [4, 9]) for apart in (False, True))
+    assert torch.equal(one["observation"], several["observation"]) and torch.equal(one["success"], several["success"])
+
+
+def test_errors_and_clipped_actions_are_recorded_and_the_others_go_on():
+    record = EpisodeRecord()
+    env = GymnasiumBatch("ToyBreaks-v0", TASK, 3, record=record)
+    env.seed_episodes([10, 11, 12])  # one with an odd seed cannot be reset
+    env.reset()
+    for push in (5.0, 0.1):
+        out = env.step(TensorDict({"action": torch.full((3, 2), push)}, [3]))["next"]
+    assert out["done"].flatten().tolist() == [False, True, False]
+    assert record.errors == [{"seed": 11, "step": 1, "error": "RuntimeError: no place"}]
+    assert (record.actions, record.clipped) == (5, 3)
+    assert record.faults() == [
+        "3 of 5 actions left the environment's box and were clipped to it",
+        "1 episodes failed because the environment raised an error: seed 11, step 1: RuntimeError: no place",
+    ]

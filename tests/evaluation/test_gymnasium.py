@@ -22,7 +22,10 @@ from torchrl_koap import (
     save_demonstrations,
     train,
 )
+from torchrl_koap.evaluation import InspectConfig, inspect
 from torchrl_koap.evaluation.statistics import rate
+from torchrl_koap.reports.inspection_plots import draw_experiments
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 
@@ -44,11 +47,53 @@ def test_the_command(arm_run):
     assert koap("eval", arm_run, "--episodes", 3, "--threads", 1, *asked) == 0
     result = json.loads((arm_run / "eval.json").read_text())
     assert result["episodes"] == 3 and result["rates"]["success"] == rate([True] * 3)
-    assert result["mode_entropy"] is None and result["env"] == "toy_gym:ToyReachOwnKey-v0"
+    assert not {"mode_entropy", "collisions"} & set(result) and result["env"] == "toy_gym:ToyReachOwnKey-v0"
     assert [row["seed"] for row in result["episode"]] == [100, 101, 102]
     assert {row["steps"] for row in result["episode"]} == {6}
     page = (arm_run / "index.html").read_text()
     assert "3 of 3 rollouts" in page and "--env toy_gym:ToyReachOwnKey-v0" in page
+
+
+def test_step_limit_success_and_arguments_are_said(arm_run, capsys):
+    asked = ("--env", "toy_gym:ToyReach-v0", "--env-kwargs", "max_episode_steps=4", "length=9", "--no-animate")
+    assert koap("eval", arm_run, "--episodes", 2, "--threads", 1, *asked) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "at most 4 steps (the environment's own); success: info['is_success']" in printed
+    result = json.loads((arm_run / "eval.json").read_text())
+    assert {row["steps"] for row in result["episode"]} == {4}
+    assert "--env-kwargs max_episode_steps=4 length=9" in (arm_run / "index.html").read_text()
+    assert koap("eval", arm_run, "--episodes", 1, "--env", "toy_gym:ToyReachLost-v0", "--no-report") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    found = json.loads((arm_run / "eval.json").read_text())
+    assert found["step_limit"] == "46 steps (that of task 'data': the environment has none)"
+    assert found["success"] == "success: an end with a positive reward, as info says nothing of success"
+
+
+def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
+    found = evaluate(arm_run, EvalConfig(episodes=3, seed=10, env="toy_gym:ToyBreaks-v0", threads=1))
+    assert [row["outcome"] for row in found["episode"]] == ["success", "error", "success"]
+    assert found["errors"] == [{"seed": 11, "step": 1, "error": "RuntimeError: no place"}]
+    assert any("failed because the environment raised an error: seed 11, step 1" in fault for fault in found["faults"])
+
+
+def test_an_unknown_success_key_is_refused_before_the_first_episode(arm_run, capsys):
+    before = (arm_run / "eval.json").read_bytes()
+    assert koap("eval", arm_run, "--env", "toy_gym:ToyReach-v0", "--success-key", "arrived") == 1
+    assert "info of environment 'toy_gym:ToyReach-v0' has no 'arrived', it has is_success" in capsys.readouterr().err
+    assert (arm_run / "eval.json").read_bytes() == before
+
+
+def test_processes_of_their_own_change_no_result(arm_run):
+    asked = {"episodes": 3, "env": "toy_gym:ToyReach-v0", "threads": 1}
+    one, several = (evaluate(arm_run, EvalConfig(**asked, num_envs=number)) for number in (None, 2))
+    assert one["episode"] == several["episode"] and one["rates"] == several["rates"]
+
+
+def test_the_closed_loop_is_inspected_there(arm_run):
+    found = inspect(arm_run, InspectConfig(episodes=2, env="toy_gym:ToyReach-v0", threads=1))
+    assert found["both"] == rate([True] * 2) and {"plan_to_execution", "distance_to_demonstrations"} <= set(found)
+    assert not {"controller_alone", "planner_alone"} & set(found)
+    draw_experiments(found, RunFacts.read(arm_run))
 
 
 def test_results_depend_on_the_seed_alone(arm_run):
@@ -78,6 +123,12 @@ def test_the_actions_are_those_of_an_agent(arm_run):
 def test_success_keys_are_for_environments(trained_run):
     with pytest.raises(ValueError, match="success_key was given, but no env"):
         evaluate(trained_run, EvalConfig(success_key="is_success"))
+    with pytest.raises(ValueError, match="num_envs was given, but no env"):
+        evaluate(trained_run, EvalConfig(num_envs=2))
+    with pytest.raises(ValueError, match="env_kwargs must be key=value, such as obs_type=state, got 'state'"):
+        evaluate(trained_run, EvalConfig(env="x", env_kwargs=("state",)))
+    with pytest.raises(ValueError, match="num_envs and batch_size both say"):
+        evaluate(trained_run, EvalConfig(env="x", num_envs=2, batch_size=2))
 
 
 def test_refusals(arm_run, capsys):

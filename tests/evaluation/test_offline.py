@@ -85,7 +85,9 @@ def test_latent_space_and_suggestions(run):
     assert "mrad" in found and " mm" not in found
     assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in found
     assert {row["episode"] for row in suggest(run, SuggestConfig(count=7)).suggestions} == set(range(3, 10))
-    with pytest.raises(ValueError, match="task 'arm' has no environment to make experiments in: --latent-only"):
+    with pytest.raises(
+        ValueError, match="task 'arm' has no environment to make experiments in: name one with --env, or --latent-only"
+    ):
         inspect(run)
 
 

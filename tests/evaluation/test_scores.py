@@ -129,7 +129,22 @@ def test_the_figure_of_stacking_is_the_sum_of_its_rates():
 
 def test_without_modes_there_is_no_entropy():
     result = score([episode_of(4, success=True)], [0], num_modes=1, mode_index=number)
-    assert result["rates"]["success"]["rate"] == 1.0 and result["mode_entropy"] is None
+    assert result["rates"]["success"]["rate"] == 1.0 and not [name for name in result if "mode" in name]
+    assert "mode" not in result["episode"][0]
+
+
+def test_an_episode_in_which_the_environment_failed_is_no_success():
+    failed = episode_of(2, success=True)
+    failed["next", "failed"] = failed["next", "success"].clone()
+    assert outcome_of(failed) == "error"
+    assert score([failed], [0], num_modes=1, mode_index=number)["rates"]["success"]["rate"] == 0
+
+
+def test_collisions_are_counted_where_there_are_any():
+    without = episode_of(3)
+    del without["next", "collision"]
+    assert "collisions" not in score([without], [0], num_modes=1, mode_index=number)
+    assert score([episode_of(3)], [0], num_modes=1, mode_index=number)["collisions"] == 0
 
 
 @pytest.mark.parametrize("unsolved", ["Zero", ""])

@@ -42,6 +42,24 @@ class Reach(gymnasium.Env):
         return np.concatenate([self.joints, self.goal])
 
 
+class Breaks(Reach):
+    """Raises an error in a step, or at every reset with an odd seed."""
+
+    def __init__(self, at=None):
+        super().__init__(key="is_success")
+        self.at = at
+
+    def reset(self, *, seed=None, options=None):
+        if self.at is None and seed % 2:
+            raise RuntimeError("no\nplace")
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        if self.time + 1 == self.at:
+            raise ZeroDivisionError("division by zero")
+        return super().step(action)
+
+
 def demonstrations(number=5, steps=30, seed=0):
     """States and actions of a robot that goes to its goal."""
     env, states, actions = Reach(length=steps), [], []
@@ -62,6 +80,7 @@ for _id, _options in {
     "ToyReachLost-v0": {"terminates": "lost"},
 }.items():
     gymnasium.register(_id, entry_point=Reach, kwargs=_options)
+gymnasium.register("ToyBreaks-v0", Breaks)
 
 
 def reach(robots: int | None = None, **options) -> EnvBase:

@@ -3,29 +3,58 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.vector.utils import iterate
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_koap.keys import ACTION, MODE, OBSERVATION, SUCCESS
+from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode, success_entry
+from torchrl_koap.files import some
+from torchrl_koap.keys import ACTION, FAILED, MODE, OBSERVATION, SUCCESS
 from torchrl_koap.tasks import Task
 from torchrl_koap.vision.observer import STATE, Observer
 
-SUCCESS_KEYS = ("is_success", "success")
+
+@dataclass
+class EpisodeRecord:
+    """What happened in the episodes of all batches that were given it.
+
+    Args:
+        actions (int): steps that were played.
+        clipped (int): those whose action lay outside the environment's box and was clipped to it.
+        errors (list of dict): ``seed``, ``step`` and ``error`` of every episode in which the environment raised one.
+    """
+
+    actions: int = 0
+    clipped: int = 0
+    errors: list[dict[str, Any]] = field(default_factory=list)
+
+    def faults(self) -> list[str]:
+        """Returns a sentence about clipped actions, and one about errors, where there are any."""
+        found = []
+        if self.clipped:
+            found.append(f"{self.clipped} of {self.actions} actions left the environment's box and were clipped to it")
+        if self.errors:
+            said = some([f"seed {each['seed']}, step {each['step']}: {each['error']}" for each in self.errors])
+            found.append(f"{len(self.errors)} episodes failed because the environment raised an error: {said}")
+        return found
 
 
 class GymnasiumBatch(EnvBase):
     """Environments of one Gymnasium id side by side; one whose episode is over waits for the others.
 
-    ``success`` stays True from the step on in which it is reported: by ``info[success_key]``; without a key by
-    ``info["is_success"]`` or ``info["success"]`` where the environment has one of them, else by an episode that
-    terminates with a positive reward. Actions are handed over unchanged.
+    ``success`` stays True from the step on in which it is reported (:class:`GymnasiumEpisode`). Actions are clipped to
+    the environment's box. An environment that raises an error ends its episode as failed (``failed``).
 
     Where the policy was trained with cameras, the environment's observation is a dictionary: its uint8 pictures are the
     frames of the cameras of their names (of the only one whatever their name), its numbers side by side the state.
@@ -34,14 +63,17 @@ class GymnasiumBatch(EnvBase):
         env_id (str): id of the environment, such as ``"my_package:Reach-v0"``, which imports ``my_package`` first.
         task (Task): the task that the policy was trained on: its numbers of observation and action columns.
         num_envs (int): number of episodes.
+        env_kwargs (mapping, optional): further arguments of ``gymnasium.make``, such as ``max_episode_steps``.
+        processes (bool): each environment has a process of its own.
         observe (callable, optional): of a policy with cameras, see :class:`~torchrl_koap.vision.Observer`.
-        success_key (str, optional): the entry of ``info`` that says whether the task is done.
+        success_key (str, optional): the entry of ``info`` of every step that says whether the task is done.
         max_steps (int, optional): steps after which an episode is truncated. Default: the environment's own limit, or
             the task's where it has none.
+        record (EpisodeRecord, optional): is told of clipped actions and errors.
 
     Raises:
-        ValueError: if there is no such environment, or its observations or actions are no flat boxes of the task's
-            widths; at the end of an episode, if ``info`` never had the success key.
+        ValueError: if there is no such environment, its observations or actions are no flat boxes of the task's
+            widths, or ``info`` of a first step has no such success key.
 
     Examples:
         >>> from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
@@ -58,34 +90,47 @@ class GymnasiumBatch(EnvBase):
         task: Task,
         num_envs: int = 1,
         *,
+        env_kwargs: Mapping[str, Any] | None = None,
+        processes: bool = False,
         observe: Observer | None = None,
         success_key: str | None = None,
         max_steps: int | None = None,
+        record: EpisodeRecord | None = None,
     ):
         super().__init__(batch_size=[num_envs])
-        self.env_id, self.task, self.success_key, self._observe = env_id, task, success_key, observe
+        self.env_id, self.task, self._observe = env_id, task, observe
+        self.record = EpisodeRecord() if record is None else record
+        make = partial(gymnasium.make, env_id, **(env_kwargs or {}))
         try:
-            self.envs = [gymnasium.make(env_id) for _ in range(num_envs)]
-        except (gymnasium.error.Error, ImportError) as error:
+            first = make()
+        except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: an argument that it does not take
             raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
-        first = self.envs[0]
-        if observe is None:
-            _check_box(env_id, "observation", first.observation_space, task.name, task.observation_dim)
-        else:
-            _check_entries(env_id, first.observation_space, observe)
-        _check_box(env_id, "action", first.action_space, task.name, task.action_dim)
-        limit = None if first.spec is None else first.spec.max_episode_steps
-        self.max_steps = max_steps or limit or task.max_steps
+        try:
+            if observe is None:
+                _check_box(env_id, "observation", first.observation_space, task.name, task.observation_dim)
+            else:
+                _check_entries(env_id, first.observation_space, observe)
+            _check_box(env_id, "action", first.action_space, task.name, task.action_dim)
+            self.own_limit = None if first.spec is None else first.spec.max_episode_steps
+            self.success_key = _probe(env_id, first, success_key)
+        finally:
+            first.close()
+        self.max_steps = max_steps or self.own_limit or task.max_steps
+        episode = partial(_make_episode, make, max_steps=self.max_steps, success_key=success_key)
+        vector = partial(AsyncVectorEnv, context=_FORK) if processes else SyncVectorEnv
+        self._env = vector([partial(episode, index) for index in range(num_envs)], copy=False)
         self._seeds: list[int | None] = [None] * num_envs
-        self._observation = np.zeros((num_envs, task.observation_dim), dtype=np.float32)
-        self._success, self._over = np.zeros(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool)
+        self._begun_with = list(self._seeds)
         self._steps = np.zeros(num_envs, dtype=np.int64)
-        self.success_keys: set[str] = set()  # those that have occurred
         shape, flag = self.batch_size, (num_envs, 1)
+        self._state: dict[str, Any] = {OBSERVATION: torch.zeros(*shape, task.observation_dim)}
+        self._state |= {MODE: torch.zeros(flag, dtype=torch.int64)}
+        self._state |= {name: torch.zeros(flag, dtype=torch.bool) for name in (*_ENDS, SUCCESS, FAILED)}
         self.observation_spec = Composite(
             {
                 OBSERVATION: Unbounded((*shape, task.observation_dim)),
                 SUCCESS: Binary(n=1, shape=flag, dtype=torch.bool),
+                FAILED: Binary(n=1, shape=flag, dtype=torch.bool),
                 MODE: Unbounded(flag, dtype=torch.int64),
             },
             shape=shape,
@@ -93,82 +138,82 @@ class GymnasiumBatch(EnvBase):
         self.action_spec = Unbounded((*shape, task.action_dim))
         self.reward_spec = Unbounded(flag)
         done = Categorical(2, flag, dtype=torch.bool)
-        self.done_spec = Composite({name: done.clone() for name in ("done", "terminated", "truncated")}, shape=shape)
+        self.done_spec = Composite({name: done.clone() for name in _ENDS}, shape=shape)
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
         """Seeds the next reset of every environment, so that an episode does not depend on the batch it runs in."""
         self._seeds = [int(seed) for seed in seeds]
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seeds = [None if seed is None else seed + index for index in range(len(self.envs))]
+        self._seeds = [None if seed is None else seed + index for index in range(self.batch_size[0])]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         chosen = None if tensordict is None else tensordict.get("_reset", None)
-        for index, env in enumerate(self.envs):
-            if chosen is None or chosen[index].any():
-                observation, _ = env.reset(seed=self._seeds[index])
-                self._seeds[index] = None  # further episodes go on from there
-                self._observation[index] = self._seen(observation)
-                self._success[index], self._over[index], self._steps[index] = False, False, 0
-        nothing = np.zeros(len(self.envs))
-        return self._leaves({"terminated": nothing > 0, "truncated": nothing > 0})
+        begin = np.ones(self.batch_size[0], bool) if chosen is None else chosen.flatten(1).any(1).cpu().numpy()
+        seen, _ = self._env.reset(seed=self._seeds, options={"begin": begin})
+        for index in np.flatnonzero(begin):
+            self._begun_with[index], self._seeds[index], self._steps[index] = self._seeds[index], None, 0
+        for name in (*_ENDS, SUCCESS, FAILED):
+            self._state[name] = self._state[name] & ~torch.from_numpy(begin).unsqueeze(-1)
+        return self._leaves(seen)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = tensordict.get(ACTION).cpu().numpy()
-        reward = np.zeros(len(self.envs), dtype=np.float32)
-        flags = {name: self._over.copy() for name in ("terminated", "truncated")}
-        flags["terminated"][:] = False
-        for index in np.flatnonzero(~self._over):
-            env = self.envs[index]
-            action = actions[index].astype(env.action_space.dtype)
-            observation, reward[index], terminated, truncated, info = env.step(action)
-            self._observation[index] = self._seen(observation)
-            self._steps[index] += 1
-            over = bool(terminated or truncated or self._steps[index] >= self.max_steps)
-            self._success[index] |= self._succeeded(info, float(reward[index]), bool(terminated), over)
-            self._over[index] = over
-            flags["terminated"][index], flags["truncated"][index] = terminated, over and not terminated
-        return self._leaves(flags, reward)
+        seen, reward, _, _, told = self._env.step(tensordict.get(ACTION).cpu().numpy())
+        self._steps += told["played"]
+        self.record.actions += int(told["played"].sum())
+        self.record.clipped += int(told["clipped"].sum())
+        failed = told["error"].astype(bool)
+        self.record.errors += [
+            {"seed": self._begun_with[index], "step": int(self._steps[index]), "error": told["error"][index]}
+            for index in np.flatnonzero(failed)
+        ]
+        ends = {"done": told["over"], FAILED: failed} | {name: told[name] for name in (*_ENDS[1:], SUCCESS)}
+        self._state |= {name: torch.from_numpy(flags.astype(bool)).unsqueeze(-1) for name, flags in ends.items()}
+        return self._leaves(seen).set("reward", torch.from_numpy(reward).float().unsqueeze(-1))
 
-    def _seen(self, observation: Any) -> Any:
-        """What an environment gives as the task's observation ``[obs]``."""
-        if self._observe is None:
-            return observation
+    def _leaves(self, seen: Any) -> TensorDictBase:
+        """What was seen and the state of every episode, as leaves."""
+        if self._observe is not None:
+            seen = np.stack([self._read(each) for each in iterate(self._env.observation_space, seen)])
+        self._state[OBSERVATION] = torch.from_numpy(np.array(seen, dtype=np.float32))
+        return TensorDict({name: value.clone() for name, value in self._state.items()}, self.batch_size)
+
+    def _read(self, observation: Any) -> np.ndarray:
+        """The task's observation ``[obs]`` of an environment's dictionary."""
         frames, numbers = _sorted(dict(_entries(observation)))
         named = _named(frames, self._observe)
         state = np.concatenate([np.ravel(value) for value in numbers.values()]) if numbers else None
         return self._observe(named if state is None else {STATE: state.astype(np.float32), **named})
 
-    def _succeeded(self, info: dict[str, Any], reward: float, terminated: bool, over: bool) -> bool:
-        """Whether a step reports success."""
-        keys = SUCCESS_KEYS if self.success_key is None else (self.success_key,)
-        found = next((key for key in keys if key in info), None)
-        if found is not None:
-            self.success_keys.add(found)
-            if isinstance(info[found], str):
-                return info[found].strip().lower() in ("true", "1")
-            return bool(np.any(info[found]))
-        if self.success_key is None:
-            return terminated and reward > 0
-        if over and not self.success_keys:
-            has = ", ".join(sorted(map(str, info))) or "nothing"
-            raise ValueError(f"info of environment {self.env_id!r} has no {self.success_key!r}, it has {has}")
-        return False
-
-    def _leaves(self, flags: dict[str, np.ndarray], reward: np.ndarray | None = None) -> TensorDictBase:
-        flags = flags | {"done": self._over, SUCCESS: self._success}
-        leaves = {name: torch.from_numpy(flag.copy()).unsqueeze(-1) for name, flag in flags.items()}
-        leaves[OBSERVATION] = torch.from_numpy(self._observation.copy())
-        leaves[MODE] = torch.zeros(len(self.envs), 1, dtype=torch.int64)
-        if reward is not None:
-            leaves["reward"] = torch.from_numpy(reward).unsqueeze(-1)
-        return TensorDict(leaves, self.batch_size)
-
     def close(self, **kwargs: Any) -> None:
         """Closes the environments."""
-        for env in self.envs:
-            env.close()
+        self._env.close()
         super().close(**kwargs)
+
+
+_ENDS = ("done", "terminated", "truncated")
+# a process that is spawned imports everything again, for seconds in every batch, and knows no environment that a plugin
+# has registered
+_FORK = "fork" if sys.platform == "linux" else None
+
+
+def _make_episode(make: Any, index: int, **options: Any) -> GymnasiumEpisode:
+    return GymnasiumEpisode(make(), index, **options)
+
+
+def _probe(env_id: str, env: gymnasium.Env, success_key: str | None) -> str | None:
+    """The entry of ``info`` of a first step that says whether the task is done, None where none does."""
+    space: Any = env.action_space
+    try:
+        env.reset(seed=0)
+        info = env.step(np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype))[-1]
+    except Exception:  # the episodes tell
+        return success_key
+    found = success_entry(info, success_key)
+    if found is None and success_key is not None:
+        has = ", ".join(sorted(map(str, info))) or "nothing"
+        raise ValueError(f"info of environment {env_id!r} has no {success_key!r}, it has {has}")
+    return found
 
 
 def _entries(observation: Any, name: str = "pixels") -> Iterator[tuple[str, Any]]:

@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from torchrl_koap.evaluation.config import EvalConfig, check_options
+from torchrl_koap.evaluation.config import EvalConfig, RolloutConfig, check_options, environment_arguments
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.loop_on_labels import limited_commands
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
@@ -29,6 +29,9 @@ from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
+
+if TYPE_CHECKING:
+    from torchrl_koap.envs.gymnasium_batch import EpisodeRecord  # takes seconds
 
 
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
@@ -72,7 +75,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    where = find_environment(task, config, Observer.of(task, trained.cameras))
+    chosen = config.rollouts_per_context, config.contexts_file
+    where = find_environment(task, config, Observer.of(task, trained.cameras), *chosen)
     errors, actions = evaluate_actions(trained, config.dataset)
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -81,7 +85,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
             where.make_env,
             seeds,
             max_steps=where.max_steps,
-            batch_size=config.batch_size,
+            batch_size=config.num_envs or config.batch_size,
             contexts=where.contexts,
             progress=count_up_to(bar),
         )
@@ -100,8 +104,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
     result |= measure_latency(timed, task.observation_dim)
     result |= errors | limited_commands(policy) | {"execution": to_json(policy.execution), "episode": rows}
-    if config.env is not None:
-        result |= {"env": config.env, "success_key": config.success_key}
+    result |= where.facts
+    if where.record is not None:
+        result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
+        result["faults"] = [*result.get("faults", ()), *where.record.faults()]
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
@@ -173,24 +179,53 @@ class RolloutEnvironment:
     num_modes: int
     numbers: list[int] | None = None  # of the context of every rollout
     contexts: np.ndarray | None = None
+    record: EpisodeRecord | None = None  # of an environment of Gymnasium: what happened in the episodes
+    facts: Mapping[str, Any] = field(default_factory=dict)  # and what it is, for ``eval.json``
 
 
-def find_environment(task: Task, config: EvalConfig, observe: Observer | None = None) -> RolloutEnvironment:
+def find_environment(
+    task: Task,
+    config: RolloutConfig,
+    observe: Observer | None = None,
+    rollouts_per_context: int = 1,
+    contexts_file: Path | None = None,
+) -> RolloutEnvironment:
     """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures ``observe`` embeds.
 
     Raises:
-        ValueError: if there is no such environment, it is not of the task's widths, or contexts do not suffice.
+        ValueError: if there is no such environment, it is not of the task's widths, it does not report success by the
+            key that was asked for, or contexts do not suffice.
     """
     if config.env is None:
-        numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
+        numbers, contexts = choose_contexts(task, config.episodes, rollouts_per_context, contexts_file)
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
         make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
         return RolloutEnvironment(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
-    _refuse_contexts(config.rollouts_per_context, config.contexts_file, "an environment of Gymnasium")
-    from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
+    _refuse_contexts(rollouts_per_context, contexts_file, "an environment of Gymnasium")
+    from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 
-    make_env = partial(GymnasiumBatch, config.env, task, observe=observe, success_key=config.success_key)
+    record = EpisodeRecord()
+    make_env = partial(
+        GymnasiumBatch,
+        config.env,
+        task,
+        env_kwargs=environment_arguments(config.env_kwargs),
+        processes=config.num_envs is not None,
+        observe=observe,
+        success_key=config.success_key,
+        record=record,
+    )
     probe = make_env(1)
     probe.close()
-    return RolloutEnvironment(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)
+    limit = "the environment's own" if probe.own_limit else f"that of task {task.name!r}: the environment has none"
+    facts = {
+        "env": config.env,
+        "env_kwargs": list(config.env_kwargs),
+        "num_envs": config.num_envs,
+        "success_key": probe.success_key,
+        "step_limit": f"{probe.max_steps} steps ({limit})",
+    }
+    if probe.success_key is None:
+        facts["success"] = "success: an end with a positive reward, as info says nothing of success"
+    return RolloutEnvironment(make_env, probe.max_steps, lambda mode: mode[..., 0], 1, record=record, facts=facts)

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -17,45 +19,112 @@ MOST_EPISODES = 100_000  # kept in memory
 
 
 @dataclass
-class EvalConfig:
-    """Rollouts of a trained run in closed loop; without an environment plans and actions on recorded data.
+class RolloutConfig:
+    """How a trained run is rolled out, whatever for.
 
     Attributes:
-        episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
-        rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
+        episodes: number of rollouts.
         seed: seed of the first rollout; the others count on from it.
         execution: how plans become actions; what is not asked for is the run's, the method's, the task's.
-        out: folder to evaluate in instead of the run's own; what the run is made of is copied there.
-        batch_size: episodes at a time; results do not depend on it.
-        contexts_file: a context file of D3IL to take instead of the table.
+        out: folder to write to instead of the run's own; what the run is made of is copied there.
         env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
+        env_kwargs: arguments of gymnasium.make, such as obs_type=state max_episode_steps=300.
         success_key: entry of its info that says whether the task is done (default: "is_success" or "success" where it
             has one of them, else an episode that terminates with a positive reward).
-        dataset: for a task without an environment: where the data set of the training is now (default: where it was).
-        samples: for a task without an environment: plans that are sampled in each recorded situation.
+        num_envs: environments at a time, each in a process of its own (default: all in this process).
+        dataset: where the data set of the training is now (default: where it was).
         threads: torch and simulator threads (default: as many as torch has).
         device: "cpu" or "cuda".
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
+    """
+
+    episodes: int = 60
+    seed: int = 100
+    execution: Annotated[ExecutionConfig, tyro.conf.arg(name="")] = ExecutionConfig()
+    out: Path | None = None
+    env: str | None = None
+    env_kwargs: tuple[str, ...] = ()
+    success_key: str | None = None
+    num_envs: int | None = None
+    dataset: str | None = None
+    threads: int | None = None
+    device: str = "cpu"
+    plugins: Plugins = ()
+
+
+@dataclass
+class EvalConfig(RolloutConfig):
+    """Rollouts of a trained run in closed loop; without an environment plans and actions on recorded data.
+
+    Attributes:
+        rollouts_per_context: rollouts in each context, which tasks that have them take from the evaluation table in
+            turn; from 2 on the entropy of the modes per context is known.
+        batch_size: episodes at a time; results do not depend on it.
+        contexts_file: a context file of D3IL to take instead of the table.
+        samples: for a task without an environment: plans that are sampled in each recorded situation.
 
     Examples:
         >>> from torchrl_koap.evaluation import EvalConfig, evaluate
         >>> evaluate("runs/koap", EvalConfig(episodes=20))["rates"]["success"]  # doctest: +SKIP
     """
 
-    episodes: int = 60
     rollouts_per_context: int = 1
-    seed: int = 100
-    execution: Annotated[ExecutionConfig, tyro.conf.arg(name="")] = ExecutionConfig()
-    out: Path | None = None
     batch_size: int | None = None
     contexts_file: Path | None = None
-    env: str | None = None
-    success_key: str | None = None
-    dataset: str | None = None
     samples: int = 16
-    threads: int | None = None
-    device: str = "cpu"
-    plugins: Plugins = ()
+
+
+def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
+    """Reads arguments of an environment: numbers, lists, true, false and null as such, anything else as text.
+
+    Raises:
+        ValueError: for a word that is no ``key=value``.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.config import environment_arguments
+        >>> environment_arguments(["obs_type=state", "max_episode_steps=300", "sparse=True"])
+        {'obs_type': 'state', 'max_episode_steps': 300, 'sparse': True}
+    """
+    found = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals or not name.isidentifier():
+            raise ValueError(f"env_kwargs must be key=value, such as obs_type=state, got {word!r}")
+        try:
+            found[name] = json.loads(_IN_JSON.get(value, value))
+        except ValueError:
+            found[name] = value
+    return found
+
+
+_IN_JSON = {"True": "true", "False": "false", "None": "null"}
+
+
+def check_rollouts(config: RolloutConfig) -> None:
+    """Refuses what no run could be rolled out with, before any of it is loaded.
+
+    Args:
+        config (RolloutConfig): what was asked for.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    for name in ("episodes", "num_envs"):
+        value = getattr(config, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}")
+    if config.episodes > MOST_EPISODES:
+        raise ValueError(
+            f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {config.episodes:,}"
+        )
+    check_machine(config.threads, config.device)
+    if config.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {config.seed}")
+    environment_arguments(config.env_kwargs)
+    about_env = {"success_key": config.success_key, "env_kwargs": config.env_kwargs, "num_envs": config.num_envs}
+    given = [name for name, value in about_env.items() if value]
+    if given and config.env is None:
+        raise ValueError(f"{given[0]} was given, but no env: name an environment of Gymnasium with --env")
 
 
 def check_options(config: EvalConfig) -> None:
@@ -67,19 +136,10 @@ def check_options(config: EvalConfig) -> None:
     Raises:
         ValueError: naming the option.
     """
-    for name in ("episodes", "batch_size", "rollouts_per_context", "samples"):
+    check_rollouts(config)
+    for name in ("batch_size", "rollouts_per_context", "samples"):
         value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
-    if config.episodes > MOST_EPISODES:
-        raise ValueError(
-            f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {config.episodes:,}"
-        )
-    check_machine(config.threads, config.device)
-    if config.seed < 0:
-        raise ValueError(f"seed must be >= 0, got {config.seed}")
-    if config.success_key is not None and config.env is None:
-        raise ValueError(
-            f"success_key was given, but no env that could report {config.success_key!r}: name an environment of"
-            " Gymnasium with --env"
-        )
+    if config.num_envs is not None and config.batch_size is not None:
+        raise ValueError("num_envs and batch_size both say how many episodes run at a time: give one of them")

@@ -73,13 +73,15 @@ def _describe_experiments(result: Mapping[str, Any]) -> str:
         if left > _LEFT * count:
             paths = f"{left} of {count} recorded tool paths"
             parts.append(f"the controller leaves {paths} by more than {1e3 * NEAR:.0f} mm")
-    elif controller < GOOD:
+    elif controller is not None and controller < GOOD:
         parts.append(f"the controller follows recorded states to the goal in {controller:.0%} only")
     distance = result["distance_to_demonstrations"]
     if distance and distance["visited_95"] > 2 * distance["demonstrated_95"]:
         parts.append("executed states lie far from every demonstration")
     if parts:
         return "; ".join(parts)
+    if controller is None:
+        return "planner and controller cannot be tried alone: this environment cannot start where a recording did"
     if planner is None:
         return "the controller works alone: the planner, or plans that start from executed states, are what is left"
     return "planner and controller work alone, not together: plans that start from executed states are worse"

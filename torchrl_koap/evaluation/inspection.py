@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import controller_view, trajectory_lengths
-from torchrl_koap.evaluation.closed_loop import choose_contexts
+from torchrl_koap.evaluation.closed_loop import find_environment
+from torchrl_koap.evaluation.config import RolloutConfig, check_rollouts
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
     follow_recordings,
@@ -26,29 +27,25 @@ from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
-from torchrl_koap.modules import ExecutionConfig, KoopmanInverseDynamics
+from torchrl_koap.modules import KoopmanInverseDynamics, PlanningPolicy
 from torchrl_koap.runs.device import set_up_torch
-from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
+from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import label_budget
 from torchrl_koap.training.trained import Trained
+from torchrl_koap.vision import Observer
 
 
 @dataclass
-class InspectConfig:
+class InspectConfig(RolloutConfig):
     """Which part of a trained run fails, and what its latent actions hold.
 
+    In an environment of Gymnasium, which cannot start where a recording did, the closed loop is looked at alone.
+
     Attributes:
-        episodes: episodes of each of the three experiments.
-        dataset: demonstrations to compare with (default: those the run was trained on).
-        out: folder to write to instead of the run's own; what the run is made of is copied there.
-        seed: seed of the planner's noise.
-        execution: how plans become actions (default: as `koap eval` has it).
         latent_only: look into the latent space alone: seconds, without the experiments in the simulator.
-        threads: torch and simulator threads (default: as many as torch has).
-        device: "cpu" or "cuda".
-        plugins: modules that register tasks or methods, besides those that the run was trained with.
 
     Examples:
         >>> from torchrl_koap.evaluation import InspectConfig
@@ -57,14 +54,8 @@ class InspectConfig:
     """
 
     episodes: int = 30
-    dataset: str | None = None
-    out: Path | None = None
     seed: int = 500
-    execution: Annotated[ExecutionConfig, tyro.conf.arg(name="")] = ExecutionConfig()
     latent_only: bool = False
-    threads: int | None = None
-    device: str = "cpu"
-    plugins: Plugins = ()
 
 
 def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, Any]:
@@ -91,18 +82,15 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
     """
     config = InspectConfig() if config is None else config
-    if config.episodes < 1:
-        raise ValueError(f"episodes must be >= 1, got {config.episodes}")
-    if config.seed < 0:
-        raise ValueError(f"seed must be >= 0, got {config.seed}")
+    check_rollouts(config)
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
     trained = Trained.load(run)
     task = trained.task
-    if task.env is None and not config.latent_only:
+    if task.env is None and config.env is None and not config.latent_only:
         raise ValueError(
-            f"task {task.name!r} has no environment to make experiments in: --latent-only looks into the latent space,"
-            " `koap eval` judges plans and actions on recorded data"
+            f"task {task.name!r} has no environment to make experiments in: name one with --env, or --latent-only looks"
+            " into the latent space alone; `koap eval` judges plans and actions on recorded data"
         )
     folder = writable_folder(run) if config.out is None else None  # refused before anything is read
     data = trained.data(config.dataset)
@@ -127,32 +115,46 @@ def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) 
     policy = trained_policy(trained, config.execution).to(config.device)
     interval = policy.execution.replan_interval
     seeds = list(range(config.seed, config.seed + config.episodes))
-    from torchrl_koap.envs.registry import make_env_of  # takes seconds
-
-    make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
-    _, contexts = choose_contexts(task, config.episodes)
+    where = find_environment(task, config, Observer.of(task, trained.cameras))
+    found: dict[str, Any] = {} if config.env is None else {"env": config.env}
     with progress_bar(3, "experiments", unit="experiment") as bar:
-        closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)
+        at_once = config.num_envs
+        closed = roll_out(
+            policy, where.make_env, seeds, max_steps=where.max_steps, contexts=where.contexts, batch_size=at_once
+        )
         bar.update()
-        followed = follow_recordings(policy, task, data, make_env, episodes=config.episodes)
+        found |= {
+            "both": rate([outcome_of(episode) == "success" for episode in closed]),
+            "plan_to_execution": tracking_errors(task, closed, interval),
+            "distance_to_demonstrations": coverage(task, closed, data),
+        }
+        if config.env is None:
+            found |= _follow(config, policy, task, data, where.make_env)
         bar.update()
-        found = {}
         if task.goal is not None:
             start = torch.stack([task.state_of(episode["observation"][0]) for episode in closed]).to(config.device)
             steps = max(int(trajectory_lengths(data).max() * 1.5), 50)
             planned = planner_rollout(planner, start, interval=interval, max_steps=steps, seed=config.seed).cpu()
             found["planner_alone"] = rate(task.goal_reached(planned).any(-1).tolist())
         bar.update()
+    if where.record is not None and where.record.faults():
+        found["faults"] = where.record.faults()
+    return found
+
+
+def _follow(
+    config: InspectConfig, policy: PlanningPolicy, task: Task, data: TensorDictBase, make_env: Callable[[int], Any]
+) -> dict[str, Any]:
+    """The controller alone, which follows recordings from where they started."""
+    interval, found = policy.execution.replan_interval, dict[str, Any]()
+    followed = follow_recordings(policy, task, data, make_env, episodes=config.episodes)
     tracked = tracking_errors(task, followed, interval)
     if task.objects and task.position in tracked:
         left = left_recordings(task, followed, interval, beyond=NEAR)
         found["recordings_left"] = {"count": left, "episodes": len(followed)}
     return found | {
         "controller_alone": rate([outcome_of(episode) == "success" for episode in followed]),
-        "both": rate([outcome_of(episode) == "success" for episode in closed]),
-        "plan_to_execution": tracking_errors(task, closed, interval),
         "recording_to_execution": tracked,
-        "distance_to_demonstrations": coverage(task, closed, data),
     }
 
 

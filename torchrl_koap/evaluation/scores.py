@@ -16,17 +16,16 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, rate
-from torchrl_koap.keys import COLLISION, MODE, SUCCESS
+from torchrl_koap.keys import COLLISION, FAILED, MODE, SUCCESS
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task
 
 
 def outcome_of(episode: TensorDict) -> str:
-    """``"success"``, ``"collision"`` or ``"timeout"``, from the last frame of an episode."""
+    """``"success"``, ``"collision"``, ``"error"`` or ``"timeout"``, from the last frame of an episode."""
     last = episode[-1]["next"]
-    if last[SUCCESS].item():
-        return "success"
-    return "collision" if COLLISION in last.keys() and last[COLLISION].item() else "timeout"
+    ends = {"error": FAILED, "success": SUCCESS, "collision": COLLISION}
+    return next((name for name, key in ends.items() if key in last.keys() and last[key].item()), "timeout")
 
 
 def score(
@@ -40,10 +39,12 @@ def score(
 ) -> dict[str, Any]:
     """Success (in ``rates``) with its 95 % interval, entropy of the modes of successful episodes, a row per episode.
 
+    Modes and collisions are told of where there are any.
+
     Args:
         episodes (sequence of TensorDict): from :func:`~torchrl_koap.evaluation.rollouts.roll_out`.
         seeds (sequence of int): one per episode.
-        num_modes (int): base of the logarithm of the entropy, which is None for a single mode.
+        num_modes (int): base of the logarithm of the entropy; modes are not told of if it is 1.
         mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
         contexts (sequence of int, optional): number of the context of every episode. With it ``mode_entropy`` is the
             mean over contexts, None below two rollouts per context, and ``pooled_mode_entropy`` is that of all
@@ -53,41 +54,43 @@ def score(
     """
     rows: list[dict[str, Any]] = []
     for seed, episode in zip(seeds, episodes, strict=True):
-        mode = int(mode_index(episode[-1]["next", MODE]))
-        rows.append({"seed": seed, "outcome": outcome_of(episode), "mode": mode, "steps": len(episode)})
-    won = [row for row in rows if row["outcome"] == "success"]
-    modes = [row["mode"] for row in won if row["mode"] >= 0]
+        rows.append({"seed": seed, "outcome": outcome_of(episode), "steps": len(episode)})
     success = rate([row["outcome"] == "success" for row in rows])
     result: dict[str, Any] = {"episodes": len(rows), "rates": {"success": success}}
-
-    def pooled(sample: Sequence[int]) -> float | None:
-        return mode_entropy(sample, num_modes) if num_modes > 1 else None
-
-    if contexts is None:
-        result |= _entropy("mode_entropy", modes, pooled)
-    else:
+    if contexts is not None:
         for row, context in zip(rows, contexts, strict=True):
             row["context"] = int(context)
+        result["contexts"] = len({row["context"] for row in rows})
+    if num_modes > 1:
+        for row, episode in zip(rows, episodes, strict=True):
+            row["mode"] = int(mode_index(episode[-1]["next", MODE]))
+        result |= _mode_scores(rows, num_modes, result.get("contexts"), unsolved)
+    if any(COLLISION in episode["next"].keys() for episode in episodes):
+        result["collisions"] = sum(row["outcome"] == "collision" for row in rows)
+    return result | {"mean_steps": statistics.fmean(row["steps"] for row in rows), "episode": rows}
+
+
+def _mode_scores(
+    rows: Sequence[dict[str, Any]], num_modes: int, contexts: int | None, unsolved: str
+) -> dict[str, float | None]:
+    """Entropies of the modes of successful episodes, over all of them and per context."""
+    won = [row for row in rows if row["outcome"] == "success" and row["mode"] >= 0]
+    modes = [row["mode"] for row in won]
+    found: dict[str, float | None] = {"mode_entropy": None}
+
+    def pooled(sample: Sequence[int]) -> float:
+        return mode_entropy(sample, num_modes)
+
+    def conditional(sample: Sequence[Sequence[int]]) -> float | None:
+        return conditional_entropy(sample, num_modes, unsolved=unsolved)
+
+    if contexts is not None and len(rows) >= 2 * contexts:
         groups: dict[int, list[int]] = {row["context"]: [] for row in rows}
         for row in won:
-            if row["mode"] >= 0:
-                groups[row["context"]].append(row["mode"])
-
-        def conditional(sample: Sequence[Sequence[int]]) -> float | None:
-            return conditional_entropy(sample, num_modes, unsolved=unsolved) if num_modes > 1 else None
-
-        result["contexts"] = len(groups)
-        if len(rows) >= 2 * len(groups):
-            result |= _entropy("mode_entropy", list(groups.values()), conditional)
-        else:
-            result["mode_entropy"] = None
-        result |= _entropy("pooled_mode_entropy", modes, pooled)
-    return result | {
-        "distinct_modes": len(set(modes)),
-        "collisions": sum(row["outcome"] == "collision" for row in rows),
-        "mean_steps": statistics.fmean(row["steps"] for row in rows),
-        "episode": rows,
-    }
+            groups[row["context"]].append(row["mode"])
+        found |= _entropy("mode_entropy", list(groups.values()), conditional)
+    found |= _entropy("mode_entropy" if contexts is None else "pooled_mode_entropy", modes, pooled)
+    return found | {"distinct_modes": len(set(modes))}
 
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import entr
 from scipy.stats import binomtest
 
-OUTCOMES = ("timeout", "success", "collision")  # of an episode, by number
+OUTCOMES = ("timeout", "success", "collision", "error")  # of an episode, by number
 _RESAMPLES, _TAIL = 500, (1 - 0.95) / 2  # of a bootstrap; share outside its interval at either end
 
 

@@ -104,7 +104,7 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
         ("plan_to_execution", ORANGE, "from the plan"),
         ("recording_to_execution", MUTED, "from the recording, when that is the plan"),
     ):
-        values = {name: errors[-1] for name, errors in result[key].items()}
+        values = {name: errors[-1] for name, errors in result.get(key, {}).items()}
         offset = 0.18 if key == "plan_to_execution" else -0.18
         rows = [index + offset for index in range(len(values))]
         right.barh(rows, list(values.values()), height=0.34, color=color, label=label)

@@ -47,7 +47,15 @@ def training_rows(run: RunFacts) -> list[Row]:
 
 def evaluation_rows(run: RunFacts) -> list[Row]:
     """Returns errors on recorded data, shares of rollouts with their intervals, and times."""
-    found = [*_rates(run), _entropy(run), *_plan_errors(run), *_action_errors(run), _loop(run), _speed(run)]
+    found = [
+        *_rates(run),
+        _entropy(run),
+        _environment(run),
+        *_plan_errors(run),
+        *_action_errors(run),
+        _loop(run),
+        _speed(run),
+    ]
     return [row for row in found if row is not None]
 
 
@@ -194,6 +202,16 @@ def _entropy(run: RunFacts) -> Row | None:
     elif run.successes:
         notes.append(f"a uniform choice averages {run.expected_entropy:.2f}, n = {run.successes}")
     return Row(f"{_ENTROPIES[name]}, base {modes}", f"{value:.2f}", "; ".join(notes))
+
+
+def _environment(run: RunFacts) -> Row | None:
+    """The environment of Gymnasium, its step limit, and what counted as success there."""
+    made = run.evaluation
+    if not made.get("env"):
+        return None
+    success = f"success: info[{made['success_key']!r}]" if made.get("success_key") else made.get("success")
+    limit = f"at most {made['step_limit']}" if made.get("step_limit") else None
+    return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, success))))
 
 
 def _speed(run: RunFacts) -> Row | None:

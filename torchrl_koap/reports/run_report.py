@@ -18,6 +18,7 @@ from torchrl_koap.reports.run_facts import RunFacts
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
 _EVAL_ELSEWHERE = ("episode", "trajectory", "faults", "rates", "action_errors")
+_ABOUT_ENV = ("env", "env_kwargs", "success_key", "num_envs")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
 
@@ -119,10 +120,10 @@ def _eval_command(run: RunFacts) -> str:
     episode = evaluation.get("episode")
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
-    options |= dict(run.execution) | {key: evaluation.get(key) for key in ("env", "success_key")}
+    options |= dict(run.execution) | {key: evaluation.get(key) for key in _ABOUT_ENV}
     for key, value in options.items():
-        if value is not None:
-            words += [f"--{key.replace('_', '-')}", str(value)]
+        if value not in (None, []):
+            words += [f"--{key.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
     return shlex.join(words)
 
 

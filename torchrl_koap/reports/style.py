@@ -14,9 +14,9 @@ from torchrl_koap.evaluation.statistics import OUTCOMES as _OUTCOMES
 INK, MUTED, FAINT, PALE = "#1f2328", "#6b7280", "#c9ced6", "#f4f5f7"
 RED, GREEN, BLUE, ORANGE = "#cf222e", "#1a7f37", "#1f6feb", "#d9730d"
 PALE_BLUE, WARNING, GREY = "#9cc3f5", "#9a3412", "#9aa1ab"
-TIMEOUT, SUCCESS, COLLISION = (_OUTCOMES.index(name) for name in ("timeout", "success", "collision"))
-OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
-FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X"}
+TIMEOUT, SUCCESS, COLLISION, ERROR = (_OUTCOMES.index(name) for name in ("timeout", "success", "collision", "error"))
+OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision", ERROR: "an error of the environment"}
+FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X", ERROR: "v"}
 
 
 def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.ndarray:

@@ -164,8 +164,8 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
     if result.get("kind") == KIND:
         names = ("relative_plan_error", "relative_action_error")
         return common | {"kind": KIND} | {name: result[name] for name in names}
-    entropy, success = result["mode_entropy"], result["rates"]["success"]
-    common |= {name: result[name] for name in ("episodes", "collisions", "mean_steps")}
+    entropy, success = result.get("mode_entropy"), result["rates"]["success"]
+    common |= {name: result.get(name) for name in ("episodes", "collisions", "mean_steps")}
     common |= {f"success_{name}": success[name] for name in ("rate", "low", "high")}
     common["successes"] = round(success["rate"] * result["episodes"])
     return common | {"mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy}
