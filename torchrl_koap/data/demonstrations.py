@@ -27,7 +27,7 @@ from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
 # what a user calls the kind of an action, and the kind that it is when its rate is settled
-ACTION_KINDS: dict[str, ActionKind] = dict.fromkeys(ADDS_UP, "delta") | {"absolute": "absolute", "raw": "raw"}
+ACTION_KINDS: dict[str, ActionKind] = {**dict.fromkeys(ADDS_UP, "delta"), "absolute": "absolute", "raw": "raw"}
 _COARSE = 1e-5  # share of a column's range to which float32 has to hold it
 _SLACK = 1.5  # episodes may be that much longer than the longest demonstration
 
