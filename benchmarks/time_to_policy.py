@@ -25,7 +25,7 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.training import resolve
 
 RESULTS = Path(__file__).resolve().parent / "results" / "time_to_policy.csv"
-KEYS = ("task", "method", "labels", "network", "held_out", "updates", "seed")
+KEYS = ("task", "method", "labels", "network", "held_out", "learning_rate", "updates", "seed")
 COLUMNS = (*KEYS, "precision", "kept_update", "core_seconds", "successes", "n", "entropy")
 ROLLOUTS, PER_CONTEXT = 180, 3
 
@@ -74,7 +74,8 @@ def main(
         )
         config = resolve(asked, get_task(task))
         planner = config.planner
-        key = (task, config.method, count or fraction, planner.network, planner.held_out, planner.steps, seed)
+        settings = (planner.network, planner.held_out, planner.learning_rate, planner.steps)
+        key = (task, config.method, count or fraction, *settings, seed)
         if tuple(map(str, key)) in done:
             continue
         config = replace(config, out=folder / "-".join(map(str, key)))
