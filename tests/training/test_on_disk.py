@@ -7,16 +7,17 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tiny_runs import TINY as TINY_CALL
 from tiny_runs import koap, write_demonstrations
 
-from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, train
+from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, Trained, train
 from torchrl_koap.commands.cli import HINT
-from torchrl_koap.data import LabelBudget
+from torchrl_koap.data import LabelBudget, save_demonstrations
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import load_tensors
+from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import loop, on_disk
 from torchrl_koap.training.datasets import load_demonstrations
@@ -247,3 +248,19 @@ def test_a_run_goes_on_after_it_was_moved_together_with_what_it_builds_on(tmp_pa
     )
     assert koap("train", *again) == 0
     assert (there / "run" / "controller.safetensors").read_bytes() == weights
+
+
+def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):
+    states = [np.random.default_rng(index).normal(size=(40, 3)).cumsum(0) for index in range(4)]
+    actions = [np.diff(states[0][:, :2], axis=0), None, None, None]
+    for name, hz in (("one", 30), ("two", 30), ("slow", 10)):
+        save_demonstrations(tmp_path / name, states, actions, control_hz=hz)
+    few = {"planner": PLANNER, "controller": ControllerConfig(steps=0)}
+    own = train(TrainConfig(out=tmp_path / "run", dataset=str(tmp_path / "one"), **few))
+    shared = {"planner": PlannerConfig(source=tmp_path / "run"), "controller": ControllerConfig(steps=0)}
+    other = train(TrainConfig(out=tmp_path / "other", dataset=str(tmp_path / "two"), **shared))
+    for ours, theirs in zip(own.planner.parameters(), other.planner.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+    assert Trained.load(tmp_path / "other").task.name == "two"
+    with pytest.raises(CheckpointError, match="was trained on task 'one', not on 'slow'"):
+        train(TrainConfig(out=tmp_path / "wrong", dataset=str(tmp_path / "slow"), **shared))

@@ -23,7 +23,7 @@ from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, p
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
 from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory
 from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
-from torchrl_koap.tasks import WINDOW, Task
+from torchrl_koap.tasks import WINDOW, Task, task_from_config
 from torchrl_koap.training.command_model import with_label_commands
 from torchrl_koap.training.controller import learn_controller
 from torchrl_koap.training.datasets import (
@@ -161,10 +161,20 @@ def _frames(task: Task, config: TrainConfig) -> tuple[int, int]:
         return WINDOW, 1
     source = config.planner.source
     if source is not None and not (config.run.resume and (config.out / "planner.safetensors").exists()):
-        load_weights(source / "planner.safetensors", planner, facts_of("planner", task, config))
+        load_weights(source / "planner.safetensors", planner, _facts_of_source(task, config))
     if get_method(config.method).fit is not None:
         return WINDOW, 1
     return max(WINDOW, module.num_window_frames), module.num_past
+
+
+def _facts_of_source(task: Task, config: TrainConfig) -> dict[str, Any]:
+    """What the planner that is taken over was trained for: this task, or another one of the same columns and rate."""
+    facts = facts_of("planner", task, config)
+    theirs = task_from_config(RunDirectory(config.planner.source).read_json("config.json"))
+    same = ("state_names", "state_units", "observation_origin", "control_hz", "env")
+    if all(getattr(theirs, name) == getattr(task, name) for name in same):
+        facts["task"] = theirs.name
+    return facts
 
 
 def _read_data(
@@ -216,7 +226,7 @@ def _planner(
         return planner, run.last_metrics("planner")
     if config.planner.source is not None:
         planner, losses = build_planner(task, config.planner).to(config.run.device), dict[str, float]()
-        load_weights(config.planner.source / "planner.safetensors", planner, facts)
+        load_weights(config.planner.source / "planner.safetensors", planner, _facts_of_source(task, config))
     else:
         planner, losses = learn_planner(task, config, data, held_out=held_out, run=run, logger=logger)
     save_weights(path, planner, facts)
