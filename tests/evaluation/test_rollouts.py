@@ -130,6 +130,11 @@ def test_pictures_get_padded_paths_and_the_plans_that_were_made():
     assert tensors["plan"].shape == (2, 2, 14, 2) and tensors["plan_step"].tolist() == [[0, 4], [0, -1]]
     assert tensors["plan"][0, :, 0, 0].tolist() == [0, 4] and tensors["plan"][1, 0, 0, 0] == 50
     assert tensors["plan"][1, 1].isnan().all()
+    kept = {"shown": [1, 0], "state_of": lambda observation: observation[..., 2:4]}
+    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=number, interval=4, **kept)
+    assert tensors["column"].tolist() == [1, 0] and tensors["state"].shape == (2, 7, 2)
+    assert torch.equal(tensors["state"][0].flip(-1), tensors["position"][0]) and tensors["state"][1, 4:].isnan().all()
+    assert torch.equal(tensors["state_plan"][0].flip(-1), tensors["plan"][0])
     plain = rollouts_to_tensors([episode_of(3, plans=False)], position=slice(2, 4), mode_index=number, interval=4)
     assert plain["plan"].shape[:2] == (1, 0) and plain["plan_step"].shape == (1, 0)
 

@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from run_files import drawn_lines, make_object_rollouts, make_rollouts, run_of, titles
 
 from torchrl_koap.reports import scenes
+from torchrl_koap.reports.animation import animate_rollouts
 from torchrl_koap.reports.mode_plots import mode_colors
+from torchrl_koap.reports.pictures import NothingToDraw, all_pictures
 from torchrl_koap.reports.rollout_plots import choose_episodes, draw_plans, draw_rollouts, plan_deviation
-from torchrl_koap.tasks import get_task
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.tasks import Action, Task, get_task
 
 ROLLOUTS = make_rollouts()
 
@@ -98,3 +103,27 @@ def test_bad_rollouts(change, message):
     rollouts = {key: value for key, value in (ROLLOUTS | change).items() if value is not None}
     with pytest.raises(ValueError, match=message):
         draw_plans(rollouts, run_of("avoiding"))
+
+
+def test_plans_over_time_where_nobody_knows_a_plane():
+    parts, acting, units = {"hand": ("thumb", "finger", "palm")}, {"a": Action(), "b": Action()}, ("", "rad", "")
+    task = Task(name="hand", observation_parts=parts, actions=acting, position="hand", observation_units=units)
+    run = RunFacts(Path("run"), task)
+    state = np.random.default_rng(0).normal(size=(4, 21, 2)).cumsum(1)
+    plan = np.full((4, 5, 14, 2), np.nan)
+    plan[:, 0] = state[:, 1:15]
+    hand = ROLLOUTS | {"column": np.array([2, 1]), "state": state, "state_plan": plan}
+    figure = draw_plans(hand, run)
+    assert len(figure.axes) == 6 and [axes.get_ylabel() for axes in figure.axes[::3]] == ["palm", "finger (rad)"]
+    assert [axes.get_title(loc="left") for axes in figure.axes[:3]] == [
+        "episode 2: out of time",
+        "episode 3: collision",
+        "episode 0: success",
+    ]
+    np.testing.assert_allclose(figure.axes[5].lines[0].get_ydata(), state[0, :, 1])
+    planned = figure.axes[5].collections[0].get_segments()[0]
+    np.testing.assert_allclose(planned, np.stack([np.arange(1, 15), state[0, 1:15, 1]], 1))
+    assert "columns that actions are about" in all_pictures()["plans.png"].caption_for(run)
+    for draw in (draw_rollouts, animate_rollouts):
+        with pytest.raises(NothingToDraw, match="nobody knows which columns lie in a plane"):
+            draw(hand, run)

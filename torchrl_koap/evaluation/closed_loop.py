@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord  # takes seconds
 
 
+_SHOWN = 6  # columns of plans that are drawn where nobody knows what lies in a plane
+
+
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
@@ -115,6 +118,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         interval=policy.execution.replan_interval,
         objects=[task.observation[body.position] for body in task.bodies] if config.env is None else (),
         plans_position=task.plans_position,
+        shown=(task.targets or task.moved_columns() or task.robot or range(task.state_dim))[:_SHOWN],
+        state_of=task.state_of if task.env is None else None,
     )
     if where.contexts is not None:  # in full precision: a film of the same episode starts from it
         rollouts["context"] = torch.from_numpy(where.contexts)

@@ -121,17 +121,21 @@ def rollouts_to_tensors(
     interval: int,
     objects: Sequence[slice] = (),
     plans_position: bool = True,
+    shown: Sequence[int] = (),
+    state_of: Callable[[Tensor], Tensor] | None = None,
 ) -> dict[str, Tensor]:
     """Stacks what the pictures need, padded to the longest episode.
 
     Of the columns ``position`` and ``objects`` of the observation the first two are drawn, and of plans where
-    ``plans_position`` says that they are that position.
+    ``plans_position`` says that they are that position. Columns ``shown`` of the state (``state_of`` observations) and
+    of the plans are kept too.
 
     Returns:
         dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``
         ``[E, T, act]``, ``plan`` ``[E, P, H, 2]`` and ``plan_step`` ``[E, P]`` (NaN and -1 padding; empty for open-loop
         execution, whose cache holds actions); for a task with objects ``object_position`` ``[E, T, objects, 2]`` and
-        ``context`` ``[E, objects, 3]``.
+        ``context`` ``[E, objects, 3]``; with ``state_of`` ``column`` ``[k]``, ``state`` ``[E, T, k]`` and
+        ``state_plan`` ``[E, P, H, k]``, NaN behind the end.
     """
     longest, last = max(len(episode) for episode in episodes), [episode[-1]["next"] for episode in episodes]
     columns = [slice(part.start, part.start + 2) for part in (position, *objects)]
@@ -154,6 +158,14 @@ def rollouts_to_tensors(
         "plan_step": pad(plan_steps, batch_first=True, padding_value=-1),
         "action": pad(actions, batch_first=True, padding_value=torch.nan),
     }
+    if state_of is not None:
+        chosen = list(shown)
+        frames = [torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]) for episode in episodes]
+        made = [episode.get(PLAN, torch.zeros(0, 1, 1 + max(chosen)))[::interval][..., chosen] for episode in episodes]
+        tensors["column"] = torch.tensor(chosen)
+        for name, parts in {"state": [state_of(seen)[:, chosen] for seen in frames], "state_plan": made}.items():
+            tensors[name] = pad(parts, batch_first=True, padding_value=torch.nan)
+        tensors["plan_step"] = pad([torch.arange(len(part)) * interval for part in made], True, -1)
     if objects:
         tensors["object_position"] = paths[:, :, 1:].contiguous()
         tensors["context"] = torch.stack([end[CONTEXT] for end in last])

@@ -25,7 +25,18 @@ from torchrl_koap.reports.scenes import (
     keep_inside,
     read_episodes,
 )
-from torchrl_koap.reports.style import FAILURE_MARKS, INK, OUTCOMES, SUCCESS, entry, legend_beside, set_title
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAILURE_MARKS,
+    INK,
+    MUTED,
+    OUTCOMES,
+    SUCCESS,
+    entry,
+    legend_beside,
+    set_title,
+    tidy,
+)
 from torchrl_koap.tasks.columns import thousandths
 
 
@@ -54,6 +65,8 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     time, 1 success, 2 collision) ``[E]``; optionally ``object_position`` ``[E, T, bodies, 2]`` (m) and ``context``
     ``[E, bodies, 3]`` (x, y in m, yaw in rad).
     """
+    if not run.in_a_plane:
+        raise NothingToDraw("nobody knows which columns lie in a plane")
     paths, mode, outcome = read_episodes(rollouts)
     bodies, colors = body_paths(rollouts), mode_colors(run.modes)
     good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
@@ -92,6 +105,11 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 
 
 def _plans_caption(run: RunFacts) -> str:
+    if not run.in_a_plane:
+        return (
+            "Wide line: what was executed, grey in a failure. Thin lines: every plan of that episode, from the step"
+            " after it was made. Shown are the columns that actions are about, six at most. Failures come first."
+        )
     objects = " Outlines and thin coloured lines are the objects of that episode: starts and paths."
     return (
         "Wide pale band: the executed path. Thin lines: every plan of that episode; dots: where each was made. A plan"
@@ -116,6 +134,8 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     :func:`draw_rollouts`, with ``plan`` ``[E, P, H, 2]`` (m, NaN padded) and ``plan_step`` ``[E, P]``, the control step
     at which each plan was made (-1 padding).
     """
+    if not run.in_a_plane:
+        return _draw_plans_over_time(rollouts, run)
     paths, mode, outcome = read_episodes(rollouts)
     plan = entry(rollouts, "plan", [len(paths), None, None, 2])
     if not plan.shape[1]:
@@ -153,6 +173,37 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
             what = run.modes.name_of(int(mode[index]))
         set_title(axes, f"episode {index}: {what}\n{note}")
         axes.label_outer()
+    return figure
+
+
+def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws the columns that actions are about, a panel each, of up to three episodes: executed, and every plan."""
+    assert run.task is not None
+    length, outcome = (entry(rollouts, name, [None]).astype(int) for name in ("length", "outcome"))
+    columns = entry(rollouts, "column", [None]).astype(int)
+    state = entry(rollouts, "state", [len(length), None, len(columns)])
+    plan = entry(rollouts, "state_plan", [len(length), None, None, len(columns)])
+    if not plan.shape[1]:
+        raise NothingToDraw("the rollouts hold no plans")
+    plan_step = entry(rollouts, "plan_step", plan.shape[:2])
+    episodes = choose_episodes(np.full(len(length), -1), outcome, 3)
+    figure = Figure(figsize=(3.8 * len(episodes) + 0.3, 1.9 * len(columns) + 0.5), layout="constrained")
+    panels = figure.subplots(len(columns), len(episodes), squeeze=False, sharex="col", sharey="row")
+    for index, down in zip(episodes, panels.T, strict=True):
+        made = np.flatnonzero((plan_step[index] >= 0) & (plan_step[index] < length[index]))
+        steps = plan_step[index, made, None] + 1 + np.arange(plan.shape[2])
+        for place, (axes, column) in enumerate(zip(down, columns, strict=True)):
+            lines = np.stack([steps, plan[index, made, :, place]], -1)
+            axes.add_collection(LineCollection(list(lines), colors=[INK], linewidths=0.5, alpha=0.6, zorder=3))
+            color = BLUE if outcome[index] == SUCCESS else MUTED
+            axes.plot(state[index, : length[index] + 1, place], color=color, linewidth=4, alpha=0.5, zorder=2)
+            axes.autoscale_view()
+            unit = run.task.state_units[column]
+            if index == episodes[0]:
+                axes.set_ylabel(run.task.state_names[column] + (f" ({unit})" if unit else ""))
+            tidy(axes)
+        set_title(down[0], f"episode {index}: {OUTCOMES[outcome[index]]}")
+        down[-1].set_xlabel("control step")
     return figure
 
 

@@ -65,6 +65,11 @@ class RunFacts:
         return self.task is not None and self.task.env is None
 
     @property
+    def in_a_plane(self) -> bool:
+        """Whether the position of the task is known to be x and y in metres, so that paths can be drawn from above."""
+        return self.task is None or self.task.env is not None
+
+    @property
     def control_hz(self) -> float | None:
         """Control steps per second of the task, None if it is not known."""
         return None if self.task is None else self.task.control_hz
