@@ -90,9 +90,10 @@ def roll(ground: Ground, trained: Trained, execution: ExecutionConfig, n: int) -
 def judge(trained: Trained) -> dict[str, Any]:
     """Scores a run on recordings: of plans as a share of standing still's, of actions as a share of the ridge's."""
     result = evaluate(trained.folder, EvalConfig(threads=1))
+    action = result["action_errors"]["outside_budget"]  # both as shares of the error of the mean action
     errors = {
         "plan_error": result["relative_plan_error"],
-        "action_error": result["action_errors"]["outside_budget"].get("relative_of_ridge"),
+        "action_error": action["relative"] / action["relative_of_ridge"],
     }
     return {name: "" if error is None else f"{error:.4f}" for name, error in errors.items()}
 
@@ -151,6 +152,7 @@ def main(
     except ValueError as error:
         sys.exit(str(error))
     torch.set_num_threads(1)
+    folder = folder.resolve()  # runs remember where their data set is
     done, write = open_table(results, COLUMNS, KEYS)
     for name, ground in asked.items():
         if lacks := ground.missing():
