@@ -20,10 +20,10 @@ from torchrl_koap.studies.paper import (
     paper_cell,
     paper_cells,
     paper_entries,
-    paper_levels,
 )
 from torchrl_koap.studies.study import PAPER_TASKS
 from torchrl_koap.studies.table import as_markdown
+from torchrl_koap.tasks import get_task
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}
 
@@ -52,7 +52,7 @@ def paper_cells_beside(name: str) -> list[Entry]:
 
 def paper_levels_table() -> str:
     """The shares of labels that are the paper's levels, by task."""
-    body = [[f"`{task}`", *map(share, paper_levels(task))] for task in PAPER_TASKS]
+    body = [[f"`{task}`", *map(share, get_task(task).label_levels)] for task in PAPER_TASKS]
     return table(["task", *(f"level {level}" for level in range(1, 6))], body)
 
 

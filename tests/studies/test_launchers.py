@@ -160,7 +160,7 @@ def test_jobs_that_cannot_be_ordered_are_refused_before_anything_runs(tmp_path):
         (twice, "two jobs have the folder"),
     ):
         with pytest.raises(ValueError, match=message):
-            launch(act, jobs)
+            launch(act, jobs, Machines())
     assert not list(tmp_path.iterdir())
 
 

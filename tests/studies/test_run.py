@@ -147,10 +147,7 @@ def test_scripted_demonstrations_are_recorded_once_and_a_call_that_finds_too_few
     ("options", "message"),
     [
         ({"planner.steps": 4}, "holds a study with another planner.steps (3); choose another --out"),
-        (
-            {"evaluation.episodes": 2, "label_unit": "window"},
-            "label_unit (trajectory), evaluation.episodes (1)",
-        ),
+        ({"evaluation.episodes": 2, "label_unit": "window"}, "label_unit (trajectory), evaluation.episodes (1)"),
         ({"datasets": (".",)}, "with another datasets (avoiding="),
     ],
 )
@@ -185,10 +182,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
         ({"planner.steps": 0}, "planner.steps must be >= 1, got 0"),
         ({"workers": 0}, "workers must be >= 1, got 0"),
         ({"datasets": (), "record": 40, "labels": (0.01,)}, "selects none of the 40 trajectories"),
-        (
-            {"levels": (6,), "labels": ()},
-            "has no label level 6: its levels 1 to 5 are 2, 5, 10, 25, 50 %",
-        ),
+        ({"levels": (6,), "labels": ()}, "has no label level 6: its levels 1 to 5 are 2, 5, 10, 25, 50 %"),
         ({"run.seed": 3}, "run.seed is not for a study: cells have the seeds 0, 1, ..., as many as --seeds says"),
         ({"planner.source": "x"}, "planner.source is not for a study: name runs with --planners"),
         ({"preset": "table3"}, "unknown preset 'table3'; did you mean 'table"),

@@ -57,10 +57,7 @@ def failed(**more):
     return (
         cell(**{key: value for key, value in more.items() if key != "reason"})
         | empty
-        | {
-            "status": "failed",
-            "reason": more.get("reason", "RuntimeError: loss | not finite"),
-        }
+        | {"status": "failed", "reason": more.get("reason", "RuntimeError: loss | not finite")}
     )
 
 

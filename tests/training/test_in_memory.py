@@ -173,12 +173,7 @@ def test_refusals():
 
 @pytest.mark.parametrize(
     ("method", "steps", "asked"),
-    [
-        ("koap", 3, [(3, 4)]),
-        ("koap_labelled_only", 3, [(3, 1)]),
-        ("koap_untrained", 3, []),
-        ("koap", 0, []),
-    ],
+    [("koap", 3, [(3, 4)]), ("koap_labelled_only", 3, [(3, 1)]), ("koap_untrained", 3, []), ("koap", 0, [])],
 )
 def test_a_lifting_starts_from_isomap_for_as_many_updates_as_it_is_trained_and_on_the_same_trajectories(
     monkeypatch, method, steps, asked

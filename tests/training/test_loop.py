@@ -16,14 +16,7 @@ from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.training import loop as loop_file
-from torchrl_koap.training.loop import (
-    SETTLED,
-    DivergedError,
-    limit_outlier,
-    phase_finished,
-    train_phase,
-    warmup_cosine,
-)
+from torchrl_koap.training.loop import SETTLED, DivergedError, limit_outlier, train_phase, warmup_cosine
 
 
 class Interrupt(KeyboardInterrupt):
@@ -237,13 +230,6 @@ def test_divergence_is_found_and_the_last_good_checkpoint_kept(tmp_path, log_eve
         )
     tensors, about = load_tensors(tmp_path / "checkpoints" / "phase.safetensors")
     assert about["step"] == 5 and tensors["loss.x"].isfinite().all()
-
-
-def test_a_phase_is_finished_when_its_weights_are_there(tmp_path):
-    run = RunDirectory(tmp_path)
-    assert not phase_finished(run, "planner")
-    (tmp_path / "planner.safetensors").touch()
-    assert phase_finished(run, "planner") and not phase_finished(run, "controller")
 
 
 def _koopman_loss():

@@ -11,14 +11,7 @@ import torch
 from tensordict import TensorDict
 from tiny_network import random_layer
 
-from torchrl_koap.vision import (
-    FrozenImageEncoder,
-    Projection,
-    WeightsError,
-    backbones,
-    load_backbone,
-    load_encoder,
-)
+from torchrl_koap.vision import FrozenImageEncoder, Projection, WeightsError, backbones, load_backbone, load_encoder
 
 OWN, OTHER = "tiny_network:random_layer", "tiny_network:another_layer"
 FEATURES = 4 * 6 * 6

@@ -33,11 +33,7 @@ def _caption(run: RunFacts) -> str:
 
 
 @picture(
-    "rollouts.gif",
-    source="rollouts.safetensors",
-    title="The same rollouts in real time",
-    caption=_caption,
-    order=20,
+    "rollouts.gif", source="rollouts.safetensors", title="The same rollouts in real time", caption=_caption, order=20
 )
 def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     """Shows all rollouts from above in real time; plans, if there are any, are thin lines ahead of the dots.

@@ -14,18 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, error_unit, unit_circle_sides
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import (
-    BLUE,
-    FAINT,
-    INK,
-    MUTED,
-    ORANGE,
-    PALE,
-    PALE_BLUE,
-    WARNING,
-    legend_below,
-    tidy,
-)
+from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, WARNING, legend_below, tidy
 from torchrl_koap.tasks import Task
 
 SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}

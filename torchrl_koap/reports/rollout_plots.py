@@ -49,13 +49,7 @@ def _rollouts_caption(run: RunFacts) -> str:
     )
 
 
-@picture(
-    "rollouts.png",
-    source="rollouts.safetensors",
-    title="Executed rollouts",
-    caption=_rollouts_caption,
-    order=10,
-)
+@picture("rollouts.png", source="rollouts.safetensors", title="Executed rollouts", caption=_rollouts_caption, order=10)
 def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws executed paths over the scene, coloured by mode; failures are black and marked where they end.
 

@@ -94,7 +94,7 @@ class Machines:
 
 
 def launch(
-    function: Callable[[str], None], jobs: Sequence[Job], machines: Machines | None = None
+    function: Callable[[str], None], jobs: Sequence[Job], machines: Machines
 ) -> Generator[tuple[Job, str | None], None, None]:
     """Calls a function in every job's folder, each in a process of its own; yields jobs as they end.
 
@@ -107,7 +107,6 @@ def launch(
     Raises:
         ValueError: for two jobs of one folder, or a need that is no job that comes before.
     """
-    machines = Machines() if machines is None else machines
     known: set[Path] = set()
     for job in jobs:
         if job.folder in known:
@@ -132,7 +131,7 @@ def _schedule(waiting: list[Job], pool: Any) -> Generator[tuple[Job, str | None]
                 waiting.remove(job)
                 failed[job.folder] = f"{job.needs.name} failed: {failed[job.needs]}"
                 yield job, failed[job.folder]
-            for job in [job for job in waiting if job.needs in succeeded][: pool.free]:
+            for job in [job for job in waiting if job.needs in succeeded][: pool.workers - running]:
                 waiting.remove(job)
                 pool.start(job)
                 running += 1
@@ -198,11 +197,6 @@ class LocalPool:
         with _without_ctrl_c():
             forkserver.ensure_running()
         self.running: dict[Any, tuple[Job, Any, Any]] = {}
-
-    @property
-    def free(self) -> int:
-        """How many jobs may be started now."""
-        return self.workers - len(self.running)
 
     def start(self, job: Job) -> None:
         """Starts a job."""
@@ -278,11 +272,6 @@ class RayPool:
         self.workers = max(int(ray.cluster_resources().get("CPU", workers)), 1)
         self.task = ray.remote(num_cpus=1, max_retries=0)(run_logged)
         self.running: dict[Any, Job] = {}
-
-    @property
-    def free(self) -> int:
-        """How many jobs may be started now."""
-        return self.workers - len(self.running)
 
     def start(self, job: Job) -> None:
         """Starts a job."""

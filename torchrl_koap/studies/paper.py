@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.files import replacing_file
-from torchrl_koap.lookup import lookup
 from torchrl_koap.studies.plots import plot_average
 from torchrl_koap.studies.table import Summary, as_markdown, percent, summarise
 from torchrl_koap.tasks import TASKS
@@ -29,17 +28,8 @@ DEFAULT = "task's default"  # what pictures call the method that a task is train
 
 @dataclass(frozen=True)
 class PaperCell:
-    """A cell of the paper's tables.
+    """A cell of the paper's tables: mean success in 0..1 and the number after the ``+-``; level 1 has fewest labels."""
 
-    Args:
-        table (int): 1 (methods) or 2 (variants of KOAP).
-        level (int): label level, 1 for the fewest labels.
-        label_share (float): share of the labels at this level.
-        success (float): mean success in 0..1.
-        spread (float): what is printed after the ``+-``, in the same unit.
-    """
-
-    table: int
     task: str
     method: str
     level: int
@@ -58,23 +48,11 @@ def _content() -> dict[str, Any]:
     return json.loads(files("torchrl_koap.studies").joinpath("paper_results.json").read_text(encoding="utf-8"))
 
 
-def paper_levels(task: str) -> tuple[float, ...]:
-    """Shares of labels of the paper's levels, the fewest first; empty for a task that is not in the paper."""
-    entries = [entry for entry in _content()["tasks"].values() if task in entry["tasks"]]
-    return tuple(percent / 100 for entry in entries for percent in entry["label_percent"])
-
-
 def paper_cells(table: int) -> list[PaperCell]:
-    """All cells of a table; a task that stands for one of the paper's in several ways has them in each.
-
-    Raises:
-        ValueError: for another table.
-    """
-    tables = _content()["tables"]
-    lookup(tuple(tables), str(table), "table of the paper")
+    """All cells of table 1 (methods) or 2 (variants); a task that stands for one of the paper's has them as well."""
     return [
-        PaperCell(table, task, method, level, shares[level - 1] / 100, round(success / 100, 4), round(spread / 100, 4))
-        for name, methods in tables[str(table)].items()
+        PaperCell(task, method, level, shares[level - 1] / 100, round(success / 100, 4), round(spread / 100, 4))
+        for name, methods in _content()["tables"][str(table)].items()
         for task in _content()["tasks"][name]["tasks"]
         for method, cells in methods.items()
         for shares in (_content()["tasks"][name]["label_percent"],)
@@ -104,12 +82,7 @@ def paper_points(task: str) -> dict[str, list[tuple[float, float]]]:
 
 @dataclass(frozen=True)
 class Entry:
-    """A measured cell, pooled over seeds, and the paper's; either may be absent.
-
-    Args:
-        level (int): label level, 1 for the fewest labels.
-        label_share (float): share of the labels.
-    """
+    """A measured cell, pooled over seeds, and the paper's; either may be absent."""
 
     task: str
     method: str
@@ -138,29 +111,21 @@ class Entry:
 def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
     """Cells of all tasks, methods and levels that occur among some rows, those that were not run included.
 
-    Cells at shares that are no label level of their task are left out.
-
-    Raises:
-        ValueError: as :func:`~torchrl_koap.studies.table.summarise`.
+    Cells of tasks that nobody registered, and at shares that are no label level, are left out.
     """
     found: dict[tuple[str, int, str], Summary] = {}
     for item in summarise(rows):
-        levels = _levels_of(item.task)
+        levels = TASKS[item.task].label_levels if item.task in TASKS else ()
         if item.labels in levels:
             found[item.task, levels.index(item.labels) + 1, item.method] = item
-    tasks = list(dict.fromkeys(task for task, _, _ in found))
-    methods = list(dict.fromkeys(method for _, _, method in found))
+    tasks, methods = (list(dict.fromkeys(names)) for names in ([t for t, _, _ in found], [m for _, _, m in found]))
     return [
         Entry(task, method, level, share, found.get((task, level, method)), paper_cell(task, method, level))
         for task in tasks
-        for level, share in enumerate(_levels_of(task), start=1)
+        for level, share in enumerate(TASKS[task].label_levels, start=1)
         if any(key[:2] == (task, level) for key in found)
         for method in methods
     ]
-
-
-def _levels_of(task: str) -> tuple[float, ...]:
-    return TASKS[task].label_levels if task in TASKS else paper_levels(task)
 
 
 def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:

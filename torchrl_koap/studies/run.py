@@ -74,7 +74,6 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         ...
         ValueError: unknown method 'kaop'; did you mean 'koap'?
     """
-    machines = Machines() if machines is None else machines
     before = _read_study(study.out)
     study = complete(study, () if before is None else before.run.plugins)
     cells, root = check_study(study), RunDirectory(study.out)
@@ -90,7 +89,7 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         asked = set(cells)
         earlier = [cell for cell in whole.cells() if cell not in asked and _began(study.out / cell.folder)]
         table = _Table(study, [*cells, *earlier])
-        _work(study, cells, table, machines)
+        _work(study, cells, table, machines or Machines())
         table.write()
         report = _report(whole, table)
     rows = list(table.rows.values())
@@ -99,11 +98,7 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
 
 
 def _read_study(folder: Path) -> Study | None:
-    """Reads what an earlier call in a folder asked for, None if there was none.
-
-    Raises:
-        RunDirectoryError: if ``study.json`` is damaged.
-    """
+    """Reads what an earlier call in a folder asked for, None if there was none."""
     run = RunDirectory(folder)
     if not (run.path / _FILE).exists():
         return None
@@ -121,11 +116,7 @@ def _together(study: Study) -> Study:
 
 
 def _check_folder(study: Study) -> None:
-    """Refuses a folder that holds something else, or a study with other settings.
-
-    Raises:
-        RunDirectoryError: naming what differs.
-    """
+    """Refuses a folder that holds something else, or a study with other settings, and names what differs."""
     path, earlier = study.out, _read_study(study.out)
     if earlier is None:
         if path.exists() and not path.is_dir():
@@ -227,7 +218,7 @@ class _Table:
         self._next = time.monotonic() + _EVERY
 
 
-def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines | None) -> None:
+def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines) -> None:
     """Does the cells that are not done, and the planners that they share before."""
     first: list[Job] = []
     jobs: dict[Path, Job] = {}

@@ -20,13 +20,9 @@ _MOMENTS = {"step", "exp_avg", "exp_avg_sq"}  # what AdamW keeps of a parameter
 def save_training_state(
     path: str | Path, module: nn.Module, optimizer: torch.optim.Optimizer, about: Mapping[str, Any]
 ) -> None:
-    """Writes everything a training loop needs to go on: parameters (targets included), optimiser, random state.
+    """Writes everything a training loop needs to go on: parameters (targets included), moments, random state, facts.
 
-    Args:
-        path (str or Path): file to write.
-        module (nn.Module): the loss, and what else has a state.
-        optimizer (Optimizer): its moments are kept.
-        about (mapping): facts, for example ``{"phase": "planner", "step": 500}``.
+    The module holds the loss, and what else has a state. Facts are such as ``{"phase": "planner", "step": 500}``.
     """
     state = optimizer.state_dict()
     tensors = {name: value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
@@ -39,15 +35,7 @@ def save_training_state(
 
 
 def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Restores what :func:`save_training_state` wrote, the global random state included.
-
-    Args:
-        path (str or Path): the file.
-        module (nn.Module): built as it was; receives its state.
-        optimizer (torch.optim.Optimizer): optimiser of the same parameters; receives its moments.
-
-    Returns:
-        dict: the facts given when it was saved.
+    """Restores what :func:`save_training_state` wrote, the global random state included, and returns the facts.
 
     Raises:
         CheckpointError: if the file is damaged, no training state, lacks that of the optimiser, or does not fit the

@@ -14,24 +14,12 @@ from torchrl_koap.tasks import Task
 
 
 def fit_closed_form(
-    controller: InverseDynamics,
-    data: TensorDictBase,
-    *,
-    axes: Sequence[int] = (),
-    guessed: bool = False,
+    controller: InverseDynamics, data: TensorDictBase, *, axes: Sequence[int] = (), guessed: bool = False
 ) -> dict[str, Any]:
     """Fits a controller's decoder on every labelled step that sees its whole look-ahead, each used once.
 
-    Args:
-        controller (InverseDynamics): a controller with :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels`.
-        data (TensorDictBase): flat data after the label budget was applied.
-
-    Keyword Args:
-        axes (sequence of int): the state column that each action entry moves.
-        guessed (bool): the axes are only likely (:func:`axes_of`).
-
-    Returns:
-        dict: what the fit found: for a ridge regression its penalty, number of labels and held-out error.
+    The data are flat ``[N]``, after the label budget was applied; ``axes`` and ``guessed`` are those of
+    :func:`axes_of`. Returns what :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
     """
     keys = ["state", "action", "has_action", "episode"]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
@@ -45,14 +33,9 @@ def fit_closed_form(
 
 
 def axes_of(task: Task, columns: Sequence[int]) -> dict[str, Any]:
-    """Finds the column that each action moves; for a robot that came with data alone, the likely one.
+    """Finds the column of those read that each action moves; for a robot that came with data alone, the likely one.
 
-    Args:
-        task (Task): the task.
-        columns (sequence of int): state columns that the controller reads.
-
-    Returns:
-        dict: ``axes``, a column of those read for every action, empty where nothing is known or likely; ``guessed``.
+    ``axes`` are empty where nothing is known or likely; ``guessed`` tells a likely one from a known one.
 
     Examples:
         >>> from torchrl_koap.tasks import Action, Task, get_task

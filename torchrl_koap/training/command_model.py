@@ -23,13 +23,8 @@ UPDATES, BATCH, RATE, WEIGHT_DECAY = 8000, 512, 2e-3, 1e-4
 def decoder_columns(task: Task) -> dict[str, Any]:
     """What a :class:`~torchrl_koap.modules.CommandDecoder` of a task is built with (:func:`build_decoder`).
 
-    Args:
-        task (Task): the task.
-
-    Returns:
-        dict: ``state_dim``, ``commands``, ``actions``, ``relative`` positions; and ``gripper``, action column and state
-        column of a gripper whose number is read off planned widths: ``Task.gripper``, or where an absolute action
-        ``name`` has its width in the state, as the part ``name_width``.
+    ``gripper`` are action column and state column of a gripper whose number is read off planned widths:
+    ``Task.gripper``, or where an absolute action ``name`` has its width in the state, as the part ``name_width``.
 
     Raises:
         ValueError: if its observation does not repeat the last command, no action is a change of it, or nothing tells
@@ -73,12 +68,7 @@ def _gripper(task: Task) -> list[int] | None:
 
 
 def build_decoder(columns: dict[str, Any], action_dim: int) -> CommandDecoder:
-    """The module that :func:`decoder_columns` describes.
-
-    Args:
-        columns (dict): as there, or as a run's ``config.json`` has it.
-        action_dim (int): entries of an action.
-    """
+    """The module that :func:`decoder_columns` describes, for so many entries of an action."""
     own = {name: columns[name] for name in ("state_dim", "commands", "actions")}
     pairs = [[None if part is None else slice(*part) for part in pair] for pair in columns.get("relative", ())]
     features = relative_features(pairs)
@@ -96,29 +86,18 @@ def with_label_commands(labelled: TensorDictBase, data: TensorDictBase, command:
     is added is what labelled steps have, one command each; of the steps between nothing but the sum of their actions
     could be told from it.
 
-    Args:
-        labelled (TensorDictBase): flat data ``[N]`` after the label budget was applied.
-        data (TensorDictBase): the same before.
-        command (slice): columns of the observation that repeat the command.
-
-    Returns:
-        TensorDictBase: a shallow copy with :data:`LABEL_COMMAND` ``[N, J]``, NaN at steps without label.
+    ``labelled`` are flat data ``[N]`` after the label budget was applied, ``data`` the same before, ``command`` the
+    columns of the observation that repeat the command. A shallow copy is returned.
     """
     known = data[OBSERVATION][:, command].to(labelled[OBSERVATION].device)
     return labelled.copy().set(LABEL_COMMAND, torch.where(labelled[HAS_ACTION], known, torch.nan))
 
 
 def fit_decoder(decoder: CommandDecoder, data: TensorDictBase, *, updates: int = UPDATES) -> dict[str, Any]:
-    """Regresses the commands at labelled steps on the state.
+    """Regresses the commands at labelled steps of flat data ``[N]`` on the whole state, in updates of 512 steps each.
 
-    Args:
-        decoder (CommandDecoder): the module, which is trained in place.
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied, with the whole ``state``. Commands
-            are those of :data:`LABEL_COMMAND` where it is there (:func:`with_label_commands`), else those of the
-            observation, which the budget leaves in trajectories that are labelled throughout.
-
-    Keyword Args:
-        updates (int): of 512 steps each. Defaults to ``8000``.
+    Commands are those of :data:`LABEL_COMMAND` where it is there (:func:`with_label_commands`), else those of the
+    observation, which the budget leaves in trajectories that are labelled throughout.
 
     Returns:
         dict: ``labels_used``; ``commands_told``, how many of them told a command that the budget blanks because it is

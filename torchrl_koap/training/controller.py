@@ -31,12 +31,7 @@ _KEYS = ["state", "action", "has_action"]
 
 
 def learn_controller(
-    task: Task,
-    config: TrainConfig,
-    data: TensorDictBase,
-    *,
-    run: RunDirectory | None = None,
-    logger: Any = None,
+    task: Task, config: TrainConfig, data: TensorDictBase, *, run: RunDirectory | None = None, logger: Any = None
 ) -> tuple[nn.Module, dict[str, Any]]:
     """Builds and trains what turns states into actions.
 
@@ -124,12 +119,7 @@ def _train_network(
         controller.prepare(windows["state"], updates=budget if method.phases else 0, progress=progress)
     for phase in method.phases if budget else ():
         buffer = make_window_buffer(
-            data,
-            window,
-            BATCH_SIZE,
-            select=_KEYS,
-            pad_before=history,
-            labelled_share=LABELLED_SHARES[phase.windows],
+            data, window, BATCH_SIZE, select=_KEYS, pad_before=history, labelled_share=LABELLED_SHARES[phase.windows]
         )
         losses |= loop(
             phase.name,

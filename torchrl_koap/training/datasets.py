@@ -27,12 +27,7 @@ _RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("n
 
 
 def find_task_of(dataset: str | None, name: str | None = None) -> Task:
-    """Finds the task of a data set.
-
-    Args:
-        dataset (str): a folder, as for :func:`load_demonstrations`.
-        name (str, optional): name of a registered task, or of the one that the data set holds. Default: the task that
-            the data set holds or names; of raw pickles ``"avoiding"``.
+    """Finds the task of a data set: the one named, else the one that it holds or names; of raw pickles ``"avoiding"``.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -87,10 +82,7 @@ def label_budget(config: TrainConfig) -> LabelBudget:
 
 
 def fingerprint(data: TensorDictBase) -> dict[str, Any]:
-    """What tells data from others: their size, and a checksum of what was recorded.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]``, on any device.
+    """What tells flat data ``[N]`` from others: their size, and a checksum of what was recorded.
 
     Examples:
         >>> import torch
@@ -116,12 +108,7 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
     see them, the controller does. At least one trajectory is held out, of ten or more at least two, and at least one is
     left; of a single trajectory none can be.
 
-    Args:
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
-        fraction (float, optional): share of all trajectories in ``[0, 1)``; None is 0.
-
-    Keyword Args:
-        seed (int): seed of the choice.
+    The fraction is a share of all trajectories of flat data ``[N]``, in ``[0, 1)``; None is 0.
 
     Raises:
         ValueError: if the share is out of range.
@@ -150,26 +137,14 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
 
 
 def held_out_by(source: Path, dataset: str) -> list[int]:
-    """Reads which trajectories a planner that is taken over has never seen.
-
-    Args:
-        source (Path): its run directory.
-        dataset (str): the data set at hand; of another one than the planner's own nothing is known to be unseen.
-    """
+    """Reads which trajectories the planner of a run has never seen; none of another data set than its own."""
     run = RunDirectory(source)
     same = os.path.abspath(str(read_config(run).dataset)) == os.path.abspath(dataset)
     return list(run.read_json("config.json").get("held_out_episodes") or ()) if same else []
 
 
 def without_held_out(data: TensorDictBase, episodes: Sequence[int], *, keep_labelled: bool = False) -> TensorDictBase:
-    """The data that may be learnt from.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
-        episodes (sequence of int): held-out trajectories.
-
-    Keyword Args:
-        keep_labelled (bool): keep those of them that have a label, as a controller does.
+    """Leaves held-out trajectories out of flat data ``[N]``; those with a label stay for a controller, if asked for.
 
     Raises:
         ValueError: if nothing is left.

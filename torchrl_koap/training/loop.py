@@ -7,7 +7,6 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -26,15 +25,7 @@ SETTLED = 100  # updates before which the second moment says little
 
 
 def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
-    """Share of the peak learning rate at ``step``: linear warm-up, then half a cosine to 0.
-
-    Args:
-        step (int): number of the update, from 0.
-        num_steps (int): all updates.
-        warmup (int): updates of the warm-up.
-
-    Returns:
-        float: 0 to 1.
+    """Share of the peak learning rate at an update, from 0 on: linear warm-up, then half a cosine to 0.
 
     Examples:
         >>> from torchrl_koap.training.loop import warmup_cosine
@@ -45,14 +36,9 @@ def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
 
 
 def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
-    """The average of a loss's parameters that is used after training; its memory is a share of a short training.
+    """The average of a loss's ``target_*_params`` that is used after training, to be stepped after every update.
 
-    Args:
-        loss_module (nn.Module): a loss with ``target_*_params``.
-        num_steps (int): updates of the training.
-
-    Returns:
-        SoftUpdate: to be stepped after every update; its decay is ``1 - 10 / (num_steps + 10)``, at most 0.998.
+    Its memory is a share of a short training: the decay is ``1 - 10 / (num_steps + 10)``, at most 0.998.
     """
     return SoftUpdate(loss_module, eps=min(0.998, 1 - 10 / (num_steps + 10)))
 
@@ -190,19 +176,9 @@ def _interrupts_let_through() -> Iterator[None]:
         raise
 
 
-def phase_finished(run: RunDirectory, phase: str) -> bool:
-    """Whether the weights of a phase were written, which happens once, at its end.
-
-    Args:
-        run (RunDirectory): the run.
-        phase (str): name of the phase, and of its weights.
-    """
-    return Path(run.path / f"{phase}.safetensors").exists()
-
-
 @torch.no_grad()
-def limit_outlier(optimizer: torch.optim.AdamW, *, times: float = TIMES) -> Tensor | None:
-    """Shortens the gradient to ``times`` the root mean square length of earlier ones, where it is longer.
+def limit_outlier(optimizer: torch.optim.AdamW) -> Tensor | None:
+    """Shortens the gradient to five times the root mean square length of earlier ones, where it is longer.
 
     Where gradients have become short, so has the second moment that AdamW divides by. One that is several times as long
     then moves every parameter by several learning rates, the next one is longer still, and within twenty updates the
@@ -211,17 +187,8 @@ def limit_outlier(optimizer: torch.optim.AdamW, *, times: float = TIMES) -> Tens
     training without outliers is not touched.
 
     Call it between ``backward`` and ``step``. What is typical is read off the optimizer's second moment, so that a
-    training that is resumed goes on the same.
-
-    Args:
-        optimizer (torch.optim.AdamW): whose parameters hold the gradient.
-
-    Keyword Args:
-        times (float): how much longer than typical a gradient may be.
-
-    Returns:
-        Tensor: the factor ``[]`` that the gradient was multiplied by, 1 for any ordinary one; None while the optimizer
-        has seen too few.
+    training that is resumed goes on the same. Returns the factor ``[]`` that the gradient was multiplied by, 1 for any
+    ordinary one; None while the optimizer has seen too few.
 
     Examples:
         >>> import torch
@@ -249,6 +216,6 @@ def limit_outlier(optimizer: torch.optim.AdamW, *, times: float = TIMES) -> Tens
     # the second moment is positive: its sum is the 1-norm
     moment = torch.stack(torch._foreach_norm([state["exp_avg_sq"] for state in states], 1)).sum()
     typical = (moment / (1 - group["betas"][1] ** updates)).sqrt()
-    factor = (times * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or one that is not finite
+    factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or one that is not finite
     torch._foreach_mul_(gradients, factor)
     return factor

@@ -40,13 +40,7 @@ from torchrl_koap.modules import (
     VariationalInverseDynamics,
     make_koopman_inverse_dynamics,
 )
-from torchrl_koap.objectives import (
-    ActionLoss,
-    DiffusionPolicyLoss,
-    KOAPLoss,
-    QuantizedDynamicsLoss,
-    VariationalLoss,
-)
+from torchrl_koap.objectives import ActionLoss, DiffusionPolicyLoss, KOAPLoss, QuantizedDynamicsLoss, VariationalLoss
 from torchrl_koap.runs.plugins import load_entry_points
 from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, decoder_columns, fit_decoder
 from torchrl_koap.training.method import Method, Phase
@@ -139,21 +133,8 @@ def register_method(method: Method) -> Method:
 
 
 for _method in (
-    Method(
-        "koap",
-        "KOAP",
-        _koap,
-        (_UNLABELLED,),
-        closed_form=True,
-        presets=_ANY_PRESET,
-    ),
-    Method(
-        "mpc",
-        "MPC with an identified response",
-        _response,
-        fit=_fit_response,
-        execution=_EVERY_STEP,
-    ),
+    Method("koap", "KOAP", _koap, (_UNLABELLED,), closed_form=True, presets=_ANY_PRESET),
+    Method("mpc", "MPC with an identified response", _response, fit=_fit_response, execution=_EVERY_STEP),
     Method(
         "command_regression",
         "regression of the command on the state",
@@ -186,10 +167,7 @@ for _method in (
         "pretrain",
         "KOAP, pre-trained and fine-tuned",
         _koap,
-        (
-            replace(_UNLABELLED, share=0.5),
-            Phase("finetune", KOAPLoss, "labelled", share=0.5),
-        ),
+        (replace(_UNLABELLED, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
         presets=_ANY_PRESET,
     ),
     Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
@@ -217,12 +195,7 @@ for _method in (
         partial(_network, kind=QuantizedInverseDynamics),
         (Phase("controller", QuantizedDynamicsLoss, share=0.5), _DECODER),
     ),
-    Method(
-        "nonlinear",
-        "KOAP with nonlinear maps",
-        partial(_network, kind=NonlinearInverseDynamics),
-        _JOINT,
-    ),
+    Method("nonlinear", "KOAP with nonlinear maps", partial(_network, kind=NonlinearInverseDynamics), _JOINT),
     Method("dp", "Diffusion Policy", build_sampler, _POLICY, plans=False),
     Method(
         "relabel",
@@ -231,14 +204,7 @@ for _method in (
         _LABELS,
         teacher="dd_lookahead",
     ),
-    Method(
-        "vpt",
-        "Diffusion Policy on relabelled data",
-        build_sampler,
-        _POLICY,
-        plans=False,
-        teacher="dd_lookahead",
-    ),
+    Method("vpt", "Diffusion Policy on relabelled data", build_sampler, _POLICY, plans=False, teacher="dd_lookahead"),
 ):
     register_method(_method)
 

@@ -24,14 +24,9 @@ def policy_facts(
 ) -> dict[str, Any]:
     """The facts of a task as keyword arguments of :func:`~torchrl_koap.modules.make_policy`.
 
-    Args:
-        task (Task): the task.
-
-    Keyword Args:
-        columns (sequence of int, optional): columns of the state that the controller reads. Default: all.
-        gripper (sequence of int, optional): action column of a gripper and state column of its width, whose number is
-            read off the planned widths, where the task has no rule for actions of its own.
-        ranges (sequence, optional): of :func:`command_ranges`.
+    ``columns`` of the state are those that the controller reads (default: all), ``ranges`` those of
+    :func:`command_ranges`. A ``gripper`` is its action column and the state column of its width: its number is read off
+    planned widths, where the task has no rule for actions of its own.
 
     Examples:
         >>> from torchrl_koap.tasks import get_task
@@ -57,14 +52,9 @@ def policy_facts(
 
 
 def commanded_columns(task: Task) -> dict[str, list[int]] | None:
-    """The columns that actions are about: what they change or set, where it is observed, what it moves.
+    """The columns of action, observation (``"commands"``) and state that belong to each command.
 
-    Args:
-        task (Task): the task.
-
-    Returns:
-        dict: columns of the action (``"actions"``), of the observation (``"commands"``) and of the state (``"states"``)
-        for every command; None where the observation does not repeat it, or it is not known what it moves.
+    None where the observation does not repeat the command, or it is not known what it moves.
     """
     actions = list(range(task.action_dim) if task.targets else task.delta_actions)
     moved = list(task.targets or task.moved_columns(or_robot=True))
@@ -82,12 +72,8 @@ def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]
     Few labels show few directions: changes of commands reach as far either way, and on every axis, as the largest one
     in their unit. An absolute command may be wherever a demonstration took the column that it is the target of.
 
-    Args:
-        task (Task): the task.
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
-
-    Returns:
-        list: least and greatest number of every action column, None for a gripper's and for one that never changes.
+    Of flat data ``[N]`` after the label budget was applied, the least and greatest number of every action column are
+    returned, None for a gripper's and for one that never changes.
 
     Examples:
         >>> import torch

@@ -28,9 +28,6 @@ _LEAST = 9  # steps of a block, where a single stretch is cut
 def tracked_columns(task: Task) -> dict[str, Any]:
     """What a :class:`~torchrl_koap.modules.ResponseModel` is built with: which columns a task's actions move.
 
-    Args:
-        task (Task): the task.
-
     Raises:
         ValueError: if its observation does not repeat the last command, or it is not known what the actions move.
 
@@ -105,17 +102,13 @@ def take(rows: Rows, chosen: Tensor) -> Rows:
 
 
 def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any]:
-    """Fits a response to the labelled steps; axes are coupled if stretches left out are predicted better by it.
+    """Fits a response to labelled steps of flat data ``[N]``; axes are coupled if stretches left out call for it.
 
     A ridge regression of single steps is where the fit of predictions over up to 12 steps begins
     (:func:`fit_predictions`).
 
     Where a trajectory has labels on parts of it only, its commands are hidden and the changes alone are known: every
     such stretch then has an unknown offset of its own, which is taken out (fixed effects).
-
-    Args:
-        response (ResponseModel): the model, whose weights are set.
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
 
     Returns:
         dict: ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up
@@ -153,15 +146,7 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
 
 
 def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[LabelledSteps, Tensor]:
-    """The steps that may be fitted to, and the changes of the command.
-
-    Args:
-        response (ResponseModel): which columns to read.
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
-
-    Returns:
-        tuple: the steps, and the changes ``[N, J]``, NaN where they are not known.
-    """
+    """The steps that may be fitted to, and the changes of the command ``[N, J]``, NaN where they are not known."""
     memory, axes = response.memory, response.num_axes
     episode, labelled = data["episode"], data["has_action"].reshape(-1)
     positions = data["state"][:, response.states].double()
@@ -271,14 +256,8 @@ def fit_predictions(response: ResponseModel, stretches: Stretches, *, coupled: b
 
     A fit to single steps takes what it cannot explain for a shorter memory or a weaker pull of the command; the error
     then grows with every step that is predicted. Coefficients stay near the ones that the response has
-    (:data:`STAY`), where stretches tell little.
-
-    Args:
-        response (ResponseModel): the model, fitted to single steps; its weights are set.
-        stretches (Stretches): to predict. Without any, nothing changes.
-
-    Keyword Args:
-        coupled (bool): an axis may answer the commands of others.
+    (:data:`STAY`), where stretches tell little; without any, nothing changes. Coupled axes answer the commands of
+    others.
     """
     if not len(stretches.known):
         return

@@ -228,10 +228,7 @@ class Trained:
         return make_policy(self.controller, **facts, execution=execution)
 
     def data(self, dataset: str | None = None) -> TensorDictBase:
-        """Reads the demonstrations that it was trained on, with all labels that there are.
-
-        Args:
-            dataset (str, optional): where they are now. Default: where they were.
+        """Reads the demonstrations that it was trained on, with all labels, from where they are now or were then.
 
         Raises:
             RunDirectoryError: if they are not there.
@@ -247,11 +244,7 @@ class Trained:
     def with_ranges(self, dataset: str | None = None) -> Trained:
         """Finds the range of the demonstrated commands, and stores it in the folder, if the training did not.
 
-        Args:
-            dataset (str, optional): as for :meth:`data`. Where the data are not there the range stays unknown.
-
-        Returns:
-            Trained: the same with ``command_ranges`` in its results.
+        ``dataset`` is as for :meth:`data`; where the data are not there the range stays unknown.
         """
         if self.results.get("command_ranges") is not None or self.folder is None:
             return self
@@ -266,13 +259,7 @@ class Trained:
         return replace(self, results=results)
 
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
-        """Hides all labels that the training did not see: their actions are NaN.
-
-        Args:
-            data (TensorDictBase): what :meth:`data` returned.
-
-        Returns:
-            tuple: the data, and what the budget took.
+        """Hides all labels of :meth:`data` that the training did not see: their actions are NaN; the budget reports.
 
         Raises:
             RunDirectoryError: if they are not the demonstrations that it was trained on.
@@ -290,14 +277,9 @@ class Trained:
 
 
 def build_networks(task: Task, config: TrainConfig) -> tuple[StatePlanner | None, nn.Module]:
-    """Builds the networks of a training without weights, in evaluation mode.
+    """Builds the networks of a resolved configuration without weights, in evaluation mode.
 
-    Args:
-        task (Task): the task.
-        config (TrainConfig): nothing left open.
-
-    Returns:
-        tuple: the planner, None for a method that samples actions, and the controller, or what samples them.
+    The first is the planner, None for a method that samples actions; the second controls, or samples them.
 
     Raises:
         ValueError: for unknown names, or networks that cannot read the task's state.
@@ -309,13 +291,7 @@ def build_networks(task: Task, config: TrainConfig) -> tuple[StatePlanner | None
 
 
 def facts_of(part: str, task: Task, config: TrainConfig) -> dict[str, Any]:
-    """What a file of weights says about them: the options that build their network.
-
-    Args:
-        part (str): ``"planner"`` or ``"controller"``.
-        task (Task): the task.
-        config (TrainConfig): nothing left open.
-    """
+    """What a file of weights, of ``"planner"`` or ``"controller"``, says about them: the options of their network."""
     planner = {f"planner.{name}": getattr(config.planner, name) for name in ("network", "width", "frames")}
     if part == "planner":
         return {"task": task.name} | planner
