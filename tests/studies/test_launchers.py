@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from late_files import wait_until
 
-from torchrl_koap.studies.launchers import Job, Machines, launch, run_logged
+from torchrl_koap.studies.launchers import Job, Machines, launch
 
 pytestmark = pytest.mark.usefixtures("job_server")
 # where a process that no test has started finds this file and what it imports
@@ -212,12 +212,6 @@ def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
     finally:
         for pid in filter(is_alive, pids):
             os.kill(pid, signal.SIGKILL)
-
-
-def test_a_function_called_with_its_words_in_a_log(tmp_path, capsys):
-    assert run_logged(print, "a", str(tmp_path / "log")) is None
-    assert run_logged(raises, "", str(tmp_path / "log")) == "RuntimeError"
-    assert (tmp_path / "log").read_text().startswith("a\n") and capsys.readouterr() == ("", "")
 
 
 @pytest.mark.slow

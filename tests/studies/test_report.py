@@ -27,18 +27,9 @@ def make_cells(outcomes: dict | None = None, *, methods=_METHODS, labels=(0.01, 
                 generator = random.Random(f"{method} {share} {seed}")
                 won = [generator.random() < rate for _ in range(episodes)]
                 row = {"task": "avoiding", "method": method, "labels": share, "demonstrations": 1.0, "seed": seed}
-                row |= {
-                    "label_unit": "trajectory",
-                    "status": "done",
-                    "reason": "",
-                    "labelled_transitions": 9000 * share,
-                }
-                row |= {
-                    "episodes": episodes,
-                    "successes": sum(won),
-                    "action_error": 1 / rate + seed,
-                    "mode_entropy": 0.5,
-                }
+                row |= {"label_unit": "trajectory", "status": "done", "reason": "", "mode_entropy": 0.5}
+                row |= {"labelled_transitions": 9000 * share, "action_error": 1 / rate + seed}
+                row |= {"episodes": episodes, "successes": sum(won)}
                 row |= {"train_seconds": 60.0, "eval_seconds": 5.0, **more}
                 row["run"] = f"{row['task']}/{method}/{share}/{row['demonstrations']}/{seed}"
                 rows.append(row)

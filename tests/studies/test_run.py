@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -336,16 +335,3 @@ def test_each_finished_cell_is_read_once(tmp_path, monkeypatch):
     table.write()
     assert read == [*range(30), *range(25, 30)] and len(table.outcomes) == 29
     assert [row["status"] for row in read_csv(tmp_path / "cells.csv")] == [*29 * ["done"], "failed"]
-
-
-@pytest.mark.faults
-def test_two_thousand_cells(tmp_path):
-    for cell in cells(2000):
-        finish(tmp_path, cell)
-    began = time.process_time()
-    table = _Table(Study(out=tmp_path, label_unit="trajectory"), cells(2000))
-    assert all(row["status"] == "done" for row in table.rows.values())
-    for cell in cells(2000)[:50]:
-        table.ended(cell, None)
-    table.write()
-    assert time.process_time() - began < 10

@@ -21,44 +21,15 @@ from torchrl_koap.studies.table import (
 
 
 def cell(method="koap", labels=0.02, seed=0, *, successes=20, episodes=30, **more):
-    return {
-        "task": "avoiding",
-        "method": method,
-        "labels": labels,
-        "demonstrations": 1.0,
-        "seed": seed,
-        "label_unit": "trajectory",
-        "status": "done",
-        "reason": "",
-        "labelled_units": 4,
-        "labelled_transitions": 320 + seed,
-        "trajectories_touched": 4,
-        "episodes": episodes,
-        "successes": successes,
-        "success_rate": successes / episodes,
-        "success_low": 0.1,
-        "success_high": 0.9,
-        "mode_entropy": 0.5 + 0.1 * seed,
-        "collisions": 2,
-        "mean_steps": 80.5,
-        "action_error": 1.0 + seed,
-        "relative_action_error": None,
-        "relative_plan_error": None,
-        "kind": "",
-        "controller_updates": 500,
-        "train_seconds": 12.25,
-        "eval_seconds": 3.5,
-        "run": f"{method}/{labels}/{seed}",
-    } | more
+    asked = ("avoiding", method, labels, 1.0, seed, "trajectory", "done", "", 4, 320 + seed, 4)
+    found = (episodes, successes, successes / episodes, 0.1, 0.9, 0.5 + 0.1 * seed, 2, 80.5, 1.0 + seed, None, None, "")
+    row = (*asked, *found, 500, 12.25, 3.5, f"{method}/{labels}/{seed}")
+    return dict(zip(CELL_COLUMNS, row, strict=True)) | more
 
 
-def failed(**more):
+def failed(reason="RuntimeError: loss | not finite", **more):
     empty = dict.fromkeys(("episodes", "successes", "success_rate", "mode_entropy", "action_error", "train_seconds"))
-    return (
-        cell(**{key: value for key, value in more.items() if key != "reason"})
-        | empty
-        | {"status": "failed", "reason": more.get("reason", "RuntimeError: loss | not finite")}
-    )
+    return cell(**more) | empty | {"status": "failed", "reason": reason}
 
 
 def test_reasons_become_one_line_and_nan_becomes_empty(tmp_path):

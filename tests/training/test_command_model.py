@@ -12,8 +12,8 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.training.command_model import (
     LABEL_COMMAND,
     build_decoder,
-    decoder_columns,
     fit_decoder,
+    gripper_columns,
     with_label_commands,
 )
 
@@ -84,12 +84,12 @@ def test_without_a_known_command_it_says_so():
 
 
 def test_columns_of_tasks():
-    columns = decoder_columns(get_task("stacking_unobserved_joints"))
-    assert columns["commands"] == columns["actions"] == list(range(7))
-    assert columns["gripper"] == [7, 3] and columns["state_dim"] == 19
-    assert len(build_decoder(columns, 8).actions) == 7
-    assert decoder_columns(get_task("avoiding"))["gripper"] is None
-    assert decoder_columns(get_task("stacking"))["gripper"] == [7, 7]
+    task = get_task("stacking_unobserved_joints")
+    decoder = build_decoder(task)
+    assert decoder.commands == decoder.actions == list(range(7))
+    assert gripper_columns(task) == [7, 3] and decoder(torch.zeros(3, 19)).shape == (3, 7)
+    assert gripper_columns(get_task("avoiding")) is None
+    assert gripper_columns(get_task("stacking")) == [7, 7]
 
 
 def test_tasks_whose_actions_are_commands_are_refused():

@@ -10,7 +10,7 @@ from small_controllers import controller_of, plain_task
 from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
 from torchrl_koap.modules import VariationalInverseDynamics
 from torchrl_koap.tasks import WINDOW
-from torchrl_koap.training.methods import METHODS, get_method
+from torchrl_koap.training.methods import METHODS
 
 CONTROLLERS = [name for name, method in METHODS.items() if method.plans and method.fit is None]
 
@@ -86,11 +86,6 @@ def test_statistics_are_those_of_what_a_method_may_see(name, data):
         assert not changed
     elif "state_normalizer.offset" in clean:
         assert "state_normalizer.offset" in changed
-
-
-def test_unknown_methods_are_answered():
-    with pytest.raises(ValueError, match="unknown method 'linaer'; did you mean 'linear'?"):
-        get_method("linaer")
 
 
 def test_the_auto_encoder_reads_the_window_that_policies_hand_it():

@@ -236,17 +236,8 @@ def test_a_run_goes_on_after_it_was_moved_together_with_what_it_builds_on(tmp_pa
     weights = (here / "run" / "controller.safetensors").read_bytes()
     (here / "run" / "controller.safetensors").unlink()
     here.rename(there)
-    again = (
-        "--dataset",
-        there / "raw",
-        "--out",
-        there / "run",
-        "--planner.source",
-        there / "planner",
-        *call,
-        "--resume",
-    )
-    assert koap("train", *again) == 0
+    again = ("--dataset", there / "raw", "--out", there / "run", "--planner.source", there / "planner")
+    assert koap("train", *again, *call, "--resume") == 0
     assert (there / "run" / "controller.safetensors").read_bytes() == weights
 
 

@@ -74,8 +74,6 @@ class Picture:
         title (str): its heading in the report.
         caption (str or callable): what it shows and how to read it, or a function of the run that says so.
         draw (callable): from the content of the source and the run to a figure or film.
-        command (str): the ``koap`` command that leaves the source, ``{run}`` stands for the directory. Default: by the
-            source.
         order (int): pictures stand in the report in this order.
         empty (str): what the report says where the source holds nothing to draw; nothing if it is empty.
         offline (bool): it is of tasks without an environment alone, which are evaluated on recorded data.
@@ -86,15 +84,14 @@ class Picture:
     title: str
     caption: str | Callable[[RunFacts], str]
     draw: Draw
-    command: str = ""
     order: int = 1000
     empty: str = ""
     offline: bool = False
 
     @property
     def made_by(self) -> str:
-        """The command that leaves the source."""
-        return self.command or _COMMANDS.get(self.source, TRAIN)
+        """The command that leaves the source; ``{run}`` stands for the directory."""
+        return _COMMANDS.get(self.source, TRAIN)
 
     def caption_for(self, run: RunFacts) -> str:
         """Returns the caption for a run."""

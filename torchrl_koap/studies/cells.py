@@ -111,9 +111,8 @@ def run_cell(folder: str | Path) -> None:
 def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int], float]] | None:
     """Reads what a cell found, None if it is not finished.
 
-    Returns:
-        tuple or None: columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`; success by (context, evaluation
-        seed), or without an environment the relative action error by (trajectory, 0).
+    These are columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`, and outcomes as
+    :data:`~torchrl_koap.studies.paired_comparison.Outcome`.
 
     Raises:
         RunDirectoryError: if ``result.json`` is damaged.

@@ -34,24 +34,15 @@ _TAIL = (1 - 0.95) / 2  # share of the resamples outside the interval at either 
 
 @dataclass(frozen=True)
 class Comparison:
-    """How much more often the first of two methods succeeds.
+    """How much more often the first of two methods succeeds."""
 
-    Args:
-        difference (float): mean over contexts of the difference of the success rates, in -1..1, with the ends ``low``
-            and ``high`` of its 95 % interval.
-        p (float): two-sided p-value of the hypothesis of no difference.
-        contexts (int): number of contexts compared.
-        seeds (int): number of training seeds that both methods have.
-        n (int): number of pairs of rollouts behind it.
-    """
-
-    difference: float
-    low: float
+    difference: float  # of the success rates, in -1..1, mean over contexts
+    low: float  # ends of its 95 % interval
     high: float
-    p: float
-    contexts: int
-    seeds: int
-    n: int
+    p: float  # two-sided, of the hypothesis of no difference
+    contexts: int  # that both have
+    seeds: int  # training seeds that both have
+    n: int  # pairs of rollouts behind it
 
 
 def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, errors: bool = False) -> Comparison | None:
@@ -76,14 +67,8 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
     not matter in more than 99 %. The p-value is below 0.05 in 3 to 6 % of cases without a difference where seeds do not
     matter, but in 27 to 32 % where they do: then the interval is what to go by.
 
-    Args:
-        first (mapping): training seed to ``{(context, evaluation seed): success}``.
-        second (mapping): the same of the other method.
-        errors (bool): the outcomes are errors, which have no bounds, instead of successes. Where nothing varies there
-            is then no interval (NaN).
-
-    Returns:
-        Comparison or None: None if the two share nothing. The same arguments always give the same numbers.
+    Either method gives outcomes by training seed. Where these are ``errors``, which have no bounds, a single trajectory
+    has no interval (NaN). None is returned if the two share nothing; the same arguments always give the same numbers.
     """
     shared = {seed: first[seed].keys() & second[seed].keys() for seed in first.keys() & second.keys()}
     seeds = sorted(seed for seed, keys in shared.items() if keys)
@@ -159,17 +144,11 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> list[dict[str, Any]]:
-    """Compares KOAP with every other method at every share of labels.
+    """Compares KOAP with every other method at every share of labels, by the outcomes of each cell's ``run``.
 
-    Args:
-        rows (sequence of mapping): cells; those that are not done take no part.
-        outcomes (mapping): by the ``run`` of a cell its successes, or of a task without an environment its relative
-            action errors, by (context or trajectory, evaluation seed).
-
-    Returns:
-        list: a row of :data:`COMPARISON_COLUMNS` per other method and share, where ``difference`` is KOAP's
-        success minus the other's (or error, trajectory by trajectory in place of contexts), ``p_holm`` is corrected
-        over all rows, ``n`` counts paired rollouts and what cannot be compared is None.
+    A row of :data:`COMPARISON_COLUMNS` per other method and share is returned. ``difference`` is KOAP's success minus
+    the other's (or error, trajectory by trajectory in place of contexts); ``p_holm`` is corrected over all rows; what
+    cannot be compared is None. Cells that are not done take no part.
     """
     groups: dict[tuple, dict[str, dict[int, Outcome]]] = {}
     offline = set()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -30,22 +29,15 @@ _FILE = "study.json"
 # what a later call may add to; all else must be as it was
 _LISTS = ("tasks", "datasets", "planners", "methods", "labels", "levels", "demonstrations")
 _MAY_CHANGE = (*_LISTS, "seeds", "first_seed_only", "out", "run.plugins")
-_EVERY = 1.0  # least time (s) between two writes of the table
 
 
 @dataclass(frozen=True)
 class StudyResult:
-    """What a study found.
+    """What a study found."""
 
-    Args:
-        rows (list of dict): cells as in ``cells.csv``.
-        counts (mapping): how many cells are done, failed and missing.
-        report (Path): the page.
-    """
-
-    rows: list[dict[str, Any]]
-    counts: Mapping[str, int]
-    report: Path
+    rows: list[dict[str, Any]]  # cells as in cells.csv
+    counts: Mapping[str, int]  # how many of them are done, failed and missing
+    report: Path  # the page
 
 
 def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
@@ -196,7 +188,6 @@ class _Table:
         self.study = study
         self.rows: dict[Cell, dict[str, Any]] = {}
         self.outcomes: dict[str, Mapping[tuple[int, int], float]] = {}
-        self._next = 0.0
         for cell in cells:
             self._read(cell, None)
 
@@ -207,15 +198,13 @@ class _Table:
             self.outcomes[cell.folder] = outcomes
 
     def ended(self, cell: Cell, reason: str | None) -> None:
-        """Reads a cell that has just ended; the file is written unless that was done a moment ago."""
+        """Reads a cell that has just ended, and writes the file."""
         self._read(cell, reason)
-        if time.monotonic() >= self._next:
-            self.write()
+        self.write()
 
     def write(self) -> None:
         """Writes the file."""
         write_csv(self.study.out / "cells.csv", CELL_COLUMNS, list(self.rows.values()))
-        self._next = time.monotonic() + _EVERY
 
 
 def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines) -> None:

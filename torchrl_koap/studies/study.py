@@ -288,10 +288,7 @@ def union(one: Sequence[Any], other: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def check_study(study: Study) -> list[Cell]:
-    """Refuses what cannot be done of a complete study without looking at any data; nothing is written.
-
-    Returns:
-        list of Cell: its cells.
+    """Refuses what cannot be done of a complete study without looking at any data, and returns its cells.
 
     Raises:
         ValueError: for unknown names, shares and numbers out of range, and methods whose networks cannot be built.

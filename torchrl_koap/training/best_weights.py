@@ -50,14 +50,7 @@ class BestWeights(nn.Module):
         self.register_buffer("step", torch.tensor(0))
 
     def check(self, step: int) -> dict[str, float]:
-        """Scores the averaged weights after an update and keeps them if they are the best so far.
-
-        Args:
-            step (int): updates done.
-
-        Returns:
-            dict: ``held_out_score``, and :meth:`kept`, for the log.
-        """
+        """Scores the averaged weights after so many updates; keeps the best; returns the score and :meth:`kept`."""
         began, (loss,), (now,) = time.perf_counter(), self._loss, self._now
         now.load_state_dict(loss.target_network_params.flatten_keys(".").to_dict())
         score = self._score(now)

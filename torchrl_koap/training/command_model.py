@@ -20,11 +20,8 @@ SHARE = 16  # updates for each of another controller's, up to UPDATES
 UPDATES, BATCH, RATE, WEIGHT_DECAY = 8000, 512, 2e-3, 1e-4
 
 
-def decoder_columns(task: Task) -> dict[str, Any]:
-    """What a :class:`~torchrl_koap.modules.CommandDecoder` of a task is built with (:func:`build_decoder`).
-
-    ``gripper`` are action column and state column of a gripper whose number is read off planned widths:
-    ``Task.gripper``, or where an absolute action ``name`` has its width in the state, as the part ``name_width``.
+def build_decoder(task: Task) -> CommandDecoder:
+    """Builds the module that tells a task's commands from its state.
 
     Raises:
         ValueError: if its observation does not repeat the last command, no action is a change of it, or nothing tells
@@ -32,8 +29,8 @@ def decoder_columns(task: Task) -> dict[str, Any]:
 
     Examples:
         >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.training.command_model import decoder_columns
-        >>> decoder_columns(get_task("stacking_unobserved_joints"))["commands"]
+        >>> from torchrl_koap.training.command_model import build_decoder
+        >>> build_decoder(get_task("stacking_unobserved_joints")).commands
         [0, 1, 2, 3, 4, 5, 6]
     """
     if task.command is None:
@@ -41,42 +38,27 @@ def decoder_columns(task: Task) -> dict[str, Any]:
             f"task {task.name!r} cannot have its commands regressed: its observation has no part that repeats the last"
             " one (Task.command)"
         )
-    actions = list(task.delta_actions)
+    actions, gripper = list(task.delta_actions), gripper_columns(task)
     if not actions:
         raise ValueError(f"task {task.name!r} needs no commands regressed: its actions are commands, not their changes")
-    gripper = _gripper(task)
     rest = set(range(task.action_dim)) - set(actions) - {gripper[0] if gripper else None}
     if rest:
         names = ", ".join(task.action_names[column] for column in sorted(rest))
         raise ValueError(f"task {task.name!r} cannot have its commands regressed: nothing tells the actions {names}")
-    commands = list(range(task.observation_dim))[task.command_columns]
-    relative = [[_ends(part) for part in (*pair, None, None)[:4]] for pair in task.relative_columns()]
-    return {
-        "state_dim": task.state_dim,
-        "commands": [commands[i] for i in actions],
-        "actions": actions,
-        "gripper": gripper,
-        "relative": relative,
-    }
+    repeated = list(range(task.observation_dim))[task.command_columns]
+    commands, features = [repeated[i] for i in actions], relative_features(task.relative_columns())
+    return CommandDecoder(task.state_dim, commands, actions, action_dim=task.action_dim, features=features)
 
 
-def _gripper(task: Task) -> list[int] | None:
+def gripper_columns(task: Task) -> list[int] | None:
+    """Finds action column and state column of a gripper whose number is read off planned widths.
+
+    These are ``Task.gripper``, or where an absolute action ``name`` has its width in the state, the part ``name_width``.
+    """
     if task.gripper is not None:
         return list(task.gripper)
     widths = [(i, task.state_slices.get(f"{name}_width")) for i, name in enumerate(task.actions)]
     return next(([i, part.start] for i, part in widths if part is not None), None)
-
-
-def build_decoder(columns: dict[str, Any], action_dim: int) -> CommandDecoder:
-    """The module that :func:`decoder_columns` describes, for so many entries of an action."""
-    own = {name: columns[name] for name in ("state_dim", "commands", "actions")}
-    pairs = [[None if part is None else slice(*part) for part in pair] for pair in columns.get("relative", ())]
-    features = relative_features(pairs)
-    return CommandDecoder(**own, action_dim=action_dim, features=features)
-
-
-def _ends(part: slice | None) -> list[int] | None:
-    return None if part is None else [part.start, part.stop]
 
 
 def with_label_commands(labelled: TensorDictBase, data: TensorDictBase, command: slice) -> TensorDictBase:

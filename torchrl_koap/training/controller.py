@@ -33,20 +33,10 @@ _KEYS = ["state", "action", "has_action"]
 def learn_controller(
     task: Task, config: TrainConfig, data: TensorDictBase, *, run: RunDirectory | None = None, logger: Any = None
 ) -> tuple[nn.Module, dict[str, Any]]:
-    """Builds and trains what turns states into actions.
+    """Builds and trains what turns states into actions, from flat data ``[N]`` after the label budget was applied.
 
-    Args:
-        task (Task): the task of the data.
-        config (TrainConfig): nothing left open.
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied, with the whole ``state``.
-
-    Keyword Args:
-        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
-        logger (optional): a TorchRL logger.
-
-    Returns:
-        tuple: the module, and for the summary: last losses ``controller``, ``controller_updates``, what a closed form
-        found ``decoder_fit`` (empty if there is none), and the ``command_ranges`` of the labels.
+    Metrics and checkpoints go to the run, if there is one. Beside the module stand, for the summary, the last losses
+    ``controller``, ``controller_updates``, what a closed form found ``decoder_fit`` and the ``command_ranges``.
     """
     method, loop = get_method(config.method), _Loop(config, run, logger)
     ranges = command_ranges(task, data)  # of labels, not of what a teacher says

@@ -58,12 +58,7 @@ def camera_features(trained: Trained) -> dict[str, str]:
 def write_lerobot_folder(trained: Trained, out: str | Path) -> dict[str, Any]:
     """Writes the folder: weights and task as :meth:`Trained.save`, and the descriptions that LeRobot reads first.
 
-    Args:
-        trained (Trained): a whole policy.
-        out (str or Path): folder to write; what an earlier export wrote there is replaced.
-
-    Returns:
-        dict: the folder, columns and cameras by feature, and the call of ``lerobot-eval`` that runs it.
+    Returns the folder, columns and cameras by feature, and the call of ``lerobot-eval`` that runs it.
 
     Raises:
         FileExistsError: if the folder holds another ``config.json``, such as that of the run.

@@ -42,7 +42,7 @@ from torchrl_koap.modules import (
 )
 from torchrl_koap.objectives import ActionLoss, DiffusionPolicyLoss, KOAPLoss, QuantizedDynamicsLoss, VariationalLoss
 from torchrl_koap.runs.plugins import load_entry_points
-from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, decoder_columns, fit_decoder
+from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, fit_decoder
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.networks import build_sampler
 from torchrl_koap.training.response import fit_response, tracked_columns
@@ -64,7 +64,7 @@ def _fit_response(response, data, updates):
 
 
 def _command_decoder(task, columns, normalizers, preset):
-    return build_decoder(decoder_columns(task), task.action_dim)
+    return build_decoder(task)
 
 
 def _fit_command_decoder(decoder, data, updates):

@@ -56,41 +56,24 @@ def tracked_columns(task: Task) -> dict[str, Any]:
 
 
 class LabelledSteps(NamedTuple):
-    """Steps ``[n]`` whose commands are known, in the order of time.
+    """Steps whose commands are known, in the order of time."""
 
-    Args:
-        coordinates (Tensor): what the model reads ``[n, J, f]``.
-        steps (Tensor): what followed ``[n, J]``.
-        segment (Tensor): number of the unbroken stretch that each one lies in ``[n]``.
-        known (Tensor): the command itself is known, not its changes alone, bool ``[n]``.
-        row (Tensor): where it is in the data ``[n]``.
-    """
-
-    coordinates: Tensor
-    steps: Tensor
-    segment: Tensor
-    known: Tensor
-    row: Tensor
+    coordinates: Tensor  # what the model reads [n, J, f]
+    steps: Tensor  # what followed [n, J]
+    segment: Tensor  # number of the unbroken stretch that each one lies in [n]
+    known: Tensor  # whether the command itself is known, not its changes alone [n]
+    row: Tensor  # where it is in the data [n]
 
 
 class Stretches(NamedTuple):
-    """Stretches of labelled steps of equal length ``N``, to predict the measured positions of.
+    """Stretches of labelled steps of equal length ``N``, to predict the measured positions of."""
 
-    Args:
-        positions (Tensor): measured before each ``[n, memory + 1, J]``, the present one last.
-        command (Tensor): the last command ``[n, J]``.
-        changes (Tensor): that led to it ``[n, memory, J]``.
-        future (Tensor): changes of the command to come ``[n, N, J]``.
-        measured (Tensor): positions to come ``[n, N, J]``.
-        known (Tensor): whether the command itself is known, or counted from an unknown place, bool ``[n]``.
-    """
-
-    positions: Tensor
-    command: Tensor
-    changes: Tensor
-    future: Tensor
-    measured: Tensor
-    known: Tensor
+    positions: Tensor  # measured before each [n, memory + 1, J], the present one last
+    command: Tensor  # the last one [n, J]
+    changes: Tensor  # that led to it [n, memory, J]
+    future: Tensor  # changes of the command to come [n, N, J]
+    measured: Tensor  # positions to come [n, N, J]
+    known: Tensor  # whether the command itself is known, or counted from an unknown place [n]
 
 
 Rows = TypeVar("Rows", LabelledSteps, Stretches)

@@ -23,7 +23,7 @@ from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryE
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task, get_task, task_from_config
 from torchrl_koap.tasks.registry import plain_task
-from torchrl_koap.training.command_model import decoder_columns
+from torchrl_koap.training.command_model import gripper_columns
 from torchrl_koap.training.datasets import label_budget, load_demonstrations
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
@@ -208,7 +208,7 @@ class Trained:
         missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
         if self.method.plans and missing:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
-        gripper = decoder_columns(self.task)["gripper"] if isinstance(self.controller, CommandDecoder) else None
+        gripper = gripper_columns(self.task) if isinstance(self.controller, CommandDecoder) else None
         ranges = self.results.get("command_ranges")
         if ranges is None and execution.limits != math.inf:
             warnings.warn(

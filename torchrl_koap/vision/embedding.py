@@ -33,22 +33,13 @@ HELD_OUT = 10  # one trajectory in so many judges them
 
 @dataclass(frozen=True)
 class CameraReport:
-    """How well embeddings hold what a camera saw.
+    """How well embeddings hold what a camera saw."""
 
-    Args:
-        size (tuple of int): height and width of its frames.
-        components (int): columns of an embedding.
-        kept (float): share of the variance of the features that they keep, on trajectories that they were not fitted
-            to.
-        error (float): what reconstructed features are off, over the features' spread.
-        rate (float): frames that were embedded in a second; NaN where all of them had been before.
-    """
-
-    size: tuple[int, int]
-    components: int
-    kept: float
-    error: float
-    rate: float
+    size: tuple[int, int]  # height and width of its frames
+    components: int  # columns of an embedding
+    kept: float  # share of the features' variance, on trajectories that components were not fitted to
+    error: float  # what reconstructed features are off, over the features' spread
+    rate: float  # frames that were embedded in a second; NaN where all of them had been before
 
     def __str__(self) -> str:
         speed = "embedded before" if np.isnan(self.rate) else f"{self.rate:.0f} frames a second"
@@ -59,11 +50,9 @@ class CameraReport:
 
 
 def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Recordings, Task]:
-    """Reads data sets with camera frames as one, and the task that they are of.
+    """Reads data sets with camera frames as one: what ``koap convert`` wrote, or where a task is given any recordings.
 
-    Args:
-        sources (sequence of str or Path): what ``koap convert`` wrote; where a task is given, any recordings.
-        task (Task, optional): a task that has the embeddings among its columns. Default: that of the first source.
+    The task has the embeddings among its columns; without one it is that of the first source.
 
     Raises:
         DataError: if the columns of two sources differ, or one is not converted.
@@ -115,21 +104,12 @@ def embed_recordings(
     A camera that is a part of the task's observation fills it. Embeddings of any other one are further columns, which
     are not the robot's. Features lie in ``out/unfinished`` until all is done, so that the same call goes on.
 
-    Args:
-        recordings (Recordings): with the columns of the task that are no embeddings.
-        task (Task): what they are of.
-        out (str or Path): folder to write.
-
     Keyword Args:
         cameras (sequence of str): which of them. Default: all.
         network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`.
-        components (int): principal components per camera, fitted to frames of nine trajectories in ten; a part of the
-            task has its own number.
+        components (int): per camera, fitted to frames of nine trajectories in ten; a part of the task has its own.
         projection (Projection, optional): take this one instead of fitting; for a single camera.
         progress (callable, optional): called with the number of frames that are done, and that of all.
-
-    Returns:
-        dict: how well the embeddings of every camera hold its frames.
 
     Raises:
         DataError: if there are no frames, or some are missing, damaged or unlike the others; camera, trajectory and
