@@ -53,7 +53,7 @@ def build_decoder(task: Task) -> CommandDecoder:
 def gripper_columns(task: Task) -> list[int] | None:
     """Finds action column and state column of a gripper whose number is read off planned widths.
 
-    These are ``Task.gripper``, or where an absolute action ``name`` has its width in the state, the part ``name_width``.
+    These are ``Task.gripper``, or of an absolute action ``name`` whose width is the part ``name_width`` of the state.
     """
     if task.gripper is not None:
         return list(task.gripper)
