@@ -120,13 +120,6 @@ def test_recorded_folders_give_the_same(tmp_path, data):
     assert torch.equal(load_demonstrations(str(tmp_path), TASK)["action"], data["action"])
 
 
-def test_missing_and_empty_folders_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="'nowhere' is no folder"):
-        load_demonstrations("nowhere", TASK)
-    with pytest.raises(FileNotFoundError, match=f"no demonstrations .* in {tmp_path}"):
-        load_demonstrations(str(tmp_path), TASK)
-
-
 def test_a_call_without_data_names_both_commands():
     with pytest.raises(
         ValueError, match="koap demos --task sorting --out DEMOS.*koap train --task sorting --dataset DEMOS"

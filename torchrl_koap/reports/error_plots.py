@@ -24,7 +24,7 @@ from torchrl_koap.reports.style import (
     RED,
     WARNING,
     entry,
-    legend_beside,
+    place_legend,
     set_title,
     tidy,
 )
@@ -162,7 +162,7 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
         each = " ".join(filter(None, (shown[index], "" if name in absolute else "per step")))
         axes.set_xlabel(f"recorded {name} ({each})" if each else f"recorded {name}")
         axes.set_ylabel(f"predicted {name} ({each})" if each else f"predicted {name}")
-        set_title(axes, f"{name}: RMSE {_rms(error[:, index]):.3g} {shown[index]}".rstrip())
+        set_title(axes, f"{name}: RMSE {np.sqrt(np.square(error[:, index]).mean()):.3g} {shown[index]}".rstrip())
     title = f"{len(true):,} steps of demonstrations outside the label budget, for evaluation only"
     figure.suptitle(title, fontsize=10, color=WARNING, x=0.01, ha="left")
     return figure
@@ -179,10 +179,6 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
     axes.yaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
     tidy(axes)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.square(values).mean()))
 
 
 @picture(
@@ -220,7 +216,7 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     each = f", {1e3 / run.control_hz:.0f} ms each" if run.control_hz else ""
     for axes in panels[-1]:
         axes.set_xlabel(f"planned step{each}")
-    legend_beside(panels[0, 1])
+    place_legend(panels[0, 1])
     return figure
 
 
@@ -252,7 +248,7 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     handles = [Line2D([], [], color=color, linewidth=6, label=label) for label, color in _ACTIONS.values()]
     if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
         handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
-    legend_beside(panels[0, -1], handles=handles)
+    place_legend(panels[0, -1], handles=handles)
     return figure
 
 

@@ -17,7 +17,7 @@ from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy
 from torchrl_koap.lookup import resolve
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, GREY, INK, SUCCESS, entry, legend_beside, tidy
+from torchrl_koap.reports.style import BLUE, GREY, INK, SUCCESS, entry, place_legend, tidy
 from torchrl_koap.tasks import Modes
 
 _LISTED = 10  # modes of a single choice that have wide bars with their names below
@@ -57,7 +57,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         level = np.bincount(reference, minlength=number) * len(mode) / len(reference)
         label = f"{len(reference)} demonstrations, scaled"
         axes.hlines(level, places - 0.46, places + 0.46, color=INK, linewidth=1.3, zorder=3, label=label)
-        legend_beside(axes)
+        place_legend(axes)
     axes.set_ylabel("successful rollouts")
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.set_ylim(0, 1.2 * max(1, axes.dataLim.y1))
@@ -66,7 +66,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         axes.set_xticks(places, [name.split()[-1] for name in names] * (number // len(names)))
         for group in range(number // len(names)):
             middle = places[group * len(names) : (group + 1) * len(names)].mean()
-            text = _group_name(modes, group)
+            text = Modes(modes.choices[:-1]).name_of(group).replace(", ", " / ")  # of all choices but the last
             axes.annotate(text, (middle, 0), (0, -22), textcoords="offset points", ha="center", size=8.5, color=INK)
         axes.set_xlabel(" / ".join(name for name, _ in heads) + f", and above it {last}", labelpad=19)
     else:
@@ -114,8 +114,3 @@ def mode_colors(modes: Modes) -> np.ndarray:
 def color_of_mode(mode: int, colors: np.ndarray) -> Any:
     """Returns the colour of a mode, grey for -1: it is not decided."""
     return colors[mode] if 0 <= mode < len(colors) else GREY
-
-
-def _group_name(modes: Modes, group: int) -> str:
-    """Names of all choices but the last, for a group of modes that share them."""
-    return Modes(modes.choices[:-1]).name_of(group).replace(", ", " / ")

@@ -56,13 +56,9 @@ def set_title(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
 
 
-def legend_beside(axes: Axes, **options: Any) -> None:
-    """Puts the legend to the right of a panel, with further options of ``Axes.legend``."""
+def place_legend(axes: Axes, *, below: float | None = None, **options: Any) -> None:
+    """Puts the legend right of a panel, or ``below`` it by a share of its height; options are of ``Axes.legend``."""
     place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
-    axes.legend(**({"frameon": False, "fontsize": 8} | place | options))
-
-
-def legend_below(axes: Axes, offset: float, **options: Any) -> None:
-    """Puts the legend below a panel by a share of its height, in two columns, with further options as above."""
-    place = {"loc": "upper center", "bbox_to_anchor": (0.5, -offset), "ncols": 2}
+    if below is not None:
+        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -below), "ncols": 2}
     axes.legend(**({"frameon": False, "fontsize": 8} | place | options))

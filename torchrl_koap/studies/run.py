@@ -79,7 +79,8 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         whole = _together(study)
         root.write_json(_FILE, to_json(replace(whole, out=Path())))
         asked = set(cells)
-        earlier = [cell for cell in whole.cells() if cell not in asked and _began(study.out / cell.folder)]
+        folders = {cell: study.out / cell.folder for cell in whole.cells() if cell not in asked}
+        earlier = [cell for cell, folder in folders.items() if (folder / "log.txt").exists() or folder.is_file()]
         table = _Table(study, [*cells, *earlier])
         _work(study, cells, table, machines or Machines())
         table.write()
@@ -235,10 +236,6 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
                 bar.set_postfix_str(job.folder.name + (" FAILED" if reason else ""))
                 if job.folder in places:
                     table.ended(places[job.folder], reason)
-
-
-def _began(folder: Path) -> bool:
-    return (folder / "log.txt").exists() or folder.is_file()
 
 
 def _is_trained(folder: Path) -> bool:

@@ -40,7 +40,7 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_planner
 from torchrl_koap.training.planner import learn_planner
 from torchrl_koap.training.trained import Trained, build_networks, facts_of
-from torchrl_koap.vision import Projection, cameras_of
+from torchrl_koap.vision import cameras_of
 
 
 def train(config: TrainConfig, *, command: str | None = None, planner_only: bool = False) -> Trained:
@@ -113,7 +113,9 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         covers, short = plan_coverage(used, task.control_hz)
         if short is not None:
             warnings.warn(short, stacklevel=2)
-        cameras = _cameras(run, config)
+        cameras = cameras_of(config.dataset)
+        for name, projection in cameras.items():
+            projection.save(run.path / CAMERAS / f"{name}.safetensors")
         began = time.perf_counter()
         with open_logger(config.run.logger, config.out) as logger:
             torch.manual_seed(config.run.seed)
@@ -140,14 +142,6 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         save_tensors(run.path / "demonstrations.safetensors", _drawn(task, used.cpu()))
         run.write_json("summary.json", summary)
     return Trained(task, config, planner, controller, summary, tuple(held_out), run.path, cameras)
-
-
-def _cameras(run: RunDirectory, config: TrainConfig) -> dict[str, Projection]:
-    """Copies the projections that lie beside the data into the run."""
-    cameras = cameras_of(config.dataset)
-    for name, projection in cameras.items():
-        projection.save(run.path / CAMERAS / f"{name}.safetensors")
-    return cameras
 
 
 def _frames(task: Task, config: TrainConfig) -> tuple[int, int]:
