@@ -71,11 +71,8 @@ def test_the_part_that_fails_is_named(shares, words):
 
 
 def test_more_labels_are_not_proposed_where_the_planner_fails():
-    numbers = {
-        "config": {"method": "koap"},
-        "summary": {"labels": {"labelled_transitions": 80}},
-        "evaluation": rates(0.5),
-    }
+    numbers = {"summary": {"labels": {"labelled_transitions": 80}}, "evaluation": rates(0.5)}
+    numbers["config"] = {"method": "koap"}
     assert "koap suggest {run} --count 5" in commands(**numbers)
     assert "koap suggest {run} --count 5" not in commands(**numbers, inspection=inspected(0.6, 0.9, 0.5))
 

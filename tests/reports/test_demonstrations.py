@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +34,9 @@ def test_demonstrations_with_objects():
 
 def test_columns_over_time_where_there_is_no_environment():
     names = tuple(f"q{index}" for index in range(14))
-    arm = Task(
-        name="arm",
-        observation_parts={"joints": names},
-        observation_units=("rad",) * 14,
-        actions={"a": Action("rad")},
-        position="joints",
-        control_hz=10.0,
-    )
+    parts, acting = {"joints": names}, {"a": Action("rad")}
+    arm = Task(name="arm", observation_parts=parts, actions=acting, position="joints", control_hz=10.0)
+    arm = replace(arm, observation_units=("rad",) * 14)
     data = make_demonstrations() | {"state": np.random.rand(40, 14)}
     figure = draw_demonstrations(data, RunFacts(Path("run"), arm))
     assert titles(figure) == [f"{name} (rad)" for name in names[:12]]

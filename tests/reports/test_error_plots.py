@@ -19,15 +19,8 @@ NOTHING = run_of(None)
 
 def test_losses_get_a_panel_each_and_zero_is_said():
     names = ("step", "loss_planner", "loss_action", "loss_new_term", "loss_koopman", "learning_rate")
-    rows = [
-        dict(zip(names, row, strict=True))
-        for row in (
-            ("1", "1.0", "", "", "", "1"),
-            ("2", "0.1", "", "", "", "1"),
-            ("3", "", "0", "4", "", "1"),
-            ("4", "", "0", "2", "", "1"),
-        )
-    ]
+    logged = ("1 1.0 - - - 1", "2 0.1 - - - 1", "3 - 0 4 - 1", "4 - 0 2 - 1")
+    rows = [dict(zip(names, row.replace("-", "").split(" "), strict=True)) for row in logged]
     figure = draw_losses(rows, NOTHING)
     assert titles(figure) == ["planner", "action decoder (labelled steps)", "new term"]
     planner, action, _ = figure.axes

@@ -129,12 +129,8 @@ def test_earlier_picture_survives_a_failure(tmp_path, monkeypatch):
 
 def test_every_picture_has_words_and_a_command():
     for item in PICTURES.values():
-        assert (
-            item.title
-            and len(item.caption_for(RunFacts(Path("run")))) > 40
-            and item.made_by.startswith("koap ")
-            and "{run}" in item.made_by
-        )
+        assert item.title and len(item.caption_for(RunFacts(Path("run")))) > 40
+        assert item.made_by.startswith("koap ") and "{run}" in item.made_by
 
 
 def test_drawing_needs_neither_training_nor_simulator():
@@ -148,9 +144,5 @@ def test_drawing_needs_neither_training_nor_simulator():
 
 
 def test_units():
-    assert [thousandths(unit) for unit in ("m", "rad", "", "N m")] == [
-        ("mm", 1e3),
-        ("mrad", 1e3),
-        ("", 1.0),
-        ("N m", 1.0),
-    ]
+    found = [thousandths(unit) for unit in ("m", "rad", "", "N m")]
+    assert found == [("mm", 1e3), ("mrad", 1e3), ("", 1.0), ("N m", 1.0)]

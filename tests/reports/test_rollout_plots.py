@@ -115,11 +115,8 @@ def test_plans_over_time_where_nobody_knows_a_plane():
     hand = ROLLOUTS | {"column": np.array([2, 1]), "state": state, "state_plan": plan}
     figure = draw_plans(hand, run)
     assert len(figure.axes) == 6 and [axes.get_ylabel() for axes in figure.axes[::3]] == ["palm", "finger (rad)"]
-    assert [axes.get_title(loc="left") for axes in figure.axes[:3]] == [
-        "episode 2: out of time",
-        "episode 3: collision",
-        "episode 0: success",
-    ]
+    heads = [axes.get_title(loc="left") for axes in figure.axes[:3]]
+    assert heads == ["episode 2: out of time", "episode 3: collision", "episode 0: success"]
     np.testing.assert_allclose(figure.axes[5].lines[0].get_ydata(), state[0, :, 1])
     planned = figure.axes[5].collections[0].get_segments()[0]
     np.testing.assert_allclose(planned, np.stack([np.arange(1, 15), state[0, 1:15, 1]], 1))

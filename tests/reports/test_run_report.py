@@ -142,14 +142,8 @@ def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path, monke
 
 
 def test_odd_values_do_not_stop_the_report(tmp_path):
-    odd = {
-        "rates": {"success": {"rate": None}, "half": 3},
-        "episodes": "many",
-        "mode_entropy": float("nan"),
-        "control_hz": [],
-        "episode": "none",
-    }
-    (tmp_path / "eval.json").write_text(json.dumps(odd | {"plan_ms": "x"}))
+    odd = {"rates": {"success": {"rate": None}, "half": 3}, "episodes": "many", "mode_entropy": float("nan")}
+    (tmp_path / "eval.json").write_text(json.dumps(odd | {"control_hz": [], "episode": "none", "plan_ms": "x"}))
     (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "train_seconds": 12.0}))
     page = Page(write_report(tmp_path))
     assert "not a number" in page.text

@@ -33,18 +33,10 @@ def test_nothing_is_left_open_and_a_second_pass_changes_nothing(task):
 
 
 class TestTheTasksMethod:
-    @pytest.mark.parametrize(
-        "task, method",
-        [
-            ("avoiding", "koap"),
-            ("stacking", "mpc"),
-            ("stacking_1", "mpc"),
-            ("stacking_unobserved_joints", "command_regression"),
-        ],
-    )
-    def test_is_trained_unless_another_is_asked_for(self, task, method):
-        assert resolved(task).method == method
-        assert resolved(task, "linear").method == "linear"
+    def test_is_trained_unless_another_is_asked_for(self):
+        own = {"avoiding": "koap", "stacking": "mpc", "stacking_1": "mpc"}
+        for task, method in (own | {"stacking_unobserved_joints": "command_regression"}).items():
+            assert resolved(task).method == method and resolved(task, "linear").method == "linear"
 
 
 class TestTheTasksPreset:
@@ -71,13 +63,8 @@ class TestThePlanner:
         aligning, named = (
             resolved("aligning", planner=PlannerConfig(network=network)).planner for network in (None, "unet")
         )
-        assert (aligning.network, aligning.width, aligning.batch_size, aligning.learning_rate) == (
-            "mlp",
-            512,
-            512,
-            1e-3,
-        )
-        assert (named.network, named.width, named.batch_size, named.learning_rate) == ("unet", 64, 128, 3e-3)
+        found = [(each.network, each.width, each.batch_size, each.learning_rate) for each in (aligning, named)]
+        assert found == [("mlp", 512, 512, 1e-3), ("unet", 64, 128, 3e-3)]
         assert named.steps == aligning.steps == 8000 and named.frames == aligning.frames == 1
         assert resolved(planner=PlannerConfig(network="mlp")).planner.width == 512
         assert resolved("stacking", planner=PlannerConfig(width=64)).planner.width == 64

@@ -37,15 +37,11 @@ def same(first, second):
 def test_an_entry_holds_together(name):
     method = METHODS[name]
     assert method.title and len({other.title for other in METHODS.values()}) == len(METHODS)
-    assert method.name == name
     assert method.plans or not method.closed_form
-    assert not method.teacher or METHODS[method.teacher].plans
     if method.plans:
         # every method has at most one controller's budget of updates, whatever it does with it
         assert sum(phase.share for phase in method.phases) == (1 if method.phases else 0)
         assert bool(method.phases) or method.closed_form or method.fit is not None
-        assert len({phase.name for phase in method.phases}) == len(method.phases)
-    assert {phase.windows for phase in method.phases} <= {"all", "mixed", "labelled"}
     if method.sees == "labelled":
         assert {phase.windows for phase in method.phases} == {"labelled"}
 

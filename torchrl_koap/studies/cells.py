@@ -58,11 +58,7 @@ class Cell:
 
 
 def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | None) -> None:
-    """Writes what is asked of a cell, or without an evaluation of a shared planner, before its work begins.
-
-    Raises:
-        RunDirectoryError: if something else was asked of it before.
-    """
+    """Writes what is asked of a cell, or of a shared planner, before its work begins; refuses another request."""
     run = RunDirectory(folder)
     if (folder / ASKED).exists():
         changed = changed_options(read_asked(folder)[0], config)
@@ -74,11 +70,7 @@ def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | Non
 
 
 def read_asked(folder: Path) -> tuple[TrainConfig, EvalConfig | None]:
-    """Reads what is asked of a cell.
-
-    Raises:
-        RunDirectoryError: if ``cell.json`` is not there or damaged.
-    """
+    """Reads what is asked of a cell; names a ``cell.json`` that is not there or damaged."""
     content, path = RunDirectory(folder).read_json(ASKED), folder / ASKED
     if set(content) != {"train", "evaluation"}:
         raise RunDirectoryError(f"{path} is damaged: wanted the entries 'train' and 'evaluation'")

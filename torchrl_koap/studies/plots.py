@@ -125,9 +125,7 @@ def plot_average(
     """Draws success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
 
     By method ``averages`` has level, mean and the ends of its interval, the ``paper`` level and mean, all in 0..1.
-
-    Raises:
-        ValueError: if there is nothing to draw.
+    Nothing to draw is an error.
     """
     if not averages:
         raise ValueError("there is nothing to average: no method is done at a level in every task")

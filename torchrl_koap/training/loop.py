@@ -84,11 +84,9 @@ def train_phase(
         target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
         best (BestWeights, optional): scores the averages, keeps the best and ends the training early.
         run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
-        logger (optional): a TorchRL logger; scalars are named ``phase/term``.
-        log_every (int): updates per row of the log.
+        logger (optional): a TorchRL logger; scalars are named ``phase/term``, a row every ``log_every`` updates.
         checkpoint_every (int, optional): updates per checkpoint. Default: 500.
-        resume (bool): go on from the checkpoint of this phase, if there is one. On a CPU the outcome equals that of an
-            uninterrupted run bit for bit.
+        resume (bool): go on from the checkpoint of this phase, if there is one, on a CPU bit for bit.
         progress (callable, optional): called with the number of updates done and the last logged values.
 
     Returns:

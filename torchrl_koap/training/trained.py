@@ -68,14 +68,10 @@ class Trained:
 
     @classmethod
     def load(cls, where: str | Path, *, plugins: Sequence[str] = ()) -> Trained:
-        """Loads a finished run, or a file of :meth:`save`; the plugins of a run are imported first.
+        """Loads a run directory, ``"pretrained:NAME"``, or a file of :meth:`save`.
 
-        Args:
-            where (str or Path): run directory, ``"pretrained:NAME"``, or a file.
-
-        Keyword Args:
-            plugins (sequence of str): modules that register the task or method, or hold the network that embeds frames;
-                a file cannot have them imported itself.
+        Plugins are modules that register the task or method, or hold the network that embeds frames. Those of a run are
+        imported first; a file cannot have them imported itself.
 
         Raises:
             RunDirectoryError: if the folder is no finished run.
@@ -133,10 +129,7 @@ class Trained:
         return cls(task, config, planner, controller, results, folder=path, cameras=cameras)
 
     def save(self, path: str | Path) -> Path:
-        """Writes networks and options to one file, from which :meth:`load` makes the same without any data.
-
-        Args:
-            path (str or Path): file to write, such as ``"policy.safetensors"``; replaced in one step.
+        """Writes networks and options to one file, in one step, from which :meth:`load` makes the same without data.
 
         Raises:
             IsADirectoryError: if the path is a folder.
