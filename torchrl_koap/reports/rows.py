@@ -20,19 +20,12 @@ _NOT_MEASURED = "not measured"
 
 @dataclass(frozen=True)
 class Row:
-    """A result and what it is to be compared with.
+    """A result and what it is to be compared with."""
 
-    Attributes:
-        name: what was measured.
-        value: the result, with its unit.
-        note: what to compare it with, and how it was measured.
-        bar: share and ends of its interval in percent, if it is a share.
-    """
-
-    name: str
-    value: str
-    note: str = ""
-    bar: tuple[float, ...] | None = None
+    name: str  # what was measured
+    value: str  # the result, with its unit
+    note: str = ""  # what to compare it with, and how it was measured
+    bar: tuple[float, ...] | None = None  # share and ends of its interval in percent, if it is a share
 
 
 def as_text(rows: Iterable[Row]) -> dict[str, str]:

@@ -159,7 +159,6 @@ def draw_starts(axes: Axes, contexts: Any, bodies: Sequence[Body]) -> None:
 
     The far side of a body whose orientation matters is thick; of more than 20 only the centres are drawn, each with a
     line to its far side.
-
     """
     contexts = entry({"context": contexts}, "context", [None, len(bodies), 3]).astype(float)
     many = len(contexts) > MANY

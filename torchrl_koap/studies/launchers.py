@@ -96,16 +96,11 @@ class Machines:
 def launch(
     function: Callable[[str], None], jobs: Sequence[Job], machines: Machines
 ) -> Generator[tuple[Job, str | None], None, None]:
-    """Calls a function in every job's folder, each in a process of its own; yields jobs as they end.
+    """Calls a function in every job's folder, each in a process of its own; yields jobs as they end, and why they fail.
 
     The function is one of a module, of a folder. Jobs that come first are started first; one whose need failed is not
-    run and fails too. Closing the iterator stops what is running.
-
-    Yields:
-        tuple: a job, and why it failed, None if it did not.
-
-    Raises:
-        ValueError: for two jobs of one folder, or a need that is no job that comes before.
+    run and fails too. Two jobs of one folder, or a need that is no job before, are refused. Closing the iterator stops
+    what is running.
     """
     known: set[Path] = set()
     for job in jobs:

@@ -176,11 +176,7 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
 
 
 def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
-    """Draws success averaged over tasks against the label level; tasks' default methods together have a line too.
-
-    Raises:
-        ValueError: if there is no level at which a method is done in every task.
-    """
+    """Draws success averaged over tasks against the label level; tasks' default methods together have a line too."""
     if len({entry.method for entry in entries if default_entries([entry])}) > 1:  # the paper's line is koap's own
         entries = [*(replace(entry, paper=None) for entry in default_entries(entries)), *entries]
     averages = average_over_tasks(entries)
@@ -196,10 +192,8 @@ def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Writes ``paper_table.md`` and the picture of success averaged over several tasks into a folder.
 
-    Returns:
-        dict: ``rows`` of the table, a ``sentence`` on KOAP and the paper's, and ``picture``, the path of the picture
-        below the folder, None if there is nothing to average. Nothing is written, and no rows are returned, if no cell
-        lies at a label level.
+    Returned are the table's ``rows``, a ``sentence`` on KOAP and the paper's, and the path of the ``picture``, None
+    without anything to average. If no cell lies at a label level nothing is written.
     """
     folder, entries = Path(folder), paper_entries(rows)
     table = layout_rows(entries)

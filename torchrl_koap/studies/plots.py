@@ -80,10 +80,7 @@ def plot_measure(
     The measure is one of :data:`MEASURES`, in a ``unit``; the horizontal axes are of :data:`AXES`, labels counted in
     ``label_unit``. Along ``"demonstrations"`` there is a line per method and share of labels that was run with several
     of them. The ``paper`` has by method shares of the labels and successes: hollow and dashed, along ``"labels"``
-    alone. ``methods`` are all of them in the order that gives the colours.
-
-    Raises:
-        ValueError: if no cell has the measure, or an error is not above 0.
+    alone. ``methods`` are all of them in the order that gives the colours. Nothing to draw is an error.
     """
     head, title, factor = MEASURES[measure]
     panels = {name: _lines(summaries, name, measure, factor, methods) for name in by}

@@ -76,9 +76,6 @@ def write_study_report(
 
     Rows are cells of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`, outcomes those of
     :func:`~torchrl_koap.studies.paired_comparison.compare_cells`; the page shows the options of the study.
-
-    Raises:
-        ValueError: if a cell occurs twice.
     """
     folder, summaries = Path(folder), summarise(rows)
     compared = compare_cells(rows, outcomes or {})

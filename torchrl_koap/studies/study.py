@@ -162,11 +162,7 @@ class Study:
         )
 
     def cells(self) -> list[Cell]:
-        """Lists the cells of a complete study in the order asked for; repeated names count once.
-
-        Raises:
-            ValueError: for unknown methods, or a share or level that there is not.
-        """
+        """Lists the cells of a complete study in the order asked for; repeated names count once."""
         for name in self.methods:
             get_method(name)
         for name, shares in (("labels", self.labels), ("demonstrations", self.demonstrations)):
@@ -230,13 +226,7 @@ def _of_task(values: Sequence[str], task: str) -> str | None:
 
 
 def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
-    """Fills in what preset and library know, and the plugins of earlier calls in the folder; paths become absolute.
-
-    Raises:
-        ValueError: for an unknown preset or task, or a data set that is no folder.
-        RunDirectoryError: if a planner is no run.
-        PluginError: if a plugin cannot be imported.
-    """
+    """Fills in what preset and library know, and the plugins of earlier calls in the folder; paths become absolute."""
     plugins = union(plugins, study.run.plugins)
     load_plugins(plugins)
     usual = USUAL | ({} if study.preset is None else lookup(PRESETS, study.preset, "preset"))
@@ -288,11 +278,7 @@ def union(one: Sequence[Any], other: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def check_study(study: Study) -> list[Cell]:
-    """Refuses what cannot be done of a complete study without looking at any data, and returns its cells.
-
-    Raises:
-        ValueError: for unknown names, shares and numbers out of range, and methods whose networks cannot be built.
-    """
+    """Refuses what cannot be done of a complete study without looking at any data, and returns its cells."""
     for name, number in (("seeds", study.seeds), ("record", study.record)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be >= 1, got {number}")

@@ -76,11 +76,7 @@ class Summary:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Writes rows as csv, aside first; what a row lacks, and what is not a finite number, stays empty.
-
-    Raises:
-        ValueError: for another column than those named.
-    """
+    """Writes rows as csv, aside first; what a row lacks, and what is not a finite number, stays empty."""
     with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
@@ -100,10 +96,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
     The Wilson interval takes every episode for independent. The same contexts recur for every seed, so it is too narrow
     where seeds differ more than chance: look at the range of the seeds beside it.
 
-    Cells have at least task, method, labels, seed and status.
-
-    Raises:
-        ValueError: if a cell occurs twice.
+    Cells have at least task, method, labels, seed and status; one that occurs twice is an error.
     """
     groups: dict[tuple, dict[int, Mapping[str, Any]]] = {}
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]

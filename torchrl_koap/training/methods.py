@@ -93,8 +93,6 @@ _LABELS = (Phase("controller", ActionLoss, "labelled"),)
 _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
 # the decoder that is fitted afterwards, on a frozen encoder
 _DECODER = Phase("decoder", partial(ActionLoss, freeze_latents=True), "labelled", share=0.5)
-
-
 _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
 
 _ANY_PRESET = tuple(PRESETS)
