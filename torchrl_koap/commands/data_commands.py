@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shlex
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,18 +176,19 @@ class Convert(Command):
 
     def __call__(self) -> dict[str, Any]:
         """Reads, checks and writes."""
-        if self.max_steps is not None and self.max_steps < 1:
-            raise ValueError(f"max_steps must be >= 1, got {self.max_steps}")
         return self._bring_in() if self.to is None else self._take_out(self.to)
 
     def _bring_in(self) -> dict[str, Any]:
         """Recordings become a data set of this library."""
         if stored_folder(self.source) is not None:
-            raise ValueError(f"{self.source} is a data set of this library already: name another format with --to")
+            again = " (and convert that with the roles of its columns)" if self.resample is not None else ""
+            raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
         recordings = self._read()
-        folder = save_demonstrations(self.out, recordings, **self._given(_DESCRIBING))
+        with warnings.catch_warnings(record=True) as unlikely:
+            warnings.simplefilter("always")
+            folder = save_demonstrations(self.out, recordings, **self._given(_DESCRIBING))
         data, task = open_dataset(folder)
         origin = zip(task.observation_names, task.observation_origin, strict=False)
         return {
@@ -199,7 +201,7 @@ class Convert(Command):
             "skipped": ", ".join(recordings.skipped) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],
-            **_warnings(data, task, recordings.sources),
+            **_numbered([str(warning.message) for warning in unlikely], data),
             "next": _next(folder, task, recordings),
         }
 
@@ -257,7 +259,7 @@ class Validate(Command):
         with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
             data = validate(open_dataset(self.dataset, task=task, progress=count_up_to(bar))[0])
         files = [] if stored_folder(self.dataset) else find_raw_files(CONVERTERS[task.source], self.dataset)
-        warnings = _warnings(data, task, list(map(str, files)))
+        found = _numbered(find_warnings(data, task, list(map(str, files))), data)
         lengths = data["episode"].unique(return_counts=True)[1]
         labels = int(data["has_action"].sum())
         return {
@@ -266,8 +268,8 @@ class Validate(Command):
             "labelled steps": str(labels) if labels else "none: `koap train` needs a few",
             "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
             "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
-            **warnings,
-            "result": f"no problem found, {len(warnings)} warning(s)" if warnings else "no problem found",
+            **found,
+            "result": f"no problem found, {len(found)} warning(s)" if found else "no problem found",
         }
 
 
@@ -290,9 +292,8 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
     }
 
 
-def _warnings(data: TensorDictBase, task: Task, names: Sequence[str]) -> dict[str, str]:
+def _numbered(found: list[str], data: TensorDictBase) -> dict[str, str]:
     """What is unlikely in data, numbered."""
-    found = find_warnings(data, task, names)
     if not data["has_action"].any():
-        found.insert(0, "no recording has actions: a planner can be trained, a policy cannot")
+        found = ["no recording has actions: a planner can be trained, a policy cannot", *found]
     return {f"warning {number}": warning for number, warning in enumerate(found, 1)}

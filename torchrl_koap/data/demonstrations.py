@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from itertools import groupby
@@ -16,12 +17,12 @@ from tensordict import TensorDict
 
 from torchrl_koap.data.formats.columns import unknown
 from torchrl_koap.data.formats.kinds import kind_of
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings, wrong_rate
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
-from torchrl_koap.data.quality import constant_columns
+from torchrl_koap.data.quality import constant_columns, find_warnings
 from torchrl_koap.data.ted import save_ted
-from torchrl_koap.data.trajectories import flatten_trajectories
-from torchrl_koap.files import DataError
+from torchrl_koap.data.trajectories import flatten_trajectories, select_state
+from torchrl_koap.files import DataError, option
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
@@ -29,6 +30,7 @@ from torchrl_koap.tasks.action_rules import ActionKind
 # what a user calls the kind of an action, and the kind that it is when its rate is settled
 ACTION_KINDS: dict[str, ActionKind] = {**dict.fromkeys(ADDS_UP, "delta"), "absolute": "absolute", "raw": "raw"}
 _COARSE = 1e-5  # share of a column's range to which float32 has to hold it
+_SMALLEST, _LARGEST = 1e-18, 1e18  # what a column may span: the squares are numbers of float32 still
 _SLACK = 1.5  # episodes may be that much longer than the longest demonstration
 
 
@@ -127,8 +129,11 @@ def make_demonstrations(
     Raises:
         DataError: with all faults: those of :func:`~torchrl_koap.data.make_recordings`, columns that
             do not exist or overlap, targets that do not fit, units of another number, a robot that never moves, a
-            command or an action without a target whose movement float32 cannot hold.
+            command or an action without a target whose movement float32 cannot hold, a column that no float holds.
         ValueError: for an unknown kind of action.
+
+    Warns:
+        UserWarning: of what is unlikely in the data, as ``koap validate`` does.
 
     Examples:
         >>> import numpy as np
@@ -158,12 +163,16 @@ def make_demonstrations(
         if recordings is not states and kind_of(column)[0]
     ]
     names, acting = recordings.state_names, recordings.action_names
-    rate = control_hz or recordings.control_hz
+    rate = recordings.control_hz if control_hz is None else control_hz
     if resample is not None:
         recordings = resampled(replace(recordings, control_hz=rate), resample, action_kind)
         rate = resample
     if rate is None:
-        problems.append("control_hz is missing: frames per second")
+        problems.append(f"{option('control_hz')} is missing: frames per second")
+    else:
+        problems += wrong_rate(rate, "control_hz")
+    if max_steps is not None and (isinstance(max_steps, bool) or max_steps != int(max_steps) or max_steps < 1):
+        problems.append(f"{option('max_steps')} must be a positive whole number, got {max_steps}")
     commanded = _columns(command, names, "command", problems)
     others = [column for column in range(len(names)) if column not in commanded]
     own = others if robot is None else _columns(robot, names, "robot", problems)
@@ -178,7 +187,7 @@ def make_demonstrations(
         problems += [f"column {names[column]!r} is a target and a command" for column in reached if column in commanded]
     units = _each(action_units, len(acting), "action_units", problems)
     own_units = _each(state_units, len(names), "state_units", problems)
-    origin = _origin(np.concatenate(recordings.states))
+    origin = _origin(np.concatenate(recordings.states), names, "state", problems)
     problems += [
         f"command column {names[column]!r} is at {origin[column]:.3g}: subtract that from it, here and on the robot"
         for column in commanded
@@ -188,7 +197,7 @@ def make_demonstrations(
     actions = [steps - added for steps in recordings.actions]
     problems += [
         f"action column {acting[column]!r} is at {at:.3g}: subtract that from it, here and on the robot"
-        for column, at in enumerate(_origin(np.concatenate(actions)))
+        for column, at in enumerate(_origin(np.concatenate(actions), acting, "action", problems))
         if at
     ]
     labelled = [
@@ -196,11 +205,13 @@ def make_demonstrations(
         for frames, steps in zip(recordings.states, recordings.actions, strict=True)
         if np.isfinite(steps).all(-1).any()
     ]
-    if labelled and not any(np.ptp(frames, axis=0).any() for frames in labelled):
+    if not own and robot is not None and not len(robot):
+        problems.append(f"{option('robot')} names no column")
+    elif own and labelled and not any(np.ptp(frames, axis=0).any() for frames in labelled):
         which = ", ".join(names[column] for column in own)
         problems.append(
             f"robot: {which} never move where there are labels, so nothing tells what an action does: name others in"
-            " robot"
+            f" {option('robot')}"
         )
     if problems:
         raise DataError(f"task {name!r}", problems)
@@ -218,11 +229,16 @@ def make_demonstrations(
             for name, *facts in zip(acting, units, kinds, moved or (None,) * len(acting), constants, strict=True)
         },
         position=next(part for part in parts if part != _COMMAND),
-        max_steps=max_steps or round(_SLACK * max(len(frames) for frames in recordings.states)),
+        max_steps=int(max_steps)
+        if max_steps is not None
+        else round(_SLACK * max(len(frames) for frames in recordings.states)),
         control_hz=float(rate),
         command=_COMMAND if commanded else None,
         robot=tuple(others.index(column) for column in own),
     )
+    sources = recordings.sources if recordings is states or resample is not None else ()
+    for said in find_warnings(select_state(data, task.state_of), task, sources):
+        warnings.warn(said, stacklevel=2)
     return data, task
 
 
@@ -242,18 +258,26 @@ def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str
     return parts
 
 
-def _columns(given: Sequence[str | int], names: Sequence[str], what: str, problems: list[str]) -> list[int]:
-    problems += unknown([column for column in given if isinstance(column, str)], names, f"column in {what}:")
+def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -> list[int]:
+    """Columns that are given by name or number, one or several."""
+    given = [given] if isinstance(given, (str, int)) else list(given)
+    odd = [
+        column for column in given if isinstance(column, (bool, np.bool_)) or not isinstance(column, str) and column % 1
+    ]
+    if odd:
+        problems.append(f"{option(what)} names columns by name or number, got {odd[0]!r}")
+        return []
+    problems += unknown([column for column in given if isinstance(column, str)], names, f"column in {option(what)}:")
     numbers = [names.index(column) if column in names else column for column in given]
     found = [int(number) for number in numbers if not isinstance(number, str) and 0 <= number < len(names)]
     problems += [
-        f"{what}: there is no column {number}, only 0..{len(names) - 1}"
+        f"{option(what)}: there is no column {number}, only 0..{len(names) - 1}"
         for number in numbers
         if not isinstance(number, str) and number not in found
     ]
     repeated = sorted({names[column] for column in found if found.count(column) > 1})
     if repeated:
-        problems.append(f"{what} holds {', '.join(repeated)} more than once")
+        problems.append(f"{option(what)} holds {', '.join(repeated)} more than once")
     return found
 
 
@@ -267,31 +291,39 @@ def _targets(
     """State columns that absolute actions are the targets of."""
     if set(kinds) != {"absolute"}:
         if given is not None:
-            problems.append("targets are for action_kind='absolute'")
+            problems.append(f"{option('targets')} are for {option('action_kind')} 'absolute'")
         return []
     columns = list(own) if given is None else _columns(given, names, "targets", problems)
     if len(columns) != len(kinds):
         what = "the robot's columns are" if given is None else "targets are"
         problems.append(
-            f"absolute actions have {len(kinds)} columns, {what} {len(columns)}: name in targets (--targets) the column"
-            f" that each action is the target of (known: {', '.join(names)})"
+            f"absolute actions have {len(kinds)} columns, {what} {len(columns)}: name in {option('targets')} the"
+            f" column that each action is the target of (known: {', '.join(names)})"
         )
     return columns
 
 
-def _origin(rows: np.ndarray) -> np.ndarray:
+def _origin(rows: np.ndarray, names: Sequence[str], kind: str, problems: list[str]) -> np.ndarray:
     """The middle of every column of ``[N, d]`` of which float32 would keep too few digits, 0 of any other."""
     known = rows[np.isfinite(rows).all(-1)]
     if not len(known):
         return np.zeros(rows.shape[1])
     low, high = known.min(0), known.max(0)
-    kept = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(np.float32))
-    return np.where((kept > _COARSE * (high - low)) & (high > low), low + (high - low) / 2, 0.0)
+    top, span = np.maximum(np.abs(low), np.abs(high)), np.minimum(high, _LARGEST) - np.maximum(low, -_LARGEST)
+    moves = high > low
+    lost = (top > _LARGEST) | (moves & ((span < _SMALLEST) | (np.spacing(top) > _COARSE * span)))
+    problems += [
+        f"{kind} column {names[column]!r} lies in {low[column]:.3g} to {high[column]:.3g}, which numbers of"
+        f" {'float64' if top[column] > 1 else 'float32'} hold too coarsely: change its unit, or subtract an offset"
+        for column in np.flatnonzero(lost)
+    ]
+    kept = np.spacing(np.minimum(top, _LARGEST).astype(np.float32))
+    return np.where((kept > _COARSE * span) & moves & ~lost, low + span / 2, 0.0)
 
 
 def _each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:
     """What is said of every column, or once for all."""
     said = (given,) * wide if isinstance(given, str) else tuple(given)
     if len(said) != wide:
-        problems.append(f"{what} names {len(said)} columns, there are {wide}")
+        problems.append(f"{option(what)} names {len(said)} columns, there are {wide}")
     return said

@@ -18,7 +18,7 @@ from torchrl_koap.data.formats.clocks import FASTEST, SLOWEST, rises_evenly
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import DataError, some
+from torchrl_koap.files import DataError, option, some
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
@@ -116,7 +116,7 @@ def _short(lengths: Sequence[int], called: Sequence[str]) -> list[str]:
         return []
     return [
         f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
-        f" refuse them: {some(short)}; `koap convert --drop-short` leaves them out"
+        f" refuse them: {some(short)}; leave them out (`koap convert --drop-short`)"
     ]
 
 
@@ -217,8 +217,10 @@ def _cause(values: np.ndarray, near: float, flipped: bool, most: bool) -> str:
     if len(values) > 2 and abs(values[2] - values[0]) < near:
         return "a measurement that failed for a frame? fill it from its neighbours"
     if most:
-        return "two episodes in one trajectory? say where they end (a column 'episode_index' or 'timeouts')"
-    return "a switch, or a measurement that failed? leave it out (--drop-columns), or fill it from its neighbours"
+        return (
+            "two episodes in one trajectory? part them, or say where they end (a column 'episode_index' or 'timeouts')"
+        )
+    return "a switch, or a measurement that failed? leave it out, or fill it from its neighbours"
 
 
 def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
@@ -246,7 +248,7 @@ def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> lis
     return [
         f"nothing moves in {shares[0]:.0%} of all frames at the start and {shares[1]:.0%} at the end of trajectories"
         f" (most in {called[longest]}: {ends[longest, 0]} and {ends[longest, 1]} of {lengths[longest]}), so a policy"
-        " may learn to stand still; `koap convert --trim-still` cuts them"
+        " may learn to stand still: cut them (`koap convert --trim-still`)"
     ]
 
 
@@ -308,7 +310,7 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
     every = math.ceil(ENOUGH * frames / HORIZON)
     return f"{covers}; {lasts}", (
         f"a plan covers {covers}, {HORIZON / frames:.1%} of a demonstration: short against the motion. A rate of"
-        f" {control_hz / every:.3g} Hz (one frame in {every}) would let it look farther: `koap convert --resample`"
+        f" {control_hz / every:.3g} Hz (one frame in {every}) would let it look farther: {option('resample')}"
     )
 
 

@@ -16,11 +16,13 @@ from torchrl_koap.data.formats.frames import stored_clips
 from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.data.formats.robomimic import is_hdf5, read_robomimic
 from torchrl_koap.data.formats.tables import is_table_folder, read_tables
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
 from torchrl_koap.data.ted import load_ted, read_about, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.files import option
 from torchrl_koap.lookup import lookup
 
 __all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recordings", "write_recordings"]
@@ -45,7 +47,9 @@ class Format:
     write: Callable[[Recordings, Path], None] | None = None
 
 
-def _read_stored(source: str) -> Recordings:
+def _read_stored(
+    source: str, *, resample: float | None = None, action_kind: str | Sequence[str] = "delta"
+) -> Recordings:
     """All observation columns of a data set of this library, the command included, and the labels that there are."""
     data, task = load_ted(stored_folder(source) or source)
     lengths = trajectory_lengths(data).tolist()
@@ -53,7 +57,7 @@ def _read_stored(source: str) -> Recordings:
     observed, behind = (data[key].double() + origin for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION))
     actions = torch.where(data[keys.HAS_ACTION], data[keys.ACTION].double() + added, torch.nan)
     pairs = zip(observed.split(lengths), behind.split(lengths), strict=True)
-    return make_recordings(
+    recordings = make_recordings(
         [torch.cat([frames, following[-1:]]) for frames, following in pairs],
         actions.split(lengths),
         state_names=task.observation_names,
@@ -63,8 +67,21 @@ def _read_stored(source: str) -> Recordings:
         cameras=stored_clips(read_about(stored_folder(source) or source)["notes"]),
         source=source,
     )
+    if resample is None:
+        return recordings
+    given = [action_kind] * task.action_dim if isinstance(action_kind, str) else list(action_kind)
+    declared = [action.kind for action in task.actions.values()]
+    kinds = ["absolute" if is_one == "absolute" else kind for is_one, kind in zip(declared, given, strict=True)]
+    return resampled(recordings, resample, kinds)
 
 
+# what folders hold that are no recordings, and what to do
+_ELSEWHERE = {
+    "*.npy": "it holds *.npy files: save each recording with np.savez(file, states=..., actions=...)",
+    "*.tsv": "it holds *.tsv files: call them *.csv",
+    **dict.fromkeys(("*.h5", "*.hdf5"), "it holds HDF5 files: name one of them"),
+    **dict.fromkeys(("*/*.npz", "*/*.csv", "*/*.parquet"), "its folders hold tables: name one of them"),
+}
 # options of all but this library's own
 COMMON = ("control_hz", "resample", "action_kind", "action_dim", "state_columns", "drop_columns")
 
@@ -75,7 +92,12 @@ FORMATS = {
         read_minari,
         COMMON,
     ),
-    "ted": Format("a data set of this library", lambda source: stored_folder(source) is not None, _read_stored),
+    "ted": Format(
+        "a data set of this library",
+        lambda source: stored_folder(source) is not None,
+        _read_stored,
+        ("resample", "action_kind"),
+    ),
     "robomimic": Format(
         "an HDF5 file in robomimic's layout (*.hdf5)",
         is_hdf5,
@@ -155,17 +177,14 @@ def read_recordings(
     name = find_format(source)
     if name is None and not Path(source).exists():
         raise FileNotFoundError(f"{source} does not exist")
-    if name is None and any(Path(source).glob("*.npy")):
-        raise ValueError(
-            f"{source} holds *.npy files: save each recording with np.savez(file, states=..., actions=...)"
-        )
     if name is None:
-        known = "; ".join(form.what for form in FORMATS.values())
-        raise ValueError(f"{source} holds no recordings that can be read; there are readers for {known}")
+        held = next((hint for ending, hint in _ELSEWHERE.items() if any(Path(source).glob(ending))), None)
+        known = "there are readers for " + "; ".join(form.what for form in FORMATS.values())
+        raise ValueError(f"{source} holds no recordings that can be read; {known if held is None else held}")
     form = FORMATS[name]
     unfit = [name for name in given if name not in form.options]
     if unfit:
-        raise ValueError(f"{', '.join(unfit)}: not an option for {form.what}")
+        raise ValueError(f"{', '.join(map(option, unfit))}: not an option for {form.what}")
     return form.read(str(source), **given)
 
 
@@ -202,6 +221,6 @@ def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path
     """
     write = lookup({key: form.write for key, form in FORMATS.items() if form.write is not None}, name, "format")
     if Path(out).exists():
-        raise FileExistsError(f"{out} exists already; choose another --out")
+        raise FileExistsError(f"{out} exists already; choose another folder (--out)")
     write(recordings, Path(out))
     return Path(out)

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow
-from torchrl_koap.files import DataError, read_bytes, some
+from torchrl_koap.files import DataError, option, read_bytes, some
 
 if TYPE_CHECKING:
     from torchrl_koap.data.formats.columns import Piece
@@ -328,7 +328,7 @@ def check_cameras(pieces: Sequence[Piece], source: str) -> None:
     names = dict.fromkeys(name for piece in pieces for name in piece.cameras)
     problems = []
     for name in names:
-        cure = f"record them, or leave the camera out with drop_columns {name}"
+        cure = f"record them, or leave the camera out in {option('drop_columns')}"
         absent = [piece.name for piece in pieces if name not in piece.cameras]
         if absent:
             problems.append(f"camera {name!r} has no frames in {some(absent)}: {cure}")

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN
-from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, some
+from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
+from torchrl_koap.files import DataError, option, some
 from torchrl_koap.lookup import lookup
 
 # kinds of actions by name: whether they add up over the frames of a longer step; None where the name does not tell
@@ -52,10 +52,11 @@ def resampled(
     known, wide = recordings.control_hz, len(recordings.action_names)
     kinds = [action_kind] * wide if isinstance(action_kind, str) else list(action_kind)
     summing = [lookup(ADDS_UP, kind, "kind of action") for kind in kinds]
-    if not (np.isfinite(control_hz) and control_hz > 0):
-        raise DataError("resample", f"it must be a positive number of frames per second, got {control_hz!r}")
+    problems = wrong_rate(control_hz, "resample")
     if times is None and known is None:
-        raise DataError("resample", "the rate of the recordings is not known: pass control_hz")
+        problems.append(f"the rate of the recordings is not known: pass {option('control_hz')}")
+    if problems:
+        raise DataError("these recordings", problems)
     if times is None:
         times = [np.arange(len(frames)) / known for frames in recordings.states]
     usual = [float(np.median(np.diff(at))) for at in times]
@@ -64,21 +65,20 @@ def resampled(
         for name, step in zip(recordings.sources, usual, strict=True)
         if step * control_hz > MOST * (1 + _SAME)
     ]
-    problems = []
     if dense:
         problems.append(
-            f"{control_hz:g} Hz is more than twice the rate of {some(dense)}: resample to at most"
-            f" {MOST / max(usual):.4g}, most frames would be made up"
+            f"{control_hz:g} Hz is more than twice the rate of {some(dense)}: {option('resample')} may be at"
+            f" most {MOST / max(usual):.4g}, else most frames would be made up"
         )
     if len(kinds) != wide:
-        problems.append(f"action_kind names {len(kinds)} columns, there are {wide}")
+        problems.append(f"{option('action_kind')} names {len(kinds)} columns, there are {wide}")
     elif recordings.num_labels and None in summing:
         problems.append(
             "actions of kind 'delta' may be changes over one frame, which add up over a longer step, or velocities or"
-            " efforts, which hold on: pass action_kind 'change' or 'velocity'"
+            f" efforts, which hold on: pass {option('action_kind')} 'change' or 'velocity'"
         )
     if problems:
-        raise DataError("resample", problems)
+        raise DataError("these recordings", problems)
     adding = np.array(summing, dtype=bool)
     bounds = np.where(_switches(np.concatenate(recordings.states)), 0, leap_bounds(recordings.states)[0])
     parts: list[tuple[str, np.ndarray, np.ndarray, int, np.ndarray]] = []
@@ -99,7 +99,7 @@ def resampled(
             rows = start + np.searchsorted((at[span][1:] + at[span][:-1]) / 2, new)
             parts.append((called, _states(frames[span], at[span], new, bounds), labels, number, rows))
     if not parts:
-        raise DataError("resample", f"no trajectory has two frames at {control_hz:g} Hz")
+        raise DataError("these recordings", f"no trajectory has two frames at {control_hz:g} Hz")
     notes = [f"{len(gaps)} gaps in time, where trajectories were split: {some(gaps)}"] if gaps else []
     notes += [f"{len(short)} trajectories without two frames at {control_hz:g} Hz: {some(short)}"] if short else []
     names, states, actions, numbers, nearest = zip(*parts, strict=True)

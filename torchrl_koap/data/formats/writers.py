@@ -14,7 +14,7 @@ import numpy as np
 from torchrl_koap.data.formats.arrow import import_pyarrow
 from torchrl_koap.data.formats.lerobot import ACTION, EPISODE, FRAME, STATE
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, replacing_file
+from torchrl_koap.files import DataError, option, replacing_file
 
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _CHUNK = 1000  # files in a folder
@@ -35,7 +35,7 @@ def write_npz(recordings: Recordings, out: Path) -> None:
 def write_lerobot(recordings: Recordings, out: Path) -> None:
     """Writes a LeRobot data set; float64 becomes float32. The rate must be known."""
     if recordings.control_hz is None:
-        raise DataError(out, "the rate is not known: pass control_hz")
+        raise DataError(out, f"the rate is not known: pass {option('control_hz')}")
     states, actions = recordings.state_names, recordings.action_names
     writer = LeRobotWriter(out, fps=recordings.control_hz, state_names=states, action_names=actions)
     for frames, steps in zip(recordings.states, recordings.actions, strict=True):
