@@ -149,7 +149,7 @@ FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
         lambda folder: (folder / TOP).unlink(),
     ),
     "frames without end": (
-        r"'wrist' has 18 frames for 20 rows.*drop_columns wrist",
+        r"'wrist' has 18 frames for 20 rows.*drop_columns .* wrist",
         "'wrist' of 1.*frame 18 is missing",
         of_array(lambda frames: frames[:18]),
     ),

@@ -56,6 +56,26 @@ def test_embeddings_are_further_columns_that_are_not_the_robot_s(tmp_path):
     )
 
 
+@pytest.mark.parametrize("offset", [4e6, 1e8])
+def test_an_offset_of_the_numbers_beside_frames_is_subtracted_in_float64(offset, tmp_path):
+    raw = write_filmed(tmp_path / "raw", cameras=("top",))
+    own = save_demonstrations(tmp_path / "near", read_recordings(raw))
+    embed(own, tmp_path / "seen")
+    near = load_ted(tmp_path / "seen" / "ted")[0]
+    for file in raw.glob("*.npz"):
+        kept = dict(np.load(file))
+        np.savez(file, **kept | {"states": kept["states"] + [offset, 0]})
+    embed(save_demonstrations(tmp_path / "own", read_recordings(raw)), tmp_path / "far_seen")
+    far, task = load_ted(tmp_path / "far_seen" / "ted")
+    origin = torch.tensor(task.observation_origin, dtype=torch.float64)
+    assert len(origin) == 7 and origin[1:].count_nonzero() == 0
+    back = far["observation"].double() + origin - torch.tensor([offset, 0, 0, 0, 0, 0, 0])
+    torch.testing.assert_close(back, near["observation"].double(), atol=1e-5, rtol=1e-4)
+    cameras = load_cameras(tmp_path / "far_seen" / "cameras")
+    given = {"state": [offset + 0.25, 1.0], "top": np.load(raw / "03" / "top.npy")[4]}
+    assert Observer(task, cameras)(given)[0] - offset == 0.25
+
+
 def test_one_camera_of_two(tmp_path):
     own = write_own(tmp_path)
     assert list(embed(own, tmp_path / "seen", cameras=["wrist"])) == ["wrist"]

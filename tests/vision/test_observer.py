@@ -30,9 +30,9 @@ def test_columns_are_those_of_the_task():
     seen = observe({"wrist": FRAME[::-1], "state": [1.0, 2.0, 3.0, 4.0], "top": FRAME})
     assert seen.shape == (11,) and seen[[3, 4, 9, 10]].tolist() == [1, 2, 3, 4]
     for name, columns, frame in (("top", slice(0, 3), FRAME), ("wrist", slice(5, 9), FRAME[::-1].copy())):
-        torch.testing.assert_close(seen[columns], load_encoder(cameras[name]).embed(torch.from_numpy(frame)))
+        torch.testing.assert_close(seen[columns].float(), load_encoder(cameras[name]).embed(torch.from_numpy(frame)))
     several = {name: np.stack([frame] * 2) for name, frame in {"top": FRAME, "wrist": FRAME[::-1]}.items()}
-    torch.testing.assert_close(observe({"state": np.array([[1.0, 2, 3, 4]] * 2), **several})[1].float(), seen)
+    torch.testing.assert_close(observe({"state": np.array([[1.0, 2, 3, 4]] * 2), **several})[1], seen)
     assert observe(observe.example()).shape == (11,) and observe.example()["top"].shape == (16, 24, 3)
 
 

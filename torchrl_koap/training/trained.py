@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import LabelReport
+from torchrl_koap.data.formats import find_format
 from torchrl_koap.files import some
 from torchrl_koap.modules import CommandDecoder, Execution, Follower, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.runs.config import TrainConfig
@@ -227,7 +228,7 @@ class Trained:
             RunDirectoryError: if they are not there.
         """
         where = dataset or self.config.dataset
-        if where is None or not Path(where).is_dir():
+        if where is None or not Path(where).is_dir() and find_format(where) is None:
             raise RunDirectoryError(
                 f"the data set {where!r} of {self.folder} is not there (moved, or named relative to another working"
                 " directory?): say where it is with --dataset"

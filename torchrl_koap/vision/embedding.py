@@ -144,7 +144,12 @@ def embed_recordings(
         reports[name] = film.report(fitted)
         embedded[name] = [fitted(features) for features in film.features()]
     task, states = _with_columns(task, recordings, embedded)
-    data = flatten_trajectories(states, recordings.actions, action_dim=task.action_dim)
+    origin, added = map(np.asarray, task.origins or (0.0, 0.0))  # read_recordings has added them
+    data = flatten_trajectories(
+        [frames - origin for frames in states],
+        [steps - added for steps in recordings.actions],
+        action_dim=task.action_dim,
+    )
     save_ted(data, out / "ted", task, {"embedded": chosen, "network": backbone.name})
     shutil.rmtree(out / "unfinished")
     return reports
@@ -159,6 +164,7 @@ def _with_columns(
         task = replace(
             task,
             observation_parts={**task.observation_parts, **further},
+            observation_origin=task.observation_origin and task.observation_origin + (0.0,) * sum(further.values()),
             observation_units=(task.observation_units or ("",) * task.observation_dim) + ("",) * sum(further.values()),
             state={**task.state, **dict.fromkeys(further, "plain")} if task.state else {},
             robot=task.robot or tuple(range(task.state_dim)),

@@ -82,7 +82,8 @@ class Observer:
             raise ValueError(f"the observation {what}: wanted {', '.join(wanted)}, got {', '.join(map(str, given))}")
         seen = {name: self._embedded(name, given[name]) for name in self.cameras}
         batch = next(iter(seen.values())).shape[:-1]
-        state = torch.as_tensor(given.get(STATE, np.zeros((*batch, self.state_dim), np.float32)))
+        state = given.get(STATE, np.zeros((*batch, self.state_dim), np.float32))
+        state = state if isinstance(state, Tensor) else torch.from_numpy(np.array(state, dtype=np.float64))
         if state.shape != (*batch, self.state_dim):
             raise ValueError(f"'state' must be {[*batch, self.state_dim]} beside these frames, got {list(state.shape)}")
         seen |= dict(zip(numbers, state.split(list(numbers.values()), -1), strict=True))

@@ -217,7 +217,8 @@ def test_what_is_missing_is_named(tmp_path):
     (tmp_path / "run_1" / "top" / "000003.png").unlink()
     (tmp_path / "run_1" / "top" / "000004.png").unlink()
     with pytest.raises(
-        DataError, match=r"run_1.npz: camera 'top' has 2 frames for 5 rows: .*leave the camera out in drop_columns"
+        DataError,
+        match=r"run_1.npz: camera 'top' has 2 frames for 5 rows: .*leave the camera out by drop_columns .* top",
     ):
         read_recordings(tmp_path)
     (tmp_path / "run_1" / "wrist.npy").unlink()

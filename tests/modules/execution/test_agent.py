@@ -116,8 +116,42 @@ def test_refusals():
         agent.act(np.zeros(3))
     with pytest.raises(ValueError, match=r"must be \[obs\] or \[n, obs\], got \[1, 1, 2\]"):
         agent.act(np.zeros((1, 1, 2)))
-    with pytest.raises(ValueError, match=r"columns \[1\] of the observation are NaN or infinite"):
+    with pytest.raises(ValueError, match=r"columns \[1\] of the observation are NaN, or beyond"):
         agent.act(np.array([0.0, np.nan]))
+
+
+def test_arrays_of_any_kind_are_observations():
+    """What a robot's driver hands over: a mask means that there is no number."""
+    wanted = np.array([0.5, -0.25])
+    acted = []
+    for given in (wanted, wanted.astype(">f4"), wanted[::-1].copy()[::-1], wanted.astype(object), wanted.tolist()):
+        agent = Agent(policy_of(), seed=0)
+        agent.reset()
+        acted.append(agent.act(given))
+        np.testing.assert_array_equal(acted[0], acted[-1])
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (np.ma.masked_array([0.5, 1.0], mask=[0, 1]), r"columns \[1\] of the observation are NaN"),
+        ([0.5, None], r"columns \[1\] of the observation are NaN"),
+        (np.array([1e300, 0]), r"columns \[0\] of the observation are NaN, or beyond 1e\+18"),
+        (np.ones(2, complex), "must be numbers .*, got ndarray"),
+        (torch.ones(2, dtype=torch.complex64), "must be plain numbers, got a tensor of torch.complex64"),
+        (torch.ones(2).to_sparse(), "must be plain numbers"),
+        (np.zeros(2, "datetime64[s]"), "must be numbers .*, got ndarray"),
+        (["left", "right"], "must be numbers .*, got list"),
+        ([[1.0, 2.0], [3.0]], "must be numbers .*, got list"),
+        (None, r"columns \[0\]|must be"),
+        (np.zeros((0, 2)), r"must be \[obs\] or \[n, obs\], got \[0, 2\]"),
+    ],
+)
+def test_what_is_no_observation(given, says):
+    agent = Agent(policy_of())
+    agent.reset()
+    with pytest.raises(ValueError, match=says):
+        agent.act(given)
 
 
 def test_keys_of_the_policy_are_those_that_are_written_and_read():

@@ -80,7 +80,7 @@ _ELSEWHERE = {
     "*.npy": "it holds *.npy files: save each recording with np.savez(file, states=..., actions=...)",
     "*.tsv": "it holds *.tsv files: call them *.csv",
     **dict.fromkeys(("*.h5", "*.hdf5"), "it holds HDF5 files: name one of them"),
-    **dict.fromkeys(("*/*.npz", "*/*.csv", "*/*.parquet"), "its folders hold tables: name one of them"),
+    **dict.fromkeys(("*/*.npz", "*/*.csv"), "its folders hold tables: name one of them"),
 }
 # options of all but this library's own
 COMMON = ("control_hz", "resample", "action_kind", "action_dim", "state_columns", "drop_columns")
@@ -112,7 +112,7 @@ FORMATS = {
         write_lerobot,
     ),
     "npz": Format(
-        "a folder of *.npz, *.csv or *.parquet files, a trajectory each",
+        "a table, or a folder of tables (*.npz, *.csv, *.parquet), a trajectory each",
         is_table_folder,
         read_tables,
         ("action_columns", *COMMON),
@@ -178,9 +178,9 @@ def read_recordings(
     if name is None and not Path(source).exists():
         raise FileNotFoundError(f"{source} does not exist")
     if name is None:
-        held = next((hint for ending, hint in _ELSEWHERE.items() if any(Path(source).glob(ending))), None)
-        known = "there are readers for " + "; ".join(form.what for form in FORMATS.values())
-        raise ValueError(f"{source} holds no recordings that can be read; {known if held is None else held}")
+        said = [hint for ending, hint in _ELSEWHERE.items() if any(Path(source).glob(ending))]
+        said.append("there are readers for " + ", ".join(form.what for form in FORMATS.values()))
+        raise ValueError(f"{source} holds no recordings that can be read; {'; '.join(said)}")
     form = FORMATS[name]
     unfit = [name for name in given if name not in form.options]
     if unfit:

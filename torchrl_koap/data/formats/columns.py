@@ -55,7 +55,7 @@ def assemble(
     action_dim: int | None = None,
     action_names: Sequence[str] | None = None,
     skipped: Sequence[str] = (),
-    no_rate: str = "no file has time stamps (a column 'timestamp' in seconds): pass control_hz (--control-hz)",
+    no_rate: str = "no file has time stamps (a column 'timestamp' in seconds, or dates such as 2024-03-31 12:30:05.1)",
 ) -> Recordings:
     """Splits episodes, leaves out what is no state, reads the rate off the time stamps, and checks what is left.
 
@@ -121,7 +121,7 @@ def assemble(
         others = [clock, *others]
     if rate is None and clock is None:
         rate = declared_hz
-        problems += [no_rate] if rate is None else []
+        problems += [f"{no_rate}: pass {option('control_hz')}"] if rate is None else []
     about |= {other.name: told_rate(other, rate) for other in others if other is not None and rate is not None}
     left_out = [*skipped, *short, *(name + about.get(name, "") for name in seen if name not in observed)]
     left_out += [name for name in drop_columns if name not in left_out]
@@ -298,7 +298,9 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
         found = [(name, columns) for name, columns in named if columns is not None]
         for name, columns in found[1:]:
             first, wanted = found[0]
-            missing, more = (some([*rest]) for rest in (wanted.keys() - columns.keys(), columns.keys() - wanted.keys()))
+            missing, more = (
+                some(sorted(rest)) for rest in (wanted.keys() - columns.keys(), columns.keys() - wanted.keys())
+            )
             if missing or more:
                 said = [f"lacks {missing}"] * bool(missing) + [f"has {more} besides"] * bool(more)
                 yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}"

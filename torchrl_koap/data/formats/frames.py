@@ -328,7 +328,7 @@ def check_cameras(pieces: Sequence[Piece], source: str) -> None:
     names = dict.fromkeys(name for piece in pieces for name in piece.cameras)
     problems = []
     for name in names:
-        cure = f"record them, or leave the camera out in {option('drop_columns')}"
+        cure = f"record them, or leave the camera out by {option('drop_columns')} {name}"
         absent = [piece.name for piece in pieces if name not in piece.cameras]
         if absent:
             problems.append(f"camera {name!r} has no frames in {some(absent)}: {cure}")

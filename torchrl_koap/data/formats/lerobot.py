@@ -102,7 +102,7 @@ def read_lerobot(
         declared_hz=_rate(info),
         action_names=acting,
         skipped=[*absent, *unread],
-        no_rate=f"info.json holds no fps: pass {option('control_hz')}",
+        no_rate="info.json holds no fps",
         **options,
     )
 

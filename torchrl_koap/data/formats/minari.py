@@ -12,7 +12,7 @@ import numpy as np
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.kinds import spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, gathered, option
+from torchrl_koap.files import DataError, gathered
 
 PREFIX = "minari:"
 
@@ -65,7 +65,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
         source,
         declared_hz=_rate(dataset),
         skipped=skipped,
-        no_rate=f"its environment says nothing of render_fps: pass {option('control_hz')}",
+        no_rate="its environment says nothing of render_fps",
         **options,
     )
 

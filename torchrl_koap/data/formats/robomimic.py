@@ -24,7 +24,7 @@ from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, gathered, option
+from torchrl_koap.files import DataError, gathered
 
 
 def is_hdf5(path: str | Path) -> bool:
@@ -58,7 +58,7 @@ def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = Non
         str(file),
         declared_hz=declared,
         skipped=skipped,
-        no_rate=f"env_args holds no control_freq: pass {option('control_hz')}",
+        no_rate="env_args holds no control_freq",
         **options,
     )
 

@@ -17,6 +17,7 @@ from torchrl_koap.modules.execution.noise import NoiseStreams
 from torchrl_koap.modules.execution.policy import IS_INIT, PlanningPolicy
 
 KEPT = 10_000  # latencies of the last steps
+LARGEST = 1e18  # of an observation: its square is a number of float32 still
 
 
 class Agent:
@@ -129,18 +130,32 @@ class Agent:
                 given = ", ".join(observation)
                 raise ValueError(f"this policy was trained without cameras: it takes one vector [obs], got {given}")
             observation = self.policy.observe(observation)
-        observed = torch.as_tensor(observation)
+        observed = observation if isinstance(observation, Tensor) else _tensor(observation)
+        if observed.is_complex() or observed.layout != torch.strided:
+            raise ValueError(f"an observation must be plain numbers, got a tensor of {observed.dtype}")
         shape = tuple(observed.shape)
-        if len(shape) not in (1, 2):
+        if len(shape) not in (1, 2) or not observed.numel():
             raise ValueError(f"an observation must be [obs] or [n, obs], got {list(shape)}")
         if self._shape is not None and shape != self._shape:
             raise ValueError(
                 f"the observation is {list(shape)}, those before were {list(self._shape)}; reset() the agent for"
                 " another robot or batch"
             )
-        bad = ~observed.isfinite()
+        read = self.policy.from_robot(observed).to(self.device, self.dtype).reshape(-1, shape[-1])
+        bad = ~(read.abs() < LARGEST)
         if bad.any():
-            columns = bad.reshape(-1, shape[-1]).any(0).nonzero().flatten().tolist()
-            raise ValueError(f"columns {columns} of the observation are NaN or infinite")
+            columns = bad.any(0).nonzero().flatten().tolist()
+            raise ValueError(f"columns {columns} of the observation are NaN, or beyond {LARGEST:g}")
         self._shape = shape
-        return self.policy.from_robot(observed).to(self.device, self.dtype).reshape(-1, shape[-1])
+        return read
+
+
+def _tensor(given: Any) -> Tensor:
+    """Numbers as float64, whatever holds them; what is masked or None is NaN."""
+    try:
+        array = np.ma.array(given, copy=True)
+        if array.dtype.kind in "fiubO":
+            return torch.from_numpy(np.ascontiguousarray(array.astype(np.float64).filled(np.nan)))
+    except (TypeError, ValueError):  # ragged lists, other objects
+        pass
+    raise ValueError(f"an observation must be numbers [obs] or [n, obs], got {type(given).__name__}")
