@@ -23,6 +23,7 @@ from torchrl_koap.tasks import Action, Task
 PATH = torch.arange(40.0).reshape(20, 2)
 ACTIONS = torch.ones(19, 1)
 STEPS = torch.linspace(0, 1, 19)[:, None]
+MOVED = torch.cat([torch.cat([torch.zeros(1, 1), STEPS]).cumsum(0), PATH[:, 1:]], 1)  # by these steps
 TIME = np.linspace(0, 2, 60)[:, None]
 
 
@@ -40,7 +41,7 @@ def warnings(states, actions=None, *, columns=("x", "y"), units=("m", "m"), name
 
 
 def test_sound_demonstrations_raise_none():
-    assert warnings([PATH, PATH + 1, PATH], [STEPS, STEPS, 2 * STEPS]) == []
+    assert warnings([MOVED, MOVED + 1, MOVED], [STEPS, STEPS, 2 * STEPS]) == []
 
 
 def test_each_warning_is_said_once_and_names_its_trajectory():
@@ -96,7 +97,7 @@ def test_labels_that_leap_or_stand_alone():
     assert warning.startswith("action 'v' is -6.27 in label 7 of trajectory 0 and far from that before")
     assert warnings([PATH], [(torch.arange(19) == 7).float()[:, None]]) == []  # a switch
     alone = torch.where(torch.arange(19)[:, None] % 4 == 1, STEPS, torch.nan)
-    (warning,) = warnings([PATH, PATH + 1], [alone, STEPS])
+    (warning,) = warnings([MOVED, MOVED + 1], [alone, STEPS])
     assert warning.startswith("labels stand alone in 1 trajectories: trajectory 0 (5 of 19 steps)")
 
 
