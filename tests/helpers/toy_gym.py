@@ -60,6 +60,21 @@ class Breaks(Reach):
         return super().step(action)
 
 
+class Drawn(Reach):
+    """Draws its first joint as a shade of red."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+
+    def __init__(self, shade=0, render_mode=None):
+        super().__init__(key="is_success")
+        self.shade, self.render_mode = shade, render_mode
+
+    def render(self):
+        picture = np.full((8, 8, 3), self.shade, np.uint8)
+        picture[..., 0] = int(100 + 50 * self.joints[0])
+        return picture
+
+
 def demonstrations(number=5, steps=30, seed=0):
     """States and actions of a robot that goes to its goal."""
     env, states, actions = Reach(length=steps), [], []
@@ -81,6 +96,7 @@ for _id, _options in {
 }.items():
     gymnasium.register(_id, entry_point=Reach, kwargs=_options)
 gymnasium.register("ToyBreaks-v0", Breaks)
+gymnasium.register("ToyDrawn-v0", Drawn)
 
 
 def reach(robots: int | None = None, **options) -> EnvBase:

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from PIL import Image
 from run_files import make_object_rollouts, make_rollouts, run_of
+from toy_gym import Drawn
 
 from torchrl_koap.reports import animation
 from torchrl_koap.reports.animation import animate_rollouts
 from torchrl_koap.reports.pictures import NotFilmed, NothingToDraw, save_film
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
 RUN = run_of("avoiding")
@@ -111,3 +115,26 @@ def test_the_first_success_is_filmed(task, monkeypatch):
     else:
         np.testing.assert_array_equal(context, rollouts["context"][2:3])
         assert context.dtype == np.float64
+
+
+def test_a_rollout_in_gymnasium_is_played_again_from_its_seed():
+    rows = [{"seed": 5}, {"seed": 6}]
+    evaluation = {"env": "toy_gym:ToyDrawn-v0", "env_kwargs": ["shade=7"], "episode": rows}
+    rollouts = {"outcome": np.array([0, 1]), "action": np.full((2, 5, 2), 0.1, np.float32)}
+    film = animation.film_rollout(rollouts, RunFacts(Path("run"), None, evaluation=evaluation))
+    env = Drawn(shade=7, render_mode="rgb_array")
+    env.reset(seed=6)  # the first success
+    first = env.render()
+    for _ in range(5):
+        env.step(np.full(2, 0.1, np.float32))
+    frames = list(film.frames)
+    assert len(frames) == 4
+    np.testing.assert_array_equal(frames[0], first)
+    np.testing.assert_array_equal(frames[-1], env.render())
+
+
+def test_an_environment_that_cannot_be_drawn_is_told():
+    evaluation = {"env": "toy_gym:ToyReach-v0", "episode": [{"seed": 5}]}
+    rollouts = {"outcome": np.array([0]), "action": np.zeros((1, 5, 2), np.float32)}
+    with pytest.raises(NotFilmed, match="environment 'toy_gym:ToyReach-v0' was not filmed"):
+        animation.film_rollout(rollouts, RunFacts(Path("run"), None, evaluation=evaluation))

@@ -156,6 +156,8 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
         ValueError: for a wrong shape, or no context where one is needed.
     """
     task = run.task
+    if run.evaluation.get("env") and "action" in rollouts:
+        return _film_in_gymnasium(rollouts, run)
     if task is None or task.env is None or "action" not in rollouts:
         raise NothingToDraw("the rollouts hold no actions of a task with a simulator")
     if task.scene.camera is None:
@@ -173,6 +175,37 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
         return Film(list(_film_frames(actions, task, context, stride)), 2 / task.control_hz)
     except RuntimeError as error:
         raise NotFilmed(error) from error
+
+
+def _film_in_gymnasium(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
+    """The same in an environment of Gymnasium, which its seed makes begin as it did."""
+    import gymnasium  # it and the simulator take seconds
+
+    from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode
+    from torchrl_koap.evaluation.config import environment_arguments
+
+    won = np.flatnonzero(entry(rollouts, "outcome", [None]) == SUCCESS)
+    index = int(won[0]) if len(won) else 0
+    actions = entry(rollouts, "action", [None, None, None])[index]
+    actions = actions[np.isfinite(actions).all(1)]
+    given = environment_arguments(run.evaluation.get("env_kwargs") or ())
+    frames: list[np.ndarray] = []
+    try:
+        env = gymnasium.make(run.evaluation["env"], **(given | {"render_mode": "rgb_array"}))
+        episode = GymnasiumEpisode(env, 0, max_steps=len(actions))
+        episode.reset(seed=run.evaluation["episode"][index]["seed"])
+        stride = max(2, -(-len(actions) // FILM_FRAMES))
+        for number, action in enumerate(actions):
+            if number % stride == 0:
+                frames.append(np.asarray(env.render(), np.uint8))
+            episode.step(action)
+        frames.append(np.asarray(env.render(), np.uint8))
+        env.close()
+    except Exception as error:  # of an environment of somebody else
+        raise NotFilmed(f"environment {run.evaluation['env']!r} was not filmed: {error}") from error
+    if any(frame.ndim != 3 or frame.shape != frames[0].shape for frame in frames):
+        raise NotFilmed(f"environment {run.evaluation['env']!r} draws no picture [height, width, 3]")
+    return Film(frames, 2 / (run.control_hz or CONTROL_HZ))
 
 
 def _film_frames(actions: np.ndarray, task: Task, context: np.ndarray | None, stride: int) -> Iterator[np.ndarray]:
