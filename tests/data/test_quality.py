@@ -23,7 +23,8 @@ from torchrl_koap.tasks import Action, Task
 PATH = torch.arange(40.0).reshape(20, 2)
 ACTIONS = torch.ones(19, 1)
 STEPS = torch.linspace(0, 1, 19)[:, None]
-MOVED = torch.cat([torch.cat([torch.zeros(1, 1), STEPS]).cumsum(0), PATH[:, 1:]], 1)  # by these steps
+MOVED = torch.cat([torch.zeros(1, 1), STEPS]).cumsum(0)  # by these steps
+MOVED = torch.cat([MOVED, torch.sin(MOVED)], 1)
 TIME = np.linspace(0, 2, 60)[:, None]
 
 
