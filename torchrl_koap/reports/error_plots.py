@@ -24,7 +24,7 @@ from torchrl_koap.reports.style import (
     RED,
     WARNING,
     entry,
-    place_legend,
+    put_legend,
     set_title,
     tidy,
 )
@@ -216,7 +216,7 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     each = f", {1e3 / run.control_hz:.0f} ms each" if run.control_hz else ""
     for axes in panels[-1]:
         axes.set_xlabel(f"planned step{each}")
-    place_legend(panels[0, 1])
+    put_legend(panels[0, 1])
     return figure
 
 
@@ -248,7 +248,7 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     handles = [Line2D([], [], color=color, linewidth=6, label=label) for label, color in _ACTIONS.values()]
     if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
         handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
-    place_legend(panels[0, -1], handles=handles)
+    put_legend(panels[0, -1], handles=handles)
     return figure
 
 

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, error_unit, unit_circle_sides
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, WARNING, place_legend, tidy
+from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, WARNING, put_legend, tidy
 from torchrl_koap.tasks import Task
 
 SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
@@ -102,7 +102,7 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     right.invert_yaxis()
     right.set_xlabel("root mean square distance after the last step of a plan\n(m, rad, or on the unit circle)")
     if names:
-        place_legend(right, below=0.24)
+        put_legend(right, below=0.24)
     tidy(right, "How far execution is")
     return figure
 
@@ -153,7 +153,7 @@ def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     axes.set_ylabel("root mean square distance" + (f" ({shown})" if shown else ""))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     judged = f"on {errors['held_out_trajectories']} demonstrations"
-    place_legend(axes, below=0.22)
+    put_legend(axes, below=0.22)
     tidy(axes, f"Error of the predicted {part.replace('_', ' ')}\n{judged}", grid=True)
 
 
@@ -173,5 +173,5 @@ def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> Non
     axes.set_xticks(places, names, fontsize=8, rotation=45 if len(names) > 4 else 0)
     axes.set_yticks((0, 0.25, 0.5, 0.75, 1))
     axes.set_ylabel("share of variance explained (R²)")
-    place_legend(axes, below=0.22, columnspacing=1)
+    put_legend(axes, below=0.22, columnspacing=1)
     tidy(axes, "True actions from latent actions\non the same held-out demonstrations")

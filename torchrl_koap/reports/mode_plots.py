@@ -17,7 +17,7 @@ from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy
 from torchrl_koap.lookup import resolve
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, GREY, INK, SUCCESS, entry, place_legend, tidy
+from torchrl_koap.reports.style import BLUE, GREY, INK, SUCCESS, entry, put_legend, tidy
 from torchrl_koap.tasks import Modes
 
 _LISTED = 10  # modes of a single choice that have wide bars with their names below
@@ -57,7 +57,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         level = np.bincount(reference, minlength=number) * len(mode) / len(reference)
         label = f"{len(reference)} demonstrations, scaled"
         axes.hlines(level, places - 0.46, places + 0.46, color=INK, linewidth=1.3, zorder=3, label=label)
-        place_legend(axes)
+        put_legend(axes)
     axes.set_ylabel("successful rollouts")
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.set_ylim(0, 1.2 * max(1, axes.dataLim.y1))

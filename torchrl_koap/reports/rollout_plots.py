@@ -33,7 +33,7 @@ from torchrl_koap.reports.style import (
     OUTCOMES,
     SUCCESS,
     entry,
-    place_legend,
+    put_legend,
     set_title,
     tidy,
 )
@@ -94,7 +94,7 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         set_title(panel, "objects: starts (pale), paths, ends")
         marks += body_handles(bodies_of(run.task, bodies[0].shape[1]), good)
     if marks:
-        place_legend([axes, *beside][-1], handles=marks)
+        put_legend([axes, *beside][-1], handles=marks)
     return figure
 
 

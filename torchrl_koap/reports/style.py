@@ -56,7 +56,7 @@ def set_title(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
 
 
-def place_legend(axes: Axes, *, below: float | None = None, **options: Any) -> None:
+def put_legend(axes: Axes, *, below: float | None = None, **options: Any) -> None:
     """Puts the legend right of a panel, or ``below`` it by a share of its height; options are of ``Axes.legend``."""
     place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
     if below is not None:
