@@ -1,24 +1,47 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Noise of a stated size on the measured end effector, the same in specs, rollouts and any batch."""
+"""Partial observability: dropped parts, noise of a stated size, the same in specs, rollouts and any batch."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import AvoidingEnv, SortingEnv
-from torchrl_koap.envs.transforms import EndEffectorNoise
+from torchrl_koap.envs.transforms import EndEffectorNoise, PartialObservation
 from torchrl_koap.tasks import get_task
 
 
-def test_a_noisy_environment_keeps_its_specs():
-    env = TransformedEnv(SortingEnv(2, seed=0), EndEffectorNoise("po_sorting", sigma=0.002))
+def test_po_sorting_is_sorting_plus_transforms():
+    env = TransformedEnv(
+        SortingEnv(2, seed=0), Compose(EndEffectorNoise("po_sorting", sigma=0.002), PartialObservation("po_sorting"))
+    )
     check_env_specs(env)
+    assert env.observation_spec["observation"].shape == (2, 10)
     data = env.rollout(3)
-    assert data["observation"].shape == (2, 3, 16) and data["next", "observation"].shape == (2, 3, 16)
+    assert data["observation"].shape == (2, 3, 10) and data["next", "observation"].shape == (2, 3, 10)
+
+
+def test_what_remains_is_what_the_task_shows_its_planner():
+    """KOAP's ten columns: measured xy and the boxes' xy."""
+    observation = torch.randn(7, 16)
+    partial = PartialObservation("po_sorting")(TensorDict({"observation": observation.clone()}, [7]))["observation"]
+    assert torch.equal(partial, observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]])
+    assert torch.equal(partial, get_task("po_sorting").state_of(observation))
+
+
+def test_parts_may_be_chosen_on_any_task():
+    hide = PartialObservation("aligning", drop=["target_position"])
+    row = torch.arange(20.0)[None]
+    assert hide(TensorDict({"observation": row}, [1]))["observation"].shape == (1, 17)
+    with pytest.raises(ValueError, match="task 'aligning' has no part 'yaw'"):
+        PartialObservation("aligning", drop=["yaw"])
+    with pytest.raises(ValueError, match="nothing of task 'avoiding' remains"):
+        PartialObservation("avoiding", drop=["desired_xy", "measured_xy"])
+    with pytest.raises(ValueError, match="has 20 columns, got 16"):
+        hide(TensorDict({"observation": torch.zeros(1, 16)}, [1]))
 
 
 def test_noise_has_the_stated_size_and_touches_nothing_else():

@@ -56,13 +56,6 @@ def test_no_state_shows_the_command(name):
     assert torch.equal(task.state_of(observation), task.state_of(hidden))
 
 
-def test_po_sorting_shows_positions_in_the_plane():
-    """KOAP's ten columns: measured xy and the boxes' xy."""
-    observation = torch.randn(7, 16)
-    wanted = observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]]
-    assert torch.equal(get_task("po_sorting").state_of(observation), wanted)
-
-
 def test_hidden_parts_are_no_state():
     columns = Columns(**TOY, hidden=("box_xy",))
     assert columns.state_columns == (2, 3, 6) and columns.observation_dim == 7
