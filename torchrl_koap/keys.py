@@ -27,6 +27,9 @@ transition from ``x_t`` to ``x_{t+1}``.
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
@@ -90,6 +93,23 @@ def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, re
             f"{key!r} is {value.dtype}, {name} {weight.dtype}: cast one of them, as with .to({weight.dtype})"
         )
     return value
+
+
+def observed_numbers(given: Any) -> Tensor:
+    """Reads an observation as a tensor: tensors as they are, all else as float64; what is masked or None is NaN.
+
+    Raises:
+        ValueError: if it holds anything but numbers.
+    """
+    if isinstance(given, Tensor):
+        return given
+    try:
+        array = np.ma.array(given, copy=True)
+        if array.dtype.kind in "fiubO":
+            return torch.from_numpy(np.ascontiguousarray(array.astype(np.float64).filled(np.nan)))
+    except (TypeError, ValueError):  # ragged lists, other objects
+        pass
+    raise ValueError(f"an observation must be numbers [obs] or [n, obs], got {type(given).__name__}")
 
 
 def frame_mask(mask: Tensor | None, name: object, state: Tensor) -> Tensor:

@@ -36,6 +36,15 @@ def test_columns_are_those_of_the_task():
     assert observe(observe.example()).shape == (11,) and observe.example()["top"].shape == (16, 24, 3)
 
 
+def test_what_is_masked_beside_frames_is_no_number():
+    observe, _ = make()
+    masked = np.ma.masked_array([1.0, 2.0, 3.0, 4.0], mask=[0, 1, 0, 0])
+    seen = observe({"wrist": FRAME, "top": FRAME, "state": masked})[[3, 4, 9, 10]]
+    assert seen.isnan().tolist() == [False, True, False, False]
+    with pytest.raises(ValueError, match="an observation must be numbers .*, got list"):
+        observe({"wrist": FRAME, "top": FRAME, "state": ["left"] * 4})
+
+
 def test_numbers_that_no_policy_sees_may_be_left_out():
     observe, _ = make(hidden=("joints", "cup"))
     assert observe({"top": FRAME, "wrist": FRAME})[3:5].tolist() == [0, 0]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_koap.data.formats.frames import fault_of
+from torchrl_koap.keys import observed_numbers
 from torchrl_koap.tasks import Task
 from torchrl_koap.vision.encoder import FrozenImageEncoder
 from torchrl_koap.vision.projection import Projection, load_encoder
@@ -82,8 +83,7 @@ class Observer:
             raise ValueError(f"the observation {what}: wanted {', '.join(wanted)}, got {', '.join(map(str, given))}")
         seen = {name: self._embedded(name, given[name]) for name in self.cameras}
         batch = next(iter(seen.values())).shape[:-1]
-        state = given.get(STATE, np.zeros((*batch, self.state_dim), np.float32))
-        state = state if isinstance(state, Tensor) else torch.from_numpy(np.array(state, dtype=np.float64))
+        state = observed_numbers(given.get(STATE, np.zeros((*batch, self.state_dim))))
         if state.shape != (*batch, self.state_dim):
             raise ValueError(f"'state' must be {[*batch, self.state_dim]} beside these frames, got {list(state.shape)}")
         seen |= dict(zip(numbers, state.split(list(numbers.values()), -1), strict=True))

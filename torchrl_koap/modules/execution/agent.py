@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_koap.keys import observed_numbers
 from torchrl_koap.modules.execution.noise import NoiseStreams
 from torchrl_koap.modules.execution.policy import IS_INIT, PlanningPolicy
 
@@ -129,7 +130,7 @@ class Agent:
                 given = ", ".join(observation)
                 raise ValueError(f"this policy was trained without cameras: it takes one vector [obs], got {given}")
             observation = self.policy.observe(observation)
-        observed = observation if isinstance(observation, Tensor) else _tensor(observation)
+        observed = observed_numbers(observation)
         if observed.is_complex() or observed.layout != torch.strided:
             raise ValueError(f"an observation must be plain numbers, got a tensor of {observed.dtype}")
         shape = tuple(observed.shape)
@@ -147,14 +148,3 @@ class Agent:
             raise ValueError(f"columns {columns} of the observation are NaN or infinite as {self.dtype}")
         self._shape = shape
         return read
-
-
-def _tensor(given: Any) -> Tensor:
-    """Numbers as float64, whatever holds them; what is masked or None is NaN."""
-    try:
-        array = np.ma.array(given, copy=True)
-        if array.dtype.kind in "fiubO":
-            return torch.from_numpy(np.ascontiguousarray(array.astype(np.float64).filled(np.nan)))
-    except (TypeError, ValueError):  # ragged lists, other objects
-        pass
-    raise ValueError(f"an observation must be numbers [obs] or [n, obs], got {type(given).__name__}")
