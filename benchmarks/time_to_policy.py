@@ -40,6 +40,7 @@ def main(
     method: str | None = None,
     network: str | None = None,
     held_out: float | None = None,
+    learning_rate: float | None = None,
     seed: int = 0,
     folder: Path = Path("runs/time_to_policy"),
     results: Path = RESULTS,
@@ -55,6 +56,7 @@ def main(
         method: what is trained (default: the task's).
         network: network of the planner (default: the task's).
         held_out: share of the trajectories that the weights are chosen by (default: the task's).
+        learning_rate: its peak, of the planner (default: the network's).
         seed: of the training.
         folder: where to train.
         results: the table.
@@ -69,7 +71,7 @@ def main(
             task=task,
             method=method,
             labels=labels,
-            planner=PlannerConfig(steps=updates, network=network, held_out=held_out),
+            planner=PlannerConfig(steps=updates, network=network, held_out=held_out, learning_rate=learning_rate),
             run=RunConfig(seed=seed, resume=True),
         )
         config = resolve(asked, get_task(task))

@@ -30,7 +30,13 @@ def study(benchmark_script, monkeypatch):
 
 def test_each_number_of_updates_is_trained_and_written_once(study, tmp_path):
     for steps in ((30,), (30, 60)):
-        options = {"fraction": 0.01, "held_out": 0.1, "folder": tmp_path, "results": tmp_path / "t.csv"}
+        options = {
+            "fraction": 0.01,
+            "held_out": 0.1,
+            "learning_rate": 0.002,
+            "folder": tmp_path,
+            "results": tmp_path / "t.csv",
+        }
         study.main("sorting", tmp_path, steps=steps, **options)
     with (tmp_path / "t.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -39,6 +45,7 @@ def test_each_number_of_updates_is_trained_and_written_once(study, tmp_path):
         ("60", "135", "180", "40"),
     ]
     assert {row["network"] for row in rows} == {"mlp"} and {row["held_out"] for row in rows} == {"0.1"}
+    assert {row["learning_rate"] for row in rows} == {"0.002"} and study.asked[0].planner.learning_rate == 0.002
     assert [config.rollouts_per_context for config in study.rolled] == [3, 3]
     assert [config.planner.steps for config in study.asked] == [30, 60]
     assert study.asked[-1].labels.unit == "window" and study.asked[-1].planner.steps == 60
