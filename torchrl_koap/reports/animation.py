@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -191,16 +192,16 @@ def _film_in_gymnasium(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     given = environment_arguments(run.evaluation.get("env_kwargs") or ())
     frames: list[np.ndarray] = []
     try:
-        env = gymnasium.make(run.evaluation["env"], **(given | {"render_mode": "rgb_array"}))
-        episode = GymnasiumEpisode(env, 0, max_steps=len(actions))
-        episode.reset(seed=run.evaluation["episode"][index]["seed"])
-        stride = max(2, -(-len(actions) // FILM_FRAMES))
-        for number, action in enumerate(actions):
-            if number % stride == 0:
-                frames.append(np.asarray(env.render(), np.uint8))
-            episode.step(action)
-        frames.append(np.asarray(env.render(), np.uint8))
-        env.close()
+        made = gymnasium.make(run.evaluation["env"], **(given | {"render_mode": "rgb_array"}))
+        with contextlib.closing(made) as env:
+            episode = GymnasiumEpisode(env, 0, max_steps=len(actions))
+            episode.reset(seed=run.evaluation["episode"][index]["seed"])
+            stride = max(2, -(-len(actions) // FILM_FRAMES))
+            for number, action in enumerate(actions):
+                if number % stride == 0:
+                    frames.append(np.asarray(env.render(), np.uint8))
+                episode.step(action)
+            frames.append(np.asarray(env.render(), np.uint8))
     except Exception as error:  # of an environment of somebody else
         raise NotFilmed(f"environment {run.evaluation['env']!r} was not filmed: {error}") from error
     if any(frame.ndim != 3 or frame.shape != frames[0].shape for frame in frames):
