@@ -47,7 +47,7 @@ def draw_all(folder: Path) -> list[Path]:
     ways = [(row["way"], float(row["p50_ms"]), float(row["p99_ms"])) for row in read_rows("exported_policy")]
     return [
         draw_label_curves(label_curves(), folder / "success_and_entropy.png"),
-        *(draw_pipeline(folder / f"pipeline.{kind}") for kind in ("svg", "png")),
+        draw_pipeline(folder / "pipeline.svg"),
         draw_bench_average("table_1", folder / "paper_average.png"),
         draw_unlabelled(folder / "unlabelled_data.png"),
         draw_bars(
@@ -124,25 +124,26 @@ def draw_label_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path:
 
 
 def draw_pipeline(path: Path) -> Path:
-    """States, plan, latent action, action: what each part reads and whether it needs labels.
+    """Which recordings train which part, and what each part reads in the control loop.
 
     Args:
-        path (Path): svg or png to write.
+        path (Path): svg to write.
     """
-    figure = Figure(figsize=(9.6, 2.75))
+    figure = Figure(figsize=(9.6, 3.6))
     axes = figure.add_axes((0, 0, 1, 1))
-    axes.set(xlim=(0, 96), ylim=(0, 27.5))
+    axes.set(xlim=(0, 96), ylim=(0, 36))
     axes.set_axis_off()
-    axes.add_patch(_box(17.5, 13.2, 49.5, 13.3, facecolor="#eef4ff", edgecolor="none"))
-    axes.text(42.2, 24.6, "learned from states alone: every demonstration", ha="center", size=9, color=BLUE)
-    axes.add_patch(_box(69.2, 13.2, 11.2, 13.3, facecolor="#fff1e3", edgecolor="none"))
-    axes.text(74.8, 24.6, "few labels", ha="center", size=9, color=ORANGE)
+    for bar in range(50):  # recordings
+        kind = {"facecolor": ORANGE if bar in (4, 17, 21, 38, 40) else FAINT, "edgecolor": "none"}
+        axes.add_patch(_box(1.5 + bar % 10 * 1.15, 32.6 - bar // 10 * 1.9, 0.75, 1.4, radius=0.2, **kind))
+    axes.text(14.5, 32.4, "50 recordings of states train planner and Koopman model", size=9, color=BLUE)
+    axes.text(27.2, 27.0, "5 of them with actions fit the decoder", size=9, color=ORANGE)
     words = (
-        (1.5, 11, "states", "$x_{t-1}, x_t$", MUTED),
+        (1.5, 11, "states", "$x_{t-4} \\ldots x_t$", MUTED),
         (20, 12, "planner", "diffusion model", BLUE),
         (36.4, 11.2, "plan", "$x_{t+1} \\ldots x_{t+14}$", MUTED),
-        (52.2, 13.4, "Koopman model", "$z' = Kz + Bu$", BLUE),
-        (70, 9.6, "decoder", "linear", ORANGE),
+        (52.2, 14.4, "Koopman model", "$z_{t+1} = Kz_t + Bu_t$", BLUE),
+        (71, 9.6, "decoder", "$a_t = Du_t$", ORANGE),
         (84.5, 10, "action", "$a_t$", MUTED),
     )
     for x, width, head, text, color in words:
@@ -152,26 +153,28 @@ def draw_pipeline(path: Path) -> Path:
         axes.text(x + width / 2, 16.7, text, ha="center", va="center", size=9, color=INK)
     for (x, width, *_), (after, *_) in zip(words, words[1:], strict=False):
         _arrow(axes, (x + width, 18.5), (after, 18.5))
-    axes.text(67.4, 19.3, "$u_t$", ha="center", size=10, color=INK)
-    axes.text(67.4, 10.4, "latent action", ha="center", size=9, color=MUTED)
-    axes.plot([67.4, 67.4], [12.3, 17.6], color=MUTED, linewidth=0.7, linestyle=":")
-    axes.plot([89.5, 89.5, 7], [14.5, 4.5, 4.5], color=INK, linewidth=1.1)
-    _arrow(axes, (7, 4.5), (7, 14.5))
-    axes.text(
-        48, 5.4, "environment: four actions of every plan are executed, then a new plan is made", ha="center", size=9
-    )
-    options = {"Date": None} if path.suffix == ".svg" else {"Software": None}
+    for start, end, height, color in ((14.5, 26, 31.4, BLUE), (26, 59.4, 31.4, BLUE), (14.5, 75.8, 26.2, ORANGE)):
+        axes.plot([start, end], [height, height], color=color, linewidth=1.1)
+        _arrow(axes, (end, height), (end, 22.5), color)
+    axes.text(68.8, 19.3, "$u_t$", ha="center", size=10, color=INK)
+    axes.text(68.8, 12.2, "latent action", ha="center", size=9, color=MUTED)
+    axes.plot([10, 10, 59.4], [14.5, 9.8, 9.8], color=INK, linewidth=1.1)
+    _arrow(axes, (59.4, 9.8), (59.4, 14.5))
+    axes.text(34.7, 10.6, "the present state and four past ones", ha="center", size=9)
+    axes.plot([89.5, 89.5, 5], [14.5, 3.5, 3.5], color=INK, linewidth=1.1)
+    _arrow(axes, (5, 3.5), (5, 14.5))
+    axes.text(48, 4.4, "robot: four actions of every plan are executed, then a new plan is made", ha="center", size=9)
     with rc_context({"svg.hashsalt": "torchrl_koap"}):  # the same file at every call
-        figure.savefig(path, dpi=130, facecolor="white", metadata=options)
+        figure.savefig(path, dpi=130, facecolor="white", metadata={"Date": None})
     return path
 
 
-def _box(x: float, y: float, width: float, height: float, **style) -> FancyBboxPatch:
-    return FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=1.1", **style)
+def _box(x: float, y: float, width: float, height: float, radius: float = 1.1, **style) -> FancyBboxPatch:
+    return FancyBboxPatch((x, y), width, height, boxstyle=f"round,pad=0,rounding_size={radius}", **style)
 
 
-def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
-    axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=INK, linewidth=1.1))
+def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], color: str = INK) -> None:
+    axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=color, linewidth=1.1))
 
 
 def _interval(successes: int, trials: int) -> tuple[float, float, float]:

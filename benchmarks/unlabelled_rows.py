@@ -14,11 +14,11 @@ from tables import percent, read_rows, table
 
 REGIMES = {
     "plain": "positions as recorded",
-    "noise": "positions, noise of three steps",
+    "noise": "positions, noise of 3 steps",
     "wide_64": "64 nonlinear columns, noise",
     "wide_512": "512 nonlinear columns, noise",
     "pictures": "32 x 32 pictures, 64 components",
-    "distractors": "64 columns, 2 distractors",
+    "distractors": "64 nonlinear columns, 2 distractors",
     "joints_hidden": "Stacking, joints hidden",
 }
 _LOOKS = {

@@ -35,7 +35,7 @@ def test_pages_have_one_form(page):
     assert len(form["alt"].split()) >= 5 and (page.parent / form["picture"]).exists()
     assert len(form["table"].splitlines()) - 2 <= 8
     conclusions = [line.split(". ", 1)[1] for line in form["conclusions"].splitlines()]
-    assert 2 <= len(conclusions) <= 5 and conclusions[-1].startswith("Limits: ")
+    assert len(conclusions) == 5 and conclusions[-1].startswith("Limits: ")
     assert all(len(plain(line).split()) <= 20 for line in conclusions), conclusions
     files = re.findall(r"\]\(([^)]+\.csv)\)", form["files"])
     assert files and all((page.parent / name).exists() for name in files)

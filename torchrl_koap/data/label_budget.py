@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Which steps keep their action label, an exact account of how many that were, and which trajectories are used.
 
-Everything outside the budget is poisoned rather than dropped: the action becomes NaN, so whoever reads it by mistake
-finds out at once. The observation of some tasks repeats the last command, whose differences *are* the actions; those
-columns are poisoned too (:func:`hide_commands`).
+Labels outside the budget become NaN, so code that reads them by mistake produces NaN losses. The observation of some
+tasks repeats the last command. Its differences are the actions, so those columns become NaN too
+(:func:`hide_commands`).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What is right in form and unlikely in demonstrations: said, not refused, since it may be meant; some can be cut."""
+"""Warnings about demonstrations that are valid but unlikely; cuts of still ends and short trajectories."""
 
 from __future__ import annotations
 
@@ -315,7 +315,7 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
 
 
 def constant_columns(actions: np.ndarray) -> list[float | None]:
-    """What every column of actions ``[N, act]`` is in all labels; None where it differs, or is known once at most."""
+    """Returns the constant value of each column of actions ``[N, act]``; None if it varies or has one label at most."""
     steps = actions[np.isfinite(actions).all(-1)]
     return [float(column[0]) if len(column) > 1 and np.ptp(column) == 0 else None for column in steps.T]
 

@@ -20,7 +20,7 @@ MOST_EPISODES = 100_000  # kept in memory
 
 @dataclass
 class RolloutConfig:
-    """How a trained run is rolled out, whatever for.
+    """Options of the rollouts of a trained run.
 
     Attributes:
         episodes: number of rollouts.
@@ -101,7 +101,7 @@ _IN_JSON = {"True": "true", "False": "false", "None": "null"}
 
 
 def check_rollouts(config: RolloutConfig) -> None:
-    """Refuses what no run could be rolled out with, before any of it is loaded.
+    """Refuses options that fit no run, before a run is loaded.
 
     Args:
         config (RolloutConfig): what was asked for.
@@ -128,7 +128,7 @@ def check_rollouts(config: RolloutConfig) -> None:
 
 
 def check_options(config: EvalConfig) -> None:
-    """Refuses what no run could be evaluated with, before any of it is loaded.
+    """Refuses evaluation options that fit no run, before a run is loaded.
 
     Args:
         config (EvalConfig): what was asked for.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How well a run does without an environment: plans and actions judged on recorded data, where rollouts would stand."""
+"""Evaluation without an environment: errors of plans and actions on recorded data."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def load_policy(
 
 
 def trained_policy(trained: Trained, asked: ExecutionConfig) -> PlanningPolicy:
-    """Makes a policy of what was trained; what is not asked for is as it was trained for."""
+    """Makes a policy of a finished training; options that are None are those of the training."""
     execution, follower = trained.execution, None
     if asked.strategy == "oracle" and trained.method.plans:
         execution = execution.replaced(gain=1.0)  # it knows how commands are answered

@@ -144,8 +144,8 @@ class DiffusionPolicyLoss(DenoisingLoss):
     The sequence are the actions of frames ``history - 1 .. T - 2``. A step counts if it has a label and neither its
     frame nor the next one is padded. The denoiser sees steps that do not count as the middle of the range of actions,
     noise added; what was stored there (NaN) reaches neither value nor gradient. A batch without labels gives exactly 0.
-    Labels are what this method lives on: draw windows with ``labelled_share=1``
-    (:class:`~torchrl_koap.data.WindowSampler`).
+    This method learns from labels only: draw windows with
+    ``labelled_share=1`` (:class:`~torchrl_koap.data.WindowSampler`).
 
     Examples:
         >>> import torch

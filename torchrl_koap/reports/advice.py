@@ -136,7 +136,7 @@ def too_slow(run: RunFacts) -> Advice | None:
 
 
 def few_rollouts(run: RunFacts) -> Advice | None:
-    """The interval is too wide to tell anything from anything."""
+    """The interval of the success is wide."""
     low, high, episodes = (run.success(entry) for entry in ("low", "high", "episodes"))
     if low is None or high is None or episodes is None or high - low <= WIDE or episodes >= 60:
         return None

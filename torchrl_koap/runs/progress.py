@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Progress bars, which never end what they are the bar of, and loggers beside ``metrics.csv``."""
+"""Progress bars, whose errors never stop the work, and loggers beside ``metrics.csv``."""
 
 from __future__ import annotations
 

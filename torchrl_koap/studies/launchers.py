@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Many independent jobs, in processes of this machine or on a Ray cluster. One that dies takes no other along.
+"""Many independent jobs, in processes of this machine or on a Ray cluster. A failed job does not stop the others.
 
 Imported first by the server that worker processes are copies of: :func:`end_with_parent` is its first act.
 """
@@ -233,7 +233,7 @@ def _death(exit_code: int) -> str:
 
 
 def _child(writer: Any, function: Callable[[str], None], folder: str, log: str) -> None:
-    # not to outlive a killed parent: the next `koap curve` in the folder would meet its own ghost
+    # ends with a killed parent: else the next `koap curve` in the folder would find it still writing
     threading.Thread(target=_die_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     with contextlib.suppress(OSError), _open_log(log) as file:  # what is not Python prints past sys.stdout

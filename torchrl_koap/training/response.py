@@ -80,7 +80,7 @@ Rows = TypeVar("Rows", LabelledSteps, Stretches)
 
 
 def take(rows: Rows, chosen: Tensor) -> Rows:
-    """Some steps, or some stretches."""
+    """Selects steps, or stretches."""
     return type(rows)(*(field[chosen] for field in rows))
 
 

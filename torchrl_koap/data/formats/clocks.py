@@ -89,7 +89,7 @@ def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> floa
 
 
 def told_rate(clock: Clock, control_hz: float) -> str:
-    """What time stamps say that are not looked at, where it is no rate or another one; else nothing."""
+    """Returns a note if ignored time stamps give no rate or another one; else an empty text."""
     rate = usual_rate(clock, [])
     if rate is None:
         return " (its time stamps are not looked at)"

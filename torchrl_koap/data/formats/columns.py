@@ -149,7 +149,7 @@ def _without(columns: Mapping[str, Any], dropped: Sequence[str]) -> dict[str, An
 
 
 def unknown(asked: Sequence[str], known: Sequence[str], what: str) -> list[str]:
-    """What is to be said of names that are none of those known."""
+    """Returns a message for every unknown name."""
     said = []
     for name in asked:
         try:

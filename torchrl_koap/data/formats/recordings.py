@@ -178,7 +178,7 @@ def make_recordings(
 
 
 def wrong_rate(value: Any, name: str) -> list[str]:
-    """What is to be said of frames per second that are none."""
+    """Returns a message if frames per second are no positive number."""
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and not np.iscomplexobj(value)
     if number and 0 < value < math.inf:
         return []

@@ -105,7 +105,7 @@ class Expert(abc.ABC):
 
 
 def check_episodes(modes: Sequence, seeds: Sequence, contexts: Any = None, objects: int = 0) -> None:
-    """Checks that an expert is told as much about every episode.
+    """Checks that every episode has a mode, a seed and, with objects, a context.
 
     Raises:
         ValueError: if there is no mode, or the numbers of modes, seeds and, with objects, contexts differ.

@@ -93,7 +93,7 @@ class CommandDecoder(nn.Module):
 
 
 class CommandRegression(Follower):
-    r"""Follows plans by differences of the decoded command, drawn to the command itself.
+    r"""Follows plans by changes of the predicted command, and moves the command towards the predicted one.
 
     .. math::
         a_t = f(p_{t+1}) - f(x_t) + \rho\, (f(x_t) - c_t)

@@ -18,10 +18,10 @@ END_SPEED = 5.0  # weight of the speed at the end of the look-ahead: a short one
 class MPC(Follower):
     r"""Follows plans by model predictive control of the robot's response to its commands.
 
-    An inverse dynamics is told what the robot shall do, not what it was told to do; how far its command is ahead of it
-    decides what it does next, and the policy knows that command: it gave it. With the response
-    (:class:`~torchrl_koap.modules.ResponseModel`), which is linear, the next changes ``a`` of the command come in
-    closed form:
+    An inverse dynamics model reads the target state, not the last command. How far the command is ahead of the robot
+    decides its next motion, and the policy knows the command. The response
+    (:class:`~torchrl_koap.modules.ResponseModel`) is linear, so the next changes ``a`` of the command come in closed
+    form:
 
     .. math::
         \min_a \sum_{k=1}^{N} |y_k - p_k|^2 + \gamma^2 |(y_N - y_{N-1}) - (p_N - p_{N-1})|^2

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A lifting of wide, noisy states to the few coordinates behind them, trained in units of the measurement noise."""
+"""A lifting of high-dimensional, noisy states to few coordinates, trained in units of the measurement noise."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class NoiseAdjustedComponents(nn.Module):
 
     with the covariance ``C`` of the states and ``R`` of the white noise in them
     (:func:`~torchrl_koap.modules.koopman.smoothing.noise_covariance`): the minimum noise fraction transform (Green et
-    al. 1988), at unit spread. Where columns differ in their noise, principal components follow the loudest; these
-    follow the best measured. No column counts as measured to more than 1 % of its spread, and components that
+    al. 1988), at unit spread. Where columns differ in their noise, principal components follow the noisiest;
+    these follow the best measured. No column counts as measured to more than 1 % of its spread, and components that
     stand out by less than a factor of two are 0, but for the first.
 
     Args:
@@ -105,7 +105,7 @@ def _credible(noise: Tensor) -> Tensor:
 
 @torch.no_grad()
 def isomap(points: Tensor, dims: int) -> Tensor:
-    r"""Computes coordinates whose straight distances are those along the surface, as nearly as so many can be.
+    r"""Computes Isomap coordinates: their straight distances approximate those along the surface of the data.
 
     .. math::
         z_i = -\tfrac12\, \Lambda^{-1/2} V^T (D^2_{i} - \overline{D^2})
@@ -156,7 +156,7 @@ def _shortest_ways(points: Tensor, landmarks: int) -> np.ndarray:
 
 
 class CompactLifting(TensorDictModuleBase):
-    r"""Lifts wide states to few coordinates, and finds out without labels whether twice as many are needed.
+    r"""Lifts high-dimensional states to few coordinates, and chooses without labels whether twice as many are needed.
 
     .. math::
         y = P x, \quad z = (g_1(y), g_2(y)), \quad

@@ -40,7 +40,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "penalty": 1e-3,
     }
     | {"num_features": 1024, "curvature": 10.0, "motion_scale": 3.0, "position_scale": 2.0, "position_weight": 1.0},
-    # where observations are noisy or wide: few coordinates that unlabelled windows determine, smoothed
+    # where observations are noisy or high-dimensional: few coordinates that unlabelled windows determine, smoothed
     # (docs/results/unlabelled_data.md)
     "semi_supervised": _DEFAULT
     | {
@@ -117,7 +117,7 @@ def make_koopman_inverse_dynamics(
         include_state = include_state or state_dim <= NARROW
         latent_dim = state_dim if include_state else action_dim
     if "latent_dim" not in overrides and "include_state" not in overrides and latent_dim < state_dim:
-        include_state = False  # a preset's size is too small for a wide state to be part of the lifting
+        include_state = False  # a preset's size is too small for a high-dimensional state to be part of the lifting
     own = set(choice) - set(_DEFAULT)  # what only this network takes
     settings = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *own)}
     # networks are built in this order: their first weights are drawn one after the other

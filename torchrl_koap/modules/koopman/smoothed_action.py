@@ -20,7 +20,7 @@ RAW_PAST, RAW_LOOK_AHEAD = 4, (2, 3, 4, 5)  # frames that the raw block reads
 
 
 class LatentActionSmoothed(LatentActionModule):
-    r"""Computes observables of a lifted and smoothed window, or of the raw one where few labels say that it is better.
+    r"""Computes observables of a lifted and smoothed window, or of the raw one if its held-out error is clearly lower.
 
     .. math::
         w_t = (g(x_{t-n}), \dots, g(x_t), g(x_{t+2}), \dots, g(x_{t+k})), \quad
