@@ -3,10 +3,12 @@
 
     OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner
     OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part precision
+    python benchmarks/training_speed.py --part cuda
 
 Controller: every preset of KOAP, batches of 256 windows of 16 frames (17 for "semi_supervised"), sampling included.
 Planner: the default U-Net on 256 windows, and one plan and 60. Precision: updates of wide MLPs with matrix products in
-float32 and bfloat16, which a processor without units for it emulates.
+float32 and bfloat16, which a processor without units for it emulates. CUDA: the whole training loop on a GPU, windows
+and augmentation included, step by step, with a compiled denoiser, and with the update replayed as a graph.
 """
 
 from __future__ import annotations
@@ -22,7 +24,13 @@ from tables import open_table
 from tensordict import TensorDict
 from torchrl.objectives import LossModule
 
-from torchrl_koap.data import flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap.data import (
+    RecoveryAugmentation,
+    cut_windows,
+    flatten_trajectories,
+    make_window_buffer,
+    select_state,
+)
 from torchrl_koap.modules import (
     PRESETS,
     MLPDenoiser,
@@ -33,11 +41,14 @@ from torchrl_koap.modules import (
 )
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.device import has_bfloat16_units
+from torchrl_koap.training.loop import moving_average, train_phase
 
 RESULTS = Path(__file__).parent / "results"
 SPEED = ("part", "variant", "parameters", "updates_per_second", "plan_1_ms", "plan_60_ms", "command")
 PRECISION = ("processor", "units", "width", "depth", "batch", "float32", "bfloat16", "ratio")
 COMMAND = "OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner"
+CUDA = ("device", "network", "batch", "precision", "eager", "compiled", "replayed", "processor")
+BATCH, UPDATES = 512, 600
 SIZES = ((512, 4, 512), (512, 4, 256), (256, 3, 128))  # width, residual layers, batch
 
 
@@ -109,7 +120,49 @@ def wide_update(width: int, depth: int, batch: int, dtype: torch.dtype | None) -
     return update_of(PlannerLoss(planner, dtype=dtype), lambda: windows)
 
 
-def main(*, part: tuple[Literal["controller", "planner", "precision"], ...], repeats: int = 40) -> None:
+def loop_rate(network: str, *, device: str, replay: bool = False, compiled: bool = False) -> float:
+    """Updates per second of the training loop after its first hundred, in bfloat16, for 19 columns."""
+    torch.manual_seed(0)
+    denoiser = MLPDenoiser(19, 38, horizon=14) if network == "mlp" else TemporalUnet(19, 38)
+    planner = StatePlanner(denoiser, state_dim=19)
+    paths = [torch.randn(200, 19).cumsum(0) * 0.01 for _ in range(100)]
+    data = select_state(flatten_trajectories(paths, None, action_dim=1), range(19)).to(device)
+    planner.fit_normalizers(cut_windows(data, 16, select=["state"])["state"])
+    planner.to(device)
+    if compiled:
+        planner.denoiser.compile()
+    loss = PlannerLoss(planner, dtype=torch.bfloat16)
+    buffer, augment = make_window_buffer(data, 16, BATCH, select=["state"]), RecoveryAugmentation(0.01)
+    times: list[float] = []
+    train_phase(
+        "planner",
+        loss,
+        lambda: augment(buffer.sample()),
+        num_steps=UPDATES,
+        learning_rate=1e-3,
+        target_update=moving_average(loss, UPDATES),
+        replay=replay,
+        log_every=100,  # reads the losses, so that the GPU is waited for
+        progress=lambda done, values: times.append(time.perf_counter()) if done % 100 == 0 else None,
+    )
+    return (UPDATES - 100) / (times[-1] - times[0])
+
+
+def on_gpu() -> None:
+    """Writes a row per network with the rates on the GPU that is there, and on one core of its machine."""
+    device = torch.cuda.get_device_name()
+    done, write = open_table(RESULTS / "training_speed_cuda.csv", CUDA, CUDA[:4])
+    for network in ("mlp", "unet"):
+        key = (device, network, BATCH, "bfloat16")
+        if tuple(map(str, key)) not in done:
+            ways: tuple[dict[str, bool], ...] = ({}, {"compiled": True}, {"replay": True})
+            rates = [*(loop_rate(network, device="cuda", **way) for way in ways), loop_rate(network, device="cpu")]
+            row = (*key, *(f"{rate:.0f}" for rate in rates))
+            print(*row, flush=True)
+            write(row)
+
+
+def main(*, part: tuple[Literal["controller", "planner", "precision", "cuda"], ...], repeats: int = 40) -> None:
     """Measures what the tables lack.
 
     Args:
@@ -123,6 +176,8 @@ def main(*, part: tuple[Literal["controller", "planner", "precision"], ...], rep
             print(*row[:-1])
             if tuple(map(str, row[:2])) not in done:
                 write(row)
+    if "cuda" in part:
+        on_gpu()
     if "precision" not in part:
         return
     known = (torch.cpu.get_capabilities()["cpu_name"], int(has_bfloat16_units()))

@@ -1,12 +1,18 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Matrix products in bfloat16 only where the machine has units for them, unless asked for by name."""
+"""Matrix products in bfloat16 only where the machine has units for them, unless asked for by name; GPUs."""
 
 import warnings
+from itertools import cycle
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
 
+from torchrl_koap.modules import MLPDenoiser, StatePlanner
+from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.device import find_precision, has_bfloat16_units, set_up_torch
+from torchrl_koap.training.loop import SETTLED, train_phase
 
 
 @pytest.fixture(params=["amx_bf16", "avx512_bf16", None])
@@ -44,3 +50,33 @@ def test_no_number_of_threads_leaves_torch_alone():
     before = torch.get_num_threads()
     set_up_torch(None, "cpu")
     assert torch.get_num_threads() == before
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("replay", [False, True])
+def test_a_gpu_learns_what_a_processor_learns(replay):
+    def losses(device):
+        torch.manual_seed(0)
+        planner, logged = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=64), state_dim=2), []
+        entries = {"state": torch.randn(8, 32, 16, 2).cumsum(2), "planner_noise": torch.randn(8, 32, 14, 2)}
+        entries["planner_time"] = torch.randint(100, (8, 32)).float()
+        planner.fit_normalizers(entries["state"])
+        loss, batches = PlannerLoss(planner.to(device)), cycle(TensorDict(entries, [8, 32]).to(device))
+        train_phase(
+            "planner",
+            loss,
+            lambda: next(batches),
+            num_steps=SETTLED + 50,
+            learning_rate=1e-3,
+            target_update=SoftUpdate(loss, eps=0.9),
+            replay=replay,
+            log_every=1,
+            progress=lambda done, values: logged.append(values["loss_planner"]),
+        )
+        return torch.tensor(logged), loss.target_network_params.flatten_keys().cpu()
+
+    (expected, average), (found, found_average) = losses("cpu"), losses("cuda")
+    assert expected[-1] < 0.9 * expected[0]
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
+    for name, value in average.items():
+        torch.testing.assert_close(found_average[name], value, rtol=1e-2, atol=1e-3)

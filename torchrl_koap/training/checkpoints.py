@@ -31,7 +31,8 @@ def save_training_state(
     tensors["rng.cpu"] = torch.get_rng_state()
     if torch.cuda.is_available():
         tensors |= {f"rng.cuda.{i}": value for i, value in enumerate(torch.cuda.get_rng_state_all())}
-    save_tensors(path, tensors, {**about, "param_groups": state["param_groups"], "moments": len(state["state"])})
+    groups = [{**group, "lr": float(group["lr"])} for group in state["param_groups"]]  # a tensor where it is replayed
+    save_tensors(path, tensors, {**about, "param_groups": groups, "moments": len(state["state"])})
 
 
 def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
@@ -76,7 +77,7 @@ def _param_groups(path: str | Path, saved: Any, optimizer: torch.optim.Optimizer
     now = optimizer.state_dict()["param_groups"]
     if not isinstance(saved, list) or len(saved) != len(now) or not all(isinstance(group, dict) for group in saved):
         raise CheckpointError(f"{path} is damaged: param_groups must be a list of {len(now)} objects")
-    for old, new in zip(saved, json.loads(json.dumps(now)), strict=True):
+    for old, new in zip(saved, json.loads(json.dumps(now, default=float)), strict=True):
         rate = old.get("lr")
         if type(rate) not in (int, float) or not math.isfinite(rate) or rate < 0:
             raise CheckpointError(f"{path} is damaged: param_groups: lr must be a number from 0 on, got {rate!r}")

@@ -159,6 +159,7 @@ def _train_sampler(
         learning_rate=section.learning_rate,
         weight_decay=WEIGHT_DECAY,
         target_update=moving_average(loss, num_steps),
+        replay=True,
     )
     loss.target_network_params.to_module(sampler)
     return sampler, losses

@@ -6,11 +6,13 @@ from __future__ import annotations
 import contextlib
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
@@ -64,6 +66,7 @@ def train_phase(
     log_every: int = 50,
     checkpoint_every: int | None = None,
     resume: bool = False,
+    replay: bool = False,
     progress: Callable[[int, dict[str, float]], None] | None = None,
 ) -> dict[str, float]:
     """Minimises the sum of all ``loss_*`` entries with AdamW.
@@ -87,6 +90,8 @@ def train_phase(
         logger (optional): a TorchRL logger; scalars are named ``phase/term``, a row every ``log_every`` updates.
         checkpoint_every (int, optional): updates per checkpoint. Default: 500.
         resume (bool): go on from the checkpoint of this phase, if there is one, on a CPU bit for bit.
+        replay (bool): on CUDA, record an update once as a graph and replay it. The loss must take the same path for
+            every batch, as denoising losses do. Defaults to False.
         progress (callable, optional): called with the number of updates done and the last logged values.
 
     Returns:
@@ -102,8 +107,12 @@ def train_phase(
     for name, value in {"num_steps": num_steps, "log_every": log_every, "checkpoint_every": checkpoint_every}.items():
         if value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
+    device = next(loss_module.parameters()).device
+    replay = replay and device.type == "cuda"
     # fused AdamW is the quickest on CPU and on CUDA, and its state is plain tensors
-    optimizer = torch.optim.AdamW(loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True)
+    optimizer = torch.optim.AdamW(
+        loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True, capturable=replay
+    )
     checkpoint = None if run is None else run.path / "checkpoints" / f"{phase}.safetensors"
     state = nn.ModuleDict({"loss": loss_module} if best is None else {"loss": loss_module, "best": best})
     start = 0
@@ -114,6 +123,23 @@ def train_phase(
                 raise CheckpointError(f"{checkpoint} is at step {start}, this training has {num_steps}")
         run.rewind_metrics(phase, start)
     values: dict[str, float] = run.last_metrics(phase) if start else {}
+    shown_rate = torch.tensor(learning_rate, device=device)  # a graph reads tensors alone
+
+    def update(batch: TensorDictBase) -> TensorDictBase:
+        losses = loss_module(batch)
+        terms = losses.select(*(key for key in losses.keys() if key.startswith("loss_")))
+        sum(terms.values()).backward()
+        limit_outlier(optimizer)
+        optimizer.step()
+        optimizer.zero_grad()
+        if target_update is not None:
+            target_update.step()
+        return terms.detach()
+
+    if replay:
+        with warnings.catch_warnings():  # it says that it changes how torch walks through tensordicts
+            warnings.simplefilter("ignore", UserWarning)
+            update = CudaGraphModule(update)
     done = start
     began, mark, marked = time.perf_counter(), time.perf_counter(), start
     for step in range(start, num_steps):
@@ -123,16 +149,9 @@ def train_phase(
             warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / max(warmup, 1))
         )
         for group in optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = shown_rate.fill_(rate) if replay else rate
         with _interrupts_let_through():
-            losses = loss_module(sample())
-        terms = {key: losses.get(key) for key in losses.keys() if key.startswith("loss_")}
-        sum(terms.values()).backward()
-        limit_outlier(optimizer)
-        optimizer.step()
-        optimizer.zero_grad()
-        if target_update is not None:
-            target_update.step()
+            terms = update(sample())
 
         done = step + 1
         scored = best is not None and (done % best.every == 0 or done == num_steps)
@@ -206,14 +225,16 @@ def limit_outlier(optimizer: torch.optim.AdamW) -> Tensor | None:
     states = [optimizer.state[parameter] for parameter in parameters if "step" in optimizer.state[parameter]]
     if len(states) < len(parameters) or not states:
         return None
-    updates = float(states[0]["step"])
-    if updates < SETTLED:
+    updates = states[0]["step"]
+    if not updates.is_cuda and updates < SETTLED:
         return None
     gradients = [parameter.grad for parameter in parameters]
     length = torch.nn.utils.get_total_norm(gradients)
     # the second moment is positive: its sum is the 1-norm
     moment = torch.stack(torch._foreach_norm([state["exp_avg_sq"] for state in states], 1)).sum()
-    typical = (moment / (1 - group["betas"][1] ** updates)).sqrt()
+    share = 1 - group["betas"][1] ** updates.double()
+    typical = (moment / share.to(moment.dtype)).sqrt()
     factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or one that is not finite
+    factor = torch.where(updates < SETTLED, 1.0, factor)  # not read on a GPU, which would have to be waited for
     torch._foreach_mul_(gradients, factor)
     return factor

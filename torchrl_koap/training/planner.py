@@ -110,6 +110,7 @@ def learn_planner(
             run=run,
             logger=logger,
             resume=config.run.resume,
+            replay=True,
             progress=show_losses(bar),
         )
     loss.target_network_params.to_module(planner)
