@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
 from torchrl_koap.modules import MLPDenoiser, StatePlanner
+from torchrl_koap.modules.planning.noise_schedule import NUM_TRAIN_STEPS
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.device import find_precision, has_bfloat16_units, set_up_torch
 from torchrl_koap.training.loop import SETTLED, train_phase
@@ -59,7 +60,7 @@ def test_a_gpu_learns_what_a_processor_learns(replay):
         torch.manual_seed(0)
         planner, logged = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=64), state_dim=2), []
         entries = {"state": torch.randn(8, 32, 16, 2).cumsum(2), "planner_noise": torch.randn(8, 32, 14, 2)}
-        entries["planner_time"] = torch.randint(100, (8, 32)).float()
+        entries["planner_time"] = torch.randint(NUM_TRAIN_STEPS, (8, 32)).float()
         planner.fit_normalizers(entries["state"])
         loss, batches = PlannerLoss(planner.to(device)), cycle(TensorDict(entries, [8, 32]).to(device))
         train_phase(
