@@ -171,8 +171,8 @@ def make_demonstrations(
         problems.append(f"{option('control_hz')} is missing: frames per second")
     else:
         problems += wrong_rate(rate, "control_hz")
-    if max_steps is not None and (isinstance(max_steps, bool) or max_steps != int(max_steps) or max_steps < 1):
-        problems.append(f"{option('max_steps')} must be a positive whole number, got {max_steps}")
+    if max_steps is not None and (isinstance(max_steps, (bool, str)) or not max_steps >= 1 or max_steps % 1):
+        problems.append(f"{option('max_steps')} must be a positive whole number, got {max_steps!r}")
     commanded = _columns(command, names, "command", problems)
     others = [column for column in range(len(names)) if column not in commanded]
     own = others if robot is None else _columns(robot, names, "robot", problems)
@@ -205,7 +205,7 @@ def make_demonstrations(
         for frames, steps in zip(recordings.states, recordings.actions, strict=True)
         if np.isfinite(steps).all(-1).any()
     ]
-    if not own and robot is not None and not len(robot):
+    if not own and robot is not None and not problems:
         problems.append(f"{option('robot')} names no column")
     elif own and labelled and not any(np.ptp(frames, axis=0).any() for frames in labelled):
         which = ", ".join(names[column] for column in own)
@@ -260,9 +260,13 @@ def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str
 
 def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -> list[int]:
     """Columns that are given by name or number, one or several."""
-    given = [given] if isinstance(given, (str, int)) else list(given)
+    given = [given] if isinstance(given, (str, int, slice)) else list(given)
     odd = [
-        column for column in given if isinstance(column, (bool, np.bool_)) or not isinstance(column, str) and column % 1
+        column
+        for column in given
+        if isinstance(column, (bool, np.bool_))
+        or not isinstance(column, str)
+        and (not isinstance(column, (int, float, np.number)) or column % 1)
     ]
     if odd:
         problems.append(f"{option(what)} names columns by name or number, got {odd[0]!r}")

@@ -44,8 +44,19 @@ def test_a_counter_splits_and_sorts():
     np.testing.assert_array_equal(np.stack(mixed.states)[..., 0], [X[::2], X[1::2]])
     with pytest.raises(DataError, match="episode_id 0 comes back"):
         read(episode_id=[0, 0, 1, 1, 0, 0])
+    rows = np.random.default_rng(1).permutation(30)
+    by_time = read(x=rows, time=rows / 20)
+    np.testing.assert_array_equal(by_time.states[0][:, 0], np.arange(30))
     with pytest.raises(DataError, match="neither counts on nor starts again"):
         read(frame_index=[0, 1, 1, 2, 3, 4])
+
+
+def test_all_that_tells_episodes_apart_counts():
+    both = read(session=[0, 0, 0, 0, 1, 1], trial=[0, 0, 1, 1, 0, 0])
+    assert [frames[:, 0].tolist() for frames in both.states] == X.reshape(3, 2).tolist()
+    assert [len(frames) for frames in read(session=[0, 0, 0, 0, 1, 1], done=[0, 1, 0, 1, 0, 1]).states] == [2, 2, 2]
+    with pytest.raises(DataError, match="trial 0 of session 0 comes back"):
+        read(trial=[0, 0, 1, 1, 0, 0], session=[0] * 6)
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,13 @@ from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, numb
 @pytest.mark.parametrize(
     ("kind", "names"),
     {
-        "clock": "elapsed sim_time header.stamp wall_time stamp.nanosec timeStamp t_ms",
-        "episode": "episodeId run trial_no traj-idx demonstration ep segment_id take trial-nr",
-        "end": "is_last truncated episode_ends episode_done traj_finished dones_float",
-        "start": "is_first trajectory_starts new_episode",
+        "clock": "elapsed sim_time header.stamp wall_time stamp.nanosec timeStamp t_ms unix_ts utc robot_time_millis",
+        "episode": "episodeId run trial_no traj-idx ep segment_id take trial-nr sequence_id video_name file",
+        "end": "is_last truncated episode_ends episode_done traj_finished dones_float is_last_step eoe end_of_episode",
+        "start": "is_first trajectory_starts new_episode is_reset start",
         "length": "lengths episode_length",
         "frame": "timestep stepIndex frame_number",
-        "other": "discount cumulative_reward return_to_go next.success __index_level_0__",
+        "other": "discount cumulative_reward return_to_go next.success __index_level_0__ dt cost success_rate",
         None: "q restart length return_spring left_arm_time_constant step_height q_s run_speed take_off trial_force",
     }.items(),
 )
@@ -54,6 +54,11 @@ def test_dates_of_a_clock_are_seconds(zone, recwarn):
     np.testing.assert_allclose(np.diff(as_numbers("time_ms", dates)), 500)
     assert as_numbers("x", dates) is None and as_numbers("time", np.array(["noon", "later"])) is None
     assert not recwarn
+
+
+def test_numbers_of_episodes_that_float64_cannot_tell_apart():
+    for values in (np.array([2**63, 2**63 + 1], np.uint64), np.array([f"{2**63}", f"{2**63 + 1}"])):
+        assert as_numbers("episode", values).tolist() == [0, 1]
 
 
 def test_columns_of_any_type():

@@ -210,6 +210,32 @@ def test_missing_episodes_are_told(tmp_path):
         read_lerobot(root)
 
 
+def test_rows_of_an_episode_that_is_not_described_are_told(tmp_path):
+    root = write(tmp_path, version="v2.1")
+    (root / "meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 6}\n')
+    with pytest.raises(DataError, match="the description of episodes lacks 1, of which there are rows: name in episod"):
+        read_lerobot(root)
+    assert read_lerobot(root, episodes=[1]).sources == ("episode 1",)
+
+
+def test_columns_that_are_not_described_are_listed(tmp_path):
+    added = {"observation.touch": pa.array(np.arange(12.0)), "next.done": pa.array(np.arange(12) % 3 == 2)}
+    said = ["observation.touch (info.json does not list it)", "next.done (info.json does not list it)"]
+    assert list(read_lerobot(write(tmp_path, change=added)).skipped)[-2:] == said
+
+
+def test_flags_inside_an_episode_end_it(tmp_path):
+    flagged = {"next.done": pa.array(np.arange(12) % 3 == 2)}
+    root = write(tmp_path, change=flagged, features=FEATURES | {"next.done": {"dtype": "bool", "shape": [1]}})
+    assert [len(frames) for frames in read_lerobot(root).states] == [3] * 4
+
+
+def test_another_width_than_described_is_told(tmp_path):
+    features = FEATURES | {"observation.state": {"dtype": "float32", "shape": [6], "names": JOINTS[:6]}}
+    with pytest.raises(DataError, match="column 'observation.state' has 7 numbers, info.json says 6"):
+        read_lerobot(write(tmp_path, features=features))
+
+
 def test_one_row_is_too_short(tmp_path):
     with pytest.raises(DataError, match="none of its 2 trajectories has two frames"):
         read_lerobot(write(tmp_path, rows=1))

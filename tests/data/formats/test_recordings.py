@@ -54,9 +54,9 @@ def test_what_is_masked_or_none_is_unknown():
 
 def test_arrays_of_any_type_of_numbers():
     kept = [FRAMES.astype(kind) for kind in ("f2", ">f4", ">i8", "u1")] + [np.asfortranarray(FRAMES), FRAMES[::-1]]
-    kept += [torch.from_numpy(FRAMES).bfloat16()]
+    kept += [torch.from_numpy(FRAMES).bfloat16(), (torch.from_numpy(FRAMES) * 1j).conj().imag.neg()]
     recordings = make_recordings((frames for frames in kept), action_dim=1)
-    assert [frames.sum() for frames in recordings.states] == [105.0] * 7
+    assert [frames.sum() for frames in recordings.states] == [105.0] * 8
 
 
 def with_nan(array):
@@ -83,6 +83,9 @@ def with_nan(array):
         ([FRAMES], [np.ones((4, 1))], {"action_dim": 3}, r"actions have 1 columns, action_dim \(--action-dim\) says 3"),
         ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b"]}, "state_names names 2 columns, there are 3"),
         ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b", "a"]}, "state_names holds a more than once"),
+        ([FRAMES], [np.ones((4, 1))], {"state_names": "abc"}, "state_names must be a name for each of 3 columns, got"),
+        ([FRAMES], None, {"action_dim": -1}, r"action_dim \(--action-dim\) must be a positive whole number, got -1"),
+        ([FRAMES], None, {"action_dim": "2"}, "must be a positive whole number, got '2'"),
         ([FRAMES], [np.ones((4, 1))], {"control_hz": 0}, r"control_hz \(--control-hz\) must be a positive"),
         ([FRAMES], [np.ones((4, 1))], {"control_hz": True}, "must be a positive number .* got True"),
         ([torch.ones(5, 3).to_sparse()], None, {"action_dim": 1}, "states are no table of numbers, got Tensor"),

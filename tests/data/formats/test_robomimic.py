@@ -46,11 +46,34 @@ def test_chosen_observations(file):
 def test_the_frame_behind_the_last_action(file):
     with h5py.File(file, "a") as stream:
         demo = stream["data/demo_2"]
-        demo["next_obs/eef"], demo["next_obs/width"] = np.full((4, 3), 7.0), np.arange(1.0, 5.0)
+        demo["next_obs/eef"] = np.array([2.0, 2.0, 2.0, 7.0])[:, None].repeat(3, 1)
+        demo["next_obs/width"] = np.arange(1.0, 5.0)
     recordings = read_robomimic(file)
     assert len(recordings.states[0]) == 5 and recordings.num_labels == 4
     assert recordings.cameras["camera"][0].numbers == (0, 1, 2, 3, 3)
     assert recordings.states[0][-1].tolist() == [7, 7, 7, 4]
+
+
+@pytest.mark.parametrize("width", [np.arange(4.0), np.arange(4.0)[::-1]], ids=["the same frame", "another order"])
+def test_next_observations_that_are_not_those_of_the_next_frame(width, file):
+    with h5py.File(file, "a") as stream:
+        demo = stream["data/demo_2"]
+        demo["next_obs/eef"], demo["next_obs/width"] = demo["obs/eef"][:], width
+    with pytest.raises(
+        DataError, match="row 0 of next_obs/width is not row 1 of obs/width: .*--drop-columns. next_obs"
+    ):
+        read_robomimic(file)
+    recordings = read_robomimic(file, drop_columns=["next_obs"])
+    assert len(recordings.states[0]) == 4 and recordings.skipped == ("next_obs",)
+
+
+def test_ends_of_episodes_beside_the_observations(file):
+    with h5py.File(file, "a") as stream:
+        stream["data/demo_2/dones"] = np.array([False, True, False, True])
+        stream["data/demo_10/dones"] = np.zeros(5)
+    recordings = read_robomimic(file)
+    assert recordings.sources == ("demo_2[0]", "demo_2[1]", "demo_10") and recordings.skipped == ("dones",)
+    assert [frames[:, 3].tolist() for frames in recordings.states[:2]] == [[0, 1], [2, 3]]
 
 
 def test_faults(file, tmp_path):

@@ -13,7 +13,7 @@ from torchrl_koap.files import option, some
 
 UNEVEN = 0.2  # share of the usual step by which a step in time may differ
 SLOWEST, FASTEST = 1.0, 2000.0  # Hz; beyond, stamps are in another unit
-_ROUNDED = 0.03  # share of its mean step by which a rounded clock's steps may differ
+ROUNDED = 0.03  # share of its mean step by which a rounded clock's steps may differ
 _LONG = 20  # frames after which a column that rises evenly is taken for a clock
 
 
@@ -96,9 +96,13 @@ def told_rate(clock: Clock, control_hz: float) -> str:
     return "" if abs(control_hz / rate - 1) <= UNEVEN else f" (it says {rate:.4g} frames per second)"
 
 
-def rises_evenly(trajectories: Sequence[np.ndarray]) -> bool:
-    """Says whether a column, given by trajectory ``[T_i]``, rises by the same amount in every frame, as clocks do."""
+def rises_evenly(trajectories: Sequence[np.ndarray], *, room: float = ROUNDED) -> bool:
+    """Says whether a column, given by trajectory ``[T_i]``, rises in every frame as clocks do.
+
+    Keyword Args:
+        room (float): share of the mean step by which steps may differ. Default: what rounding leaves.
+    """
     steps = np.concatenate([np.diff(values.astype(np.float64)) for values in trajectories])
     if len(steps) < _LONG or steps.min() <= 0:
         return False
-    return bool(np.abs(steps / steps.mean() - 1).max() <= _ROUNDED)
+    return bool(np.abs(steps / steps.mean() - 1).max() <= room)

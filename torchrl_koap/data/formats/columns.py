@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.clocks import Clock, find_rate, rises_evenly, told_rate, usual_rate
+from torchrl_koap.data.formats.clocks import UNEVEN, Clock, find_rate, rises_evenly, told_rate, usual_rate
 from torchrl_koap.data.formats.frames import Clip, check_cameras
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
@@ -233,26 +233,30 @@ def _cut(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.nd
 def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     """The order of the rows of a piece, and which of them, so ordered, begin an episode.
 
-    Told by the number of the episode, by a frame counter or a clock that starts again, or by flags of starts and ends.
+    Told by the numbers of the episode, by a frame counter or a clock that starts again, and by flags of starts and
+    ends. Rows of one episode that lie out of order are sorted by its counter or clock.
     """
     rows = np.arange(len(next(iter(piece.states.values()), ())))
     called = {kind_of(name)[0]: name for name in reversed(piece.states)}
     columns = {kind: piece.states[name] for kind, name in called.items()}
-    number, frame = columns.get("episode"), columns.get("frame")
-    if number is not None:
-        if np.isnan(number).any():
-            raise ValueError(f"column {called['episode']!r} is empty in row {int(np.isnan(number).argmax())}")
-        sorting = columns.get("clock") if frame is None else frame
+    frame, clock = columns.get("frame"), columns.get("clock")
+    numbers = {name: values for name, values in piece.states.items() if kind_of(name)[0] == "episode"}
+    for name, values in numbers.items():
+        if np.isnan(values).any():
+            raise ValueError(f"column {name!r} is empty in row {int(np.isnan(values).argmax())}")
+    if numbers:
+        number = np.unique(np.stack(list(numbers.values())), axis=1, return_inverse=True)[1].reshape(-1)
+        sorting = clock if frame is None else frame
         starts = _changes(number)
         sorted_by = number[:, None] if sorting is None else np.stack([number, sorting], 1)
         if starts.sum() > len(np.unique(number)) and len(np.unique(sorted_by, axis=0)) < len(rows):
-            again = next(value for value in number[starts] if (number[starts] == value).sum() > 1)
+            again = next(at for at in np.flatnonzero(starts) if (number[starts] == number[at]).sum() > 1)
+            said = " of ".join(f"{name} {values[again]:g}" for name, values in numbers.items())
             raise ValueError(
-                f"{called['episode']} {again:g} comes back after another one, and no frame index or time says how its"
-                " rows follow each other"
+                f"{said} comes back after another one, and no frame index or time says how its rows follow each other"
             )
         order = rows if sorting is None else np.lexsort((sorting, number))
-        return order, _changes(number[order])
+        return order, _changes(number[order]) | _flagged(piece, order)
     if frame is not None and (np.diff(frame) <= 0).any():
         if len(np.unique(frame)) == len(rows):  # one episode, out of order
             return np.argsort(frame), rows == 0
@@ -263,22 +267,34 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
                 " belong together"
             )
         return rows, starts
-    starts = rows == 0
-    for name, flag in piece.states.items():
-        kind, switch = kind_of(name)[0], not set(np.unique(flag)) - {0, 1}
-        if kind in ("start", "end") and not switch:
-            raise ValueError(f"column {name!r} of the {kind}s of episodes must be 0 or 1")
-        if kind == "start":
-            starts = starts | (flag > 0)
-        elif kind == "end" or kind == "length" and switch:
-            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # an episode ends where a flag falls
-    clock = columns.get("clock")
-    if starts.sum() == 1 < len(rows) and clock is not None:
+    starts = _flagged(piece, rows)
+    if starts.sum() == 1 < len(rows) and clock is not None and (np.diff(clock) < 0).any():
         again = np.r_[True, np.diff(clock) < 0]
         near = np.abs(clock[again] - clock[0]) < 0.5 * np.median(np.abs(np.diff(clock)))
         if near.all() and (np.diff(np.flatnonzero(again)) > 1).all():
             return rows, again
+        order = np.argsort(clock)
+        if rises_evenly([clock[order]], room=UNEVEN):
+            return order, starts
     return rows, starts
+
+
+def _flagged(piece: Piece, order: np.ndarray) -> np.ndarray:
+    """Which rows of a piece, so ordered, begin an episode by flags of starts and ends; the first one does."""
+    starts = np.arange(len(order)) == 0
+    for name, values in piece.states.items():
+        kind, flag = kind_of(name)[0], values[order]
+        switch = not set(np.unique(flag)) - {0, 1}
+        if kind in ("start", "end") and not switch:
+            raise ValueError(
+                f"column {name!r} of the {kind}s of episodes must be 0 or 1: name it otherwise if it is none, or drop"
+                f" it in {option('drop_columns')}"
+            )
+        if kind == "start":
+            starts = starts | (flag > 0)
+        elif kind == "end" or kind == "length" and switch:
+            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # an episode ends where a flag falls
+    return starts
 
 
 def _changes(numbers: np.ndarray) -> np.ndarray:

@@ -8,26 +8,38 @@ import warnings
 
 import numpy as np
 
-_NUMBERED = "(_?(id|idx|index|number|num|nr|no))?"
-_ONE = "(episode|ep|traj|trajectory|demo|demonstration|run|rollout|trial|segment|take|session|attempt)"
-_END = "(timeout|terminal|termination|terminated|truncation|truncated|done|last|finished)s?(_float)?"
+_NUMBERED = "(_?(id|uuid|idx|index|number|num|nr|no|name|key))?"
+_ONE = (
+    "(episode|ep|traj|trajectory|demo|demonstration|run|rollout|trial|segment|take|session|attempt|recording|sequence"
+    "|video|bag|file)"
+)
+_END = (
+    "(timeout|terminal|termination|terminated|truncation|truncated|done|last|finished|final|end)(_(step|frame|flag))?"
+)
+_WHOSE = "(sim|wall|ros|unix|system|log|elapsed|robot|host|device|sensor|camera|local|relative|record(ing)?|epoch)"
 # what columns are called that are no state: words of a name joined by _, in lower case, without unit
 _KINDS = {
-    "clock": r"t|(.+_)?(time_?stamps?|stamps?)|((sim|wall|ros|unix|system|log|elapsed)_)?times?|elapsed|(date|up)_?time"
-    r"|clock",
+    "clock": rf"t|(.+_)?(ts|time_?stamps?|stamps?)|({_WHOSE}_)?times?|elapsed|epoch|(date|up)_?time"
+    r"|clock|utc|zeit|temps",
     "episode": rf"{_ONE}s?{_NUMBERED}",
-    "end": rf"(is_)?{_END}|{_ONE}_({_END}|ends?)",
-    "start": rf"(is_)?first|{_ONE}_(first|starts?)|new_{_ONE}",
+    "end": rf"(is_)?{_END}s?(_float)?|{_ONE}_{_END}s?|(end_of|eo)_?({_ONE}|e)",
+    "start": rf"(is_)?(first|start|begin|reset)(_(step|frame|flag))?|{_ONE}_(first|starts?|begins?)|new_{_ONE}",
     "length": rf"lengths|{_ONE}_len(gth)?s?",
     "frame": rf"(frame|step|time_?step)s?{_NUMBERED}",
-    "other": r"index|task_index|row|_*index_level_0_*|unnamed:_0|(.+_)?(rewards?|success)|returns?(_to_go)?|discounts?",
+    "other": r"index|task_index|row|_*index_level_0_*|unnamed:_0|(.+_)?(rewards?|success)(_(rate|flag))?"
+    r"|rew|returns?(_to_go)?|discounts?|costs?|scores?|dt|delta_time",
 }
 _KIND = {kind: re.compile(pattern) for kind, pattern in _KINDS.items()}
 _ACTING = re.compile(r"actions?(\d*|[^a-z\d].*)", re.IGNORECASE)
-_UNITS = {1.0: "s sec secs seconds", 1e-3: "ms msec msecs milliseconds", 1e-6: "us usec usecs microseconds"}
-_UNITS |= {1e-9: "ns nsec nsecs nanosec nanosecs nanoseconds", 60.0: "min minutes"}
+_UNITS = {
+    1.0: "s sec secs seconds",
+    1e-3: "ms msec msecs millis milliseconds",
+    1e-6: "us usec usecs micros microseconds",
+}
+_UNITS |= {1e-9: "ns nsec nsecs nanos nanosec nanosecs nanoseconds", 60.0: "min minutes"}
 UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 _UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(UNITS)})[)\]]?")
+_EXACT = 2**53  # the largest whole number up to which float64 tells all apart
 _WORDS = {"true": 1.0, "false": 0.0} | dict.fromkeys(("", "na", "n/a", "null", "none"), np.nan)
 
 
@@ -42,6 +54,8 @@ def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 def kind_of(name: str) -> tuple[str | None, float]:
     """What a column is by its name, None for a state; and of a clock its unit in seconds, 0.001 of "Time [ms]"."""
     plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.strip()).lower().removeprefix("next.")
+    if "sec" in plain and plain in UNITS:
+        return "clock", UNITS[plain]
     unit = _UNIT.fullmatch(plain)
     if unit and _KIND["clock"].fullmatch(_joined(unit[1])):
         return "clock", UNITS[unit[2]]
@@ -66,6 +80,8 @@ def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
     if held in "mM" and kind == "clock":
         since = values.astype("datetime64[ns]") - np.datetime64(0, "ns") if held == "M" else values
         return since / np.timedelta64(1, "s") / unit
+    if kind == "episode" and held in "iu" and len(values) and np.abs(values.astype(np.float64)).max() > _EXACT:
+        return np.unique(values, return_inverse=True)[1].astype(np.float64)
     if held in "fiub":
         return values.astype(np.float64)
     if held not in "SUO":
@@ -74,7 +90,7 @@ def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
     texts = ["" if value is None else str(value) for value in plain]
     numbers = [number_of(text) for text in texts]
     known = [number for number in numbers if number is not None]
-    if len(known) == len(numbers):
+    if len(known) == len(numbers) and not (kind == "episode" and max(known, default=0) > _EXACT):
         return np.array(known)
     if kind == "episode":
         order = {text: number for number, text in enumerate(dict.fromkeys(texts))}

@@ -24,6 +24,7 @@ import numpy as np
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import lerobot_clips
+from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, some
 
@@ -70,10 +71,19 @@ def read_lerobot(
         problems.append(f"no feature {PREFIX}* holds numbers; there are {', '.join(observed) or 'none'}")
     if problems:
         raise DataError(root, problems)
-    rows = read_rows(root, chosen, episodes=episodes)
+    flags = [name for name in known if name not in observed and kind_of(name)[0] in ("start", "end")]
+    rows, undescribed = read_rows(root, chosen, flags=flags, episodes=episodes)
     if not rows:
         raise DataError(root, "there are no trajectories")
     first, width = next(iter(rows.values())), _announced(info) or options.get("action_dim")
+    wide = {name: (first[name].shape[1], _announced(info, name)) for name in (*chosen, ACTION) if name in first}
+    problems = [
+        f"column {name!r} has {there} numbers, info.json says {said}"
+        for name, (there, said) in wide.items()
+        if said not in (0, there)
+    ]
+    if problems:
+        raise DataError(root, problems)
     if ACTION not in first and not width:
         silent = "no file has actions, and info.json does not say how many columns an action has"
         raise DataError(root, f"{silent}: say it in {option('action_dim')}")
@@ -88,14 +98,14 @@ def read_lerobot(
     for number, columns in rows.items():
         states = dict(zip(names, np.concatenate([columns[name] for name in chosen], 1).T, strict=True))
         steps = dict(zip(acting, columns[ACTION].T, strict=True)) if ACTION in columns else None
-        clock = {TIME: columns[TIME][:, 0]} if TIME in columns else {}
-        pieces.append(Piece(f"episode {number}", states | clock, steps, cameras=clips[number]))
+        beside = {name: columns[name][:, 0] for name in (TIME, *flags) if name in columns}
+        pieces.append(Piece(f"episode {number}", states | beside, steps, cameras=clips[number]))
     if ACTION not in first:
         options = {"action_dim": width} | options
         absent += [f"{ACTION} (info.json lists it, no file has it)"] if ACTION in known else []
-    unread = [
-        name for name in known if name not in (*chosen, *images, ACTION, TIME, EPISODE, FRAME, "index", "task_index")
-    ]
+    read = (*chosen, *images, *flags, ACTION, TIME, EPISODE, FRAME, "index", "task_index")
+    unread = [name for name in known if name not in read]
+    unread += [f"{name} (info.json does not list it)" for name in undescribed if name not in (*read, *known)]
     return assemble(
         pieces,
         str(root),
@@ -124,16 +134,19 @@ def read_info(root: str | Path) -> dict[str, Any]:
     return info | {"features": features}
 
 
-def read_rows(root: str | Path, features: Sequence[str], *, episodes: Sequence[int] = ()) -> dict[int, dict[str, Any]]:
-    """Reads of every episode, by its number, columns of numbers, and actions if there are any.
+def read_rows(
+    root: str | Path, features: Sequence[str], *, flags: Sequence[str] = (), episodes: Sequence[int] = ()
+) -> tuple[dict[int, dict[str, Any]], list[str]]:
+    """Reads of every episode, by its number, columns of numbers, and actions and flags if there are any.
 
     They are float64 ``[T, d]``, NaN where a row is empty; ``frame_index`` is ``[T]``. ``file`` is where the rows lie.
+    Columns of the files that are not read come second.
 
     Raises:
         DataError: with the problems of all files and episodes.
     """
     root = Path(root).expanduser()
-    table = _read_table(root, (*features, EPISODE, FRAME))
+    table, unread = _read_table(root, (*features, EPISODE, FRAME), (ACTION, TIME, *flags))
     files, problems = table["__filename"].to_pylist(), []
     columns: dict[str, Any] = {}
     for name in table.column_names:
@@ -155,6 +168,12 @@ def read_rows(root: str | Path, features: Sequence[str], *, episodes: Sequence[i
             f"{len(missing)} episodes are missing: {absent}; name in {option('episodes')} those to read: {there}"
         ]
     rows: dict[int, dict[str, Any]] = {}
+    unlisted = [number for number in found.tolist() if expected and not episodes and number not in expected]
+    if unlisted:
+        said = (
+            f"the description of episodes lacks {some([str(number) for number in unlisted])}, of which there are rows"
+        )
+        problems.append(f"{said}: name in {option('episodes')} those to read")
     for number, start, end in zip(found.tolist(), starts, ends, strict=True):
         if episodes and number not in episodes:
             continue
@@ -167,15 +186,19 @@ def read_rows(root: str | Path, features: Sequence[str], *, episodes: Sequence[i
         rows[number] |= {FRAME: frame[start:end], "file": files[start]}
     if problems:
         raise DataError(root, problems)
-    return rows
+    return rows, unread
 
 
-def _read_table(root: Path, needed: Sequence[str]):
-    """The rows of all files, sorted: the columns that are asked for, the actions, and ``__filename``."""
+def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
+    """The rows of all files, sorted: columns that are needed, those wanted that there are, and ``__filename``.
+
+    The names of columns that are not read come second.
+    """
     pyarrow = import_pyarrow()
     files = sorted((root / "data").rglob("*.parquet"))
     faults: list[tuple[str, str]] = []
     kinds: dict[str, Any] = {}
+    there: dict[str, None] = {}
     if not files:
         raise FileNotFoundError(f"no *.parquet below {root / 'data'}")
     for file in files:
@@ -188,11 +211,10 @@ def _read_table(root: Path, needed: Sequence[str]):
         except OSError as error:
             faults.append((str(file), f"it cannot be read: {error}"))
             continue
-        there = ", ".join(schema.names)
-        faults += [
-            (str(file), f"missing column {name!r}; it has {there}") for name in needed if name not in schema.names
-        ]
-        for name in {*needed, ACTION, TIME}.intersection(schema.names):
+        there |= dict.fromkeys(schema.names)
+        lacking = [name for name in needed if name not in schema.names]
+        faults += [(str(file), f"missing column {name!r}; it has {', '.join(schema.names)}") for name in lacking]
+        for name in {*needed, *wanted}.intersection(schema.names):
             got = schema.field(name).type
             kind = number_type(got)
             kinds.setdefault(name, kind)
@@ -207,7 +229,7 @@ def _read_table(root: Path, needed: Sequence[str]):
         table = data.to_table(columns=[*kinds, "__filename"])
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(root, f"it cannot be read: {str(error).splitlines()[0]}") from error
-    return table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")])
+    return table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")]), [name for name in there if name not in kinds]
 
 
 def _expected_lengths(root: Path) -> dict[int, int | None]:
@@ -226,9 +248,9 @@ def _expected_lengths(root: Path) -> dict[int, int | None]:
         raise DataError(root, f"the list of its episodes cannot be read: {error!r}") from error
 
 
-def _announced(info: Mapping[str, Any]) -> int:
-    """Number of action columns that ``info.json`` announces, 0 if it is silent."""
-    shape = (info["features"].get(ACTION) or {}).get("shape") or [0]
+def _announced(info: Mapping[str, Any], feature: str = ACTION) -> int:
+    """Number of columns of a feature that ``info.json`` announces, 0 if it is silent."""
+    shape = (info["features"].get(feature) or {}).get("shape") or [0]
     return int(shape[0]) if isinstance(shape, list) and isinstance(shape[0], int) else 0
 
 

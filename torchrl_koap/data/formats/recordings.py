@@ -127,6 +127,8 @@ def make_recordings(
     if wide is None and action_names is not None:
         wide = len(action_names)
     problems: list[str] = []
+    if action_dim is not None and (isinstance(action_dim, bool) or not isinstance(action_dim, int) or action_dim < 1):
+        raise DataError(source, f"{option('action_dim')} must be a positive whole number, got {action_dim!r}")
     if wide is None:
         wide = 1
         problems += [] if faults else [f"no trajectory has actions: {NO_ACTIONS}"]
@@ -200,7 +202,7 @@ def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str
     """Numbers of a trajectory as float64, NaN where they are masked or None; else there is a fault more."""
     try:
         if isinstance(value, torch.Tensor):
-            value = value.detach().cpu()
+            value = value.detach().cpu().resolve_conj().resolve_neg()
             array = (value.double() if value.is_floating_point() else value).numpy()
         elif isinstance(value, np.ma.MaskedArray):
             array = value.astype(np.float64).filled(np.nan) if value.dtype.kind in "fiub" else value.data
@@ -245,6 +247,8 @@ def _whole(steps: np.ndarray) -> np.ndarray:
 def _names(given: Sequence[str] | None, width: int, kind: str, problems: list[str]) -> tuple[str, ...]:
     if given is None:
         return tuple(f"{kind}_{index}" for index in range(width))
+    if isinstance(given, str):
+        problems.append(f"{kind}_names must be a name for each of {width} columns, got the text {given!r}")
     names = tuple(str(name) for name in given)
     if not all(name.strip() for name in names):
         problems.append(f"{kind}_names holds an empty name")

@@ -284,8 +284,9 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
         if pyarrow.types.is_boolean(values.type):
             values = values.cast(pyarrow.int8())
         kind = number_type(values.type)
-        if kind is None:  # text, dates, pictures
-            plain = pyarrow.types.is_temporal(values.type)
+        whole = pyarrow.types.is_integer(values.type)
+        if kind is None or whole:  # text, dates, pictures, numbers of episodes
+            plain = whole or pyarrow.types.is_temporal(values.type)
             columns[name] = as_numbers(name, values.to_numpy() if plain else np.array(values.to_pylist(), dtype=object))
             continue
         block = numbers(values.cast(kind, safe=False), name)
