@@ -65,7 +65,7 @@ def write_method(method: Method) -> None:
     sizes = {task: sum(p.numel() for p in build(method, task).parameters()) for task in ("avoiding", "stacking")}
     facts = [
         ("network", f":class:`~{kind.__module__}.{kind.__name__}`"),
-        ("planner", "the one that all controllers share" if method.plans else "none: it is a policy of its own"),
+        ("planner", "the one that all controllers share" if method.plans else "none: it samples actions"),
         *frames_read(network),
         ("states it learns from", states_seen(method)),
         ("decoder", "closed form, on every labelled step once" if method.closed_form else "trained by gradients"),

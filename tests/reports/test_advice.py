@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
 
+from torchrl_koap.commands.options import parse
+from torchrl_koap.commands.subcommands import Subcommand
 from torchrl_koap.reports.advice import RULES, advice
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
@@ -89,6 +92,9 @@ def test_a_ridge_that_errs_less_is_pointed_out():
     (item,) = found(config={"method": "koap"}, evaluation=actions(0.32, 0.31))
     assert item.finding == "actions of koap err 0.32 times as much as their mean would, a plain ridge's 0.31 times"
     assert not found(config={"method": "linear"}, evaluation=actions(0.3, 0.3))
+    call = shlex.split(item.command.format(data="arm"))
+    study = parse(Subcommand, call[1:]).config
+    assert study.methods == ("koap", "koap_untrained", "linear_steps", "linear") and study.datasets == ("arm",)
 
 
 def test_slow_plans():

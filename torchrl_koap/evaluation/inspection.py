@@ -100,7 +100,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         result = {name: value for name, value in earlier.items() if name != "findings"}
     elif trained.planner is None:
         method = trained.config.method
-        raise ValueError(f"method {method!r} is a policy of its own: there are no planner and controller to tell apart")
+        raise ValueError(f"method {method!r} samples actions: it has no planner and controller to compare")
     else:
         result = _experiments(config, trained, data)
     result["latent"] = _look_into(config, trained, data)

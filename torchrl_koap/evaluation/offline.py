@@ -99,7 +99,7 @@ def _summary_of(action: Mapping[str, Any]) -> dict[str, Any]:
 
 def _plans(trained: Trained, data: TensorDictBase, **options: Any) -> dict[str, Any]:
     if trained.planner is None:
-        return {"note": f"method {trained.config.method!r} is a policy of its own: it makes no plans"}
+        return {"note": f"method {trained.config.method!r} samples actions: it makes no plans"}
     if not trained.held_out:
         return {"note": "no trajectory was held out from the planner (--planner.held-out; two trajectories at least)"}
     unseen = select_trajectories(data, trained.held_out)

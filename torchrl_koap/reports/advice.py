@@ -22,7 +22,7 @@ CONTROLS = ("koap_untrained", "linear_steps", "linear")
 
 @dataclass(frozen=True)
 class Advice:
-    """What the numbers say, what may help or tell more, and a command line with ``{run}``, if there is one."""
+    """What the numbers say, what may help or tell more, and a command line, if any, with ``{run}`` or ``{data}``."""
 
     finding: str
     proposal: str
@@ -82,7 +82,7 @@ def one_way_only(run: RunFacts) -> Advice | None:
     seen = f"the entropy of the modes is {entropy:.2f}, a uniform choice would average {even:.2f}"
     if _is_policy(run):
         return Advice(
-            f"{seen}: a policy of its own knows the labelled ways only",
+            f"{seen}: a method without a planner knows the labelled ways only",
             "a method that plans learns the ways from all demonstrations (--method koap)",
         )
     return Advice(
@@ -102,7 +102,7 @@ def control_is_as_good(run: RunFacts) -> Advice | None:
     return Advice(
         f"actions of {method} err {own:.3g} times as much as their mean would, a plain ridge's {ridge:.3g} times",
         "the ridge is simpler; compare both in closed loop before keeping either",
-        "koap curve --methods koap,koap_untrained,linear_steps,linear --out curves/compare",
+        "koap curve --datasets {data} --methods koap koap_untrained linear_steps linear --out curves/compare",
     )
 
 

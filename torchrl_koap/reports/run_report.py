@@ -128,7 +128,8 @@ def _eval_command(run: RunFacts) -> str:
 
 
 def _filled(command: str, run: RunFacts) -> str:
-    return command.format(run=shlex.quote(str(run.folder)))
+    places = {"run": run.folder, "data": run.config.get("dataset")}
+    return command.format(**{name: shlex.quote(str(place)) for name, place in places.items()})
 
 
 def _given(source: Mapping[str, Any], key: str) -> bool:
