@@ -154,6 +154,12 @@ def test_an_action_that_never_changes_is_commanded_as_it_is():
     assert absolute.action_rule(torch.full((1, 3, 4), 2.0), decoded)[0].tolist() == [[3, 3, 0.5]] * 3
 
 
+def test_what_never_changes_within_a_recording_is_not_the_robot():
+    goals = [np.concatenate([frames[:, :2], np.full((len(frames), 1), index)], 1) for index, frames in enumerate(STATES)]
+    assert make_demonstrations(goals, ACTIONS, control_hz=20)[1].robot == (0, 1)
+    assert make_demonstrations([np.zeros((20, 3))], control_hz=20, action_dim=2)[1].robot == (0, 1, 2)
+
+
 def test_a_robot_that_stands_where_there_are_labels():
     still = [np.column_stack([0 * STATES[0][:, :2], STATES[0][:, 2:]]), *STATES[1:]]
     with pytest.raises(DataError, match="robot: q1, q2 never move where there are labels"):

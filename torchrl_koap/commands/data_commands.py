@@ -141,7 +141,8 @@ class Convert(Command):
         drop_columns: state and action columns that are left out.
         trim_still: cut the frames at both ends of trajectories in which nothing moves.
         drop_short: leave out trajectories that are shorter than a window.
-        robot: state columns of the robot itself, which the controller reads (default: all that are no command).
+        robot: state columns of the robot itself, which the controller reads (default: all that are no command and
+            change within a recording).
         command: neighbouring columns that repeat the last command; nothing that learns sees them.
         action_kind: of each action column, or one for all: "delta" (velocities, efforts, changes), "absolute" (targets
             of state columns) or "raw" (neither, such as normalised targets); with --resample "change" (over one frame,
@@ -196,6 +197,7 @@ class Convert(Command):
             "task": task.name,
             "steps": len(data),
             **_contents(recordings),
+            "controller reads": ", ".join(task.state_names[column] for column in task.robot),
             "action kind": ", ".join(self.action_kind) or "delta (default)",
             "labels look": describe_likely(likely_kinds(data, task)) or "like no kind: too few",
             "skipped": ", ".join(recordings.skipped) or "nothing",

@@ -106,7 +106,7 @@ def make_demonstrations(
         state_units, action_units (sequence of str, or str): unit of every column, or one for all. Errors of actions are
             averaged over columns of one unit.
         robot (sequence of str or int, optional): state columns of the robot itself, by name or number: the controller
-            reads these. Default: all that are no command.
+            reads these. Default: all that are no command and change within a recording.
         command (sequence of str or int): neighbouring columns that repeat the last command. Their differences are the
             actions, so nothing that learns ever sees them.
         action_kind (str, or sequence of str): ``"delta"``, velocities, efforts or changes: small where the robot stands
@@ -175,7 +175,7 @@ def make_demonstrations(
         problems.append(f"{option('max_steps')} must be a positive whole number, got {max_steps!r}")
     commanded = _columns(command, names, "command", problems)
     others = [column for column in range(len(names)) if column not in commanded]
-    own = others if robot is None else _columns(robot, names, "robot", problems)
+    own = _moving(recordings, others) if robot is None else _columns(robot, names, "robot", problems)
     problems += [f"column {names[column]!r} is the robot's and a command" for column in own if column in commanded]
     if commanded and commanded != list(range(min(commanded), min(commanded) + len(commanded))):
         problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
@@ -256,6 +256,12 @@ def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str
         number = sum(part.partition("_")[0] == kind for part in parts)
         parts[f"{kind}_{number + 1}" if number else kind] = tuple(names[column] for column in columns)
     return parts
+
+
+def _moving(recordings: Recordings, columns: list[int]) -> list[int]:
+    """Those of some columns that change within a recording, as a goal does not; all if none does."""
+    moving = np.any([(frames[1:] != frames[:-1]).any(0) for frames in recordings.states], axis=0)
+    return [column for column in columns if moving[column]] or columns
 
 
 def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -> list[int]:
