@@ -70,7 +70,7 @@ actions = [commands if index < 3 else None for index, (_, commands) in enumerate
 # %%
 # Planner, controller, policy
 # ---------------------------
-# ``robot`` names the columns that the commands move. The goal is planned, not commanded.
+# ``robot`` names the columns that the controller reads. Goals are not among them.
 
 data, task = torchrl_koap.make_demonstrations(
     states, actions, control_hz=30, state_names=NAMES, state_units="rad", action_units="rad/s", robot=NAMES[:2]
