@@ -155,8 +155,8 @@ def test_an_action_that_never_changes_is_commanded_as_it_is():
 
 
 def test_what_never_changes_within_a_recording_is_not_the_robot():
-    goals = [np.concatenate([frames[:, :2], np.full((len(frames), 1), index)], 1) for index, frames in enumerate(STATES)]
-    assert make_demonstrations(goals, ACTIONS, control_hz=20)[1].robot == (0, 1)
+    with_goal = [np.insert(frames[:, :2], 2, goal, axis=1) for goal, frames in enumerate(STATES)]
+    assert make_demonstrations(with_goal, ACTIONS, control_hz=20)[1].robot == (0, 1)
     assert make_demonstrations([np.zeros((20, 3))], control_hz=20, action_dim=2)[1].robot == (0, 1, 2)
 
 

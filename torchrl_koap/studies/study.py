@@ -307,8 +307,8 @@ def check_study(study: Study) -> list[Cell]:
     sampling = [name for name in study.methods if not get_method(name).plans]
     if study.execution.strategy == "open_loop" and sampling:
         raise ValueError(
-            f"strategy 'open_loop' was asked of {', '.join(sampling)}: methods without a planner execute chunks of actions"
-            " and has no other strategy; leave it out of --methods"
+            f"strategy 'open_loop' was asked of {', '.join(sampling)}: they execute chunks of actions and"
+            " have no other strategy; leave them out of --methods"
         )
     for task in study.tasks:
         for method in study.methods:
