@@ -37,7 +37,7 @@ from torchrl_koap.modules.execution.export import (
     SUFFIXES,
     Exportable,
     ExportError,
-    export_part,
+    export_policy,
     exportable,
     relative_gap,
 )
@@ -91,7 +91,7 @@ def exported(run: Path | None, repeats: int) -> list[dict[str, str]]:
                     ways[way] = compiled(what)
                 else:
                     file = Path(folder) / f"policy{SUFFIXES[way]}"
-                    ways[way] = export_part(what, file, kind=way, tolerance=TOLERANCE)
+                    ways[way] = export_policy(what, file, kind=way, tolerance=TOLERANCE)
             except ExportError as error:
                 print(f"{way}: {error}")
             seconds[way] = time.perf_counter() - began

@@ -2,6 +2,7 @@
 """Public functions tell what they take, public classes show how they are used."""
 
 import ast
+import importlib
 from pathlib import Path
 
 import torchrl_koap
@@ -43,9 +44,8 @@ def exported():
     """Names that a room, or the package itself, has in its ``__all__``."""
     names = set(torchrl_koap.__all__)
     for file in PACKAGE.glob("*/__init__.py"):
-        for node in ast.parse(file.read_text()).body:
-            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-                names |= set(ast.literal_eval(node.value))
+        room = importlib.import_module(f"torchrl_koap.{file.parent.name}")
+        names |= set(vars(room).get("__all__", ()))
     return names
 
 

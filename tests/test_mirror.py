@@ -16,6 +16,7 @@ COVERED_BY = {
     "commands/run_commands.py": "commands/test_eval.py",
     "commands/subcommands.py": "commands/test_cli.py",
     "envs/base.py": "envs/test_avoiding.py",
+    "envs/episode_state.py": "envs/test_sorting.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
     "envs/mujoco/scene.py": "envs/mujoco/test_panda.py",
@@ -49,7 +50,7 @@ COVERED_BY = {
     "training/controller.py": "training/test_methods.py",
     "training/method.py": "training/test_methods.py",
     "training/planner.py": "training/test_on_disk.py",
-    "training/policy_facts.py": "evaluation/test_policies.py",
+    "training/policy_facts.py": "modules/execution/test_command_limits.py",
     "vision/backbones.py": "vision/test_encoder.py",
     "vision/projection.py": "vision/test_encoder.py",
 }

@@ -101,18 +101,13 @@ def test_a_missing_data_set_is_named(run, tmp_path, capsys):
 def test_export_and_latency(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(run_commands, "time_calls", partial(run_commands.time_calls, repeats=3))
     assert koap("export", run, "--out", tmp_path / "exported") == 0
-    assert {file.name for file in (tmp_path / "exported").iterdir()} == {
-        "policy.pt2",
-        "controller.pt2",
-        "denoiser.pt2",
-        "policy.json",
-    }
+    assert {file.name for file in (tmp_path / "exported").iterdir()} == {"policy.pt2", "policy.json"}
     printed = capsys.readouterr().out
     assert "policy ms eager" in printed and "open loop between plans" in printed
     facts = json.loads((tmp_path / "exported" / "policy.json").read_text())
-    observed, acted = facts["policy"]["inputs"]["observations"], facts["policy"]["outputs"]["actions"]
+    observed, acted = facts["inputs"]["observations"], facts["outputs"]["actions"]
     assert (observed["columns"], acted["columns"]) == (["q1", "q2", "goal1", "goal2"], ["dq1", "dq2"])
-    assert acted["units"] == ["rad", "rad"] and facts["policy"]["control_hz"] == 20
+    assert acted["units"] == ["rad", "rad"] and facts["control_hz"] == 20
     assert koap("latency", run, "--steps", 10) == 0
     late, times = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"late steps +\d+ of 10; a step may take 50 ms", late)

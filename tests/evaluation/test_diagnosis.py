@@ -42,9 +42,9 @@ AVOIDING = get_task("avoiding")
 class Straight(torch.nn.Module):
     """Plans that go on by the last step."""
 
-    history, horizon, state_dim = 2, 14, 2
+    history, horizon, state_dim, noise_shape = 2, 14, 2, (14, 2)
 
-    def sample(self, history, noise=None, generator=None):
+    def sample(self, history, noise=None):
         step = history[:, -1] - history[:, -2] + torch.tensor([0.0, 0.01])
         ahead = torch.arange(1, 15)[:, None]
         return history[:, -1:] + ahead * step[:, None]

@@ -30,7 +30,7 @@ WORK = (
     "torchrl_koap.evaluation.closed_loop.roll_out",
     "torchrl_koap.evaluation.inspection.roll_out",
     "torchrl_koap.studies.run.launch",
-    "torchrl_koap.commands.run_commands.export_part",
+    "torchrl_koap.commands.run_commands.export_policy",
     "torchrl_koap.data.demonstrations.save_ted",
 )
 # a call of `koap embed` that would do, without the weights of an extra

@@ -56,12 +56,10 @@ class SamplerTestBase:
         torch.testing.assert_close(sequence.reshape(-1, 6, self.width), flat)
 
     @pytest.mark.parametrize("exploration", ExplorationType)
-    def test_without_noise_every_sample_is_another_unless_a_generator_repeats_it(self, exploration):
+    def test_without_noise_every_sample_is_another(self, exploration):
         sampler, history = self.make(), torch.randn(3, 2, 2)
         with set_exploration_type(exploration):
             assert not torch.equal(sampler.sample(history), sampler.sample(history))
-        first, second, other = (sampler.sample(history, generator=torch.Generator().manual_seed(s)) for s in (0, 0, 1))
-        assert torch.equal(first, second) and not torch.equal(first, other)
 
     def test_a_prefix_is_kept_and_the_rest_fits_it(self):
         sampler = self.fit(self.make())

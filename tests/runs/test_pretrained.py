@@ -95,14 +95,14 @@ def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
 
 
 def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(run_commands, "export_part", lambda what, file, kind: file.write_bytes(b"a part"))
+    monkeypatch.setattr(run_commands, "export_policy", lambda what, file, kind: file.write_bytes(b"a policy"))
     out, exported = tmp_path / "mine", tmp_path / "exported"
     assert koap("demos", "--out", tmp_path / "demos", "--episodes", "4", "--threads", "1", "--quiet") == 0
     looked = ("--latent-only", "--threads", "1", "--dataset", tmp_path / "demos")
     assert koap("inspect", "pretrained:avoiding", "--out", out, *looked) == 0
     assert "findings" in json.loads((out / "inspect.json").read_text())
     assert koap("export", "pretrained:avoiding", "--out", exported, "--no-latency") == 0
-    assert len(list(exported.iterdir())) == 4  # and policy.json
+    assert {file.name for file in exported.iterdir()} == {"policy.pt2", "policy.json"}
     assert koap("latency", "pretrained:avoiding", "--steps", "2") == 0
     written = {path.name for path in (policies / "avoiding").iterdir()}
     assert not {"inspect.json", "exported", "plots"} & written

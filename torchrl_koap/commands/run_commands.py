@@ -23,14 +23,13 @@ from torchrl_koap.evaluation import (
 )
 from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop, time_calls
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import InverseDynamicsFollower
-from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, exportable
+from torchrl_koap.modules.execution.export import SUFFIXES, export_policy, exportable
 from torchrl_koap.reports.pictures import draw_pictures
 from torchrl_koap.reports.rows import as_text, evaluation_rows, training_rows
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.device import set_up_torch
-from torchrl_koap.runs.progress import check_logger, log_scores, open_logger, progress_bar
+from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies.table import result_rows
@@ -173,7 +172,7 @@ class Latency(Command):
 class Export(Command):
     """Write a policy for torch.export, ONNX, AOTInductor or LeRobot.
 
-    Each part is compared with the original (1e-5); policy.json says how to call it.
+    It is compared with the original (1e-5); policy.json says how to call it.
 
     Example: `koap export runs/arm --format onnx`
 
@@ -183,7 +182,7 @@ class Export(Command):
         format: "torch" (torch.export), "onnx" (ONNX Runtime), "aoti" (AOTInductor, needs a C++ compiler) or "lerobot"
             (a folder for lerobot-eval and lerobot-record).
         threads: torch threads.
-        latency: time the exported parts against eager ones.
+        latency: time the exported policy against the eager one.
     """
 
     run: tyro.conf.Positional[str]
@@ -202,22 +201,15 @@ class Export(Command):
             return write_lerobot_folder(trained, out)
         policy = load_policy(trained)
         out.mkdir(parents=True, exist_ok=True)
-        parts = [part for part in PARTS if part != "controller" or isinstance(policy.follower, InverseDynamicsFollower)]
-        columns, result, about = _columns(trained.task), dict[str, Any](), dict[str, Any]()
-        with progress_bar(len(parts), "export", unit="part") as bar:
-            for part in parts:
-                what = exportable(policy, part, columns=columns)
-                file = out / f"{part}{suffix}"
-                loaded = export_part(what, file, kind=self.format)
-                result[part] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
-                result[part] |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}
-                if self.latency:
-                    times = time_calls({"eager": what.module, self.format: loaded}, tuple(what.inputs.values()))
-                    result[f"{part} ms"] = times
-                about[part] = {"file": file.name, **what.facts}
-                bar.update()
-        RunDirectory(out).write_json("policy.json", {"task": trained.task.name, **about})
-        return result | {"note": about["policy"]["note"]}
+        what, file = exportable(policy, columns=_columns(trained.task)), out / f"policy{suffix}"
+        loaded = export_policy(what, file, kind=self.format)
+        result: dict[str, Any] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
+        result |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}
+        if self.latency:
+            inputs = tuple(what.inputs.values())
+            result["policy ms"] = time_calls({"eager": what.module, self.format: loaded}, inputs)
+        RunDirectory(out).write_json("policy.json", {"task": trained.task.name, "file": file.name, **what.facts})
+        return result | {"note": what.facts["note"]}
 
 
 def _columns(task: Task) -> dict[str, dict[str, str]]:
@@ -227,7 +219,6 @@ def _columns(task: Task) -> dict[str, dict[str, str]]:
     units = task.observation_units or ["m" if metre else "" for metre in metres]
     return {
         "observations": dict(zip(task.observation_names, units, strict=True)),
-        "states": dict(zip(task.state_names, task.state_units, strict=True)),
         "actions": dict(zip(task.action_names, task.action_units, strict=True)),
     }
 

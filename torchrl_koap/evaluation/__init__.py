@@ -4,29 +4,17 @@
 from torchrl_koap.lookup import exports
 
 # imported when first asked for: pictures need a reader of run directories, not TorchRL
-__getattr__ = exports(
-    __name__,
-    {
-        "EvalConfig": "torchrl_koap.evaluation.config",
-        "InspectConfig": "torchrl_koap.evaluation.inspection",
-        "SuggestConfig": "torchrl_koap.evaluation.active_labelling",
-        "SuggestedLabels": "torchrl_koap.evaluation.active_labelling",
-        "evaluate": "torchrl_koap.evaluation.closed_loop",
-        "inspect": "torchrl_koap.evaluation.inspection",
-        "load_policy": "torchrl_koap.evaluation.policies",
-        "rank_trajectories": "torchrl_koap.evaluation.active_labelling",
-        "suggest": "torchrl_koap.evaluation.active_labelling",
-    },
-)
+_MODULES = {
+    "EvalConfig": "torchrl_koap.evaluation.config",
+    "InspectConfig": "torchrl_koap.evaluation.inspection",
+    "SuggestConfig": "torchrl_koap.evaluation.active_labelling",
+    "SuggestedLabels": "torchrl_koap.evaluation.active_labelling",
+    "evaluate": "torchrl_koap.evaluation.closed_loop",
+    "inspect": "torchrl_koap.evaluation.inspection",
+    "load_policy": "torchrl_koap.evaluation.rollouts",
+    "rank_trajectories": "torchrl_koap.evaluation.active_labelling",
+    "suggest": "torchrl_koap.evaluation.active_labelling",
+}
+__getattr__ = exports(__name__, _MODULES)
 
-__all__ = [  # noqa: F822
-    "EvalConfig",
-    "InspectConfig",
-    "SuggestConfig",
-    "SuggestedLabels",
-    "evaluate",
-    "inspect",
-    "load_policy",
-    "rank_trajectories",
-    "suggest",
-]
+__all__ = list(_MODULES)

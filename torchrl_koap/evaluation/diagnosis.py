@@ -70,8 +70,8 @@ def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_
     states = [start] * planner.history
     while len(states) - planner.history < max_steps - 1:
         history = torch.stack(states[-planner.history :], -2)
-        plan = planner.sample(history, generator=generator)
-        states += plan[:, :interval].unbind(1)
+        noise = torch.randn(len(start), *planner.noise_shape, generator=generator, device=start.device)
+        states += planner.sample(history, noise)[:, :interval].unbind(1)
     return torch.stack(states[planner.history - 1 :], 1)
 
 

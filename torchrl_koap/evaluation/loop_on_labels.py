@@ -13,7 +13,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data.windows import spread_evenly
-from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
 from torchrl_koap.modules.execution.command_limits import ends_of
@@ -65,7 +64,7 @@ def check_loop(
         ``distance_to_demonstrations`` (late, 95 % quantile, standard deviations), ``limited_commands``, ``commands``,
         and sentences in ``faults``; or a ``note`` that says why there is none.
     """
-    asked, task = execution or ExecutionConfig(), trained.task
+    task = trained.task
     ranges = command_ranges(task, labelled)
     if not any(ranges):
         return {"note": "no command changes in the labels", "faults": []}
@@ -78,7 +77,8 @@ def check_loop(
         }
     if not _replay_error(response, data) < _DRIFT:
         return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
-    free = trained_policy(trained, ExecutionConfig(**vars(asked) | {"limits": math.inf}))
+    execution = (execution or ExecutionConfig()).on(trained.execution)
+    free = trained.policy(execution.replaced(limits=math.inf))
     steps = min(STEPS, task.max_steps)
     commands, distance = _roll(free, response, data, steps, seed)
     growth, late = _growth(commands, ends_of(ranges), steps)
@@ -90,7 +90,7 @@ def check_loop(
             grown = _growth(again[0], ends_of(ranges), steps)
             if grown[1] < late:
                 response, (commands, distance), (growth, late) = other, again, grown
-    policy = trained_policy(trained, asked)
+    policy = trained.policy(execution)
     if policy.limits is not None and growth.max() > 1:
         _, distance = _roll(policy, response, data, steps, seed)
     limited = int(policy.limited[0])

@@ -7,7 +7,7 @@ another way than the demonstrator is no mistake. Scores of the whole distributio
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl_koap.data import cut_windows
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.modules import StatePlanner
-from torchrl_koap.modules.planning.energy_score import energy_score, sample_sequences
+from torchrl_koap.modules.planning.energy_score import energy_score, relative_score, sample_sequences
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import unit_groups
 
@@ -58,50 +58,38 @@ def plan_errors(
     device = next(iter(planner.state_dict().values())).device
     models = {"planner": sample_sequences(planner, past.to(device), samples=samples, seed=seed).cpu()}
     models |= {name: plan[None] for name, plan in baseline_plans(states[:, :history], horizon).items()}
-    rows, scores = _score(models, future, task.state_names, task.state_units)
+    groups = unit_groups(task.state_units)
+
+    def relative(where: Tensor) -> float | None:
+        parts = models["planner"][:, where], future[where], models["standing_still"][0, where]
+        score = relative_score(*parts, list(groups.values()))
+        return None if math.isnan(score) else score
+
     return {
         "situations": len(past),
         "horizon": horizon,
         "samples": samples,
-        "relative": _relative(scores, "planner"),
-        "unit": rows,
+        "relative": relative(torch.ones_like(episode, dtype=torch.bool)),
+        "unit": [
+            {"unit": unit, "columns": [task.state_names[column] for column in columns]}
+            | {name: _score(sampled[..., columns], future[..., columns]) for name, sampled in models.items()}
+            for unit, columns in groups.items()
+        ],
         "trajectory": [
-            {"episode": number, "relative_plan_error": _relative(scores, "planner", episode == number)}
+            {"episode": number, "relative_plan_error": relative(episode == number)}
             for number in episode.unique().tolist()
         ],
     }
 
 
-def _score(
-    models: Mapping[str, Tensor], true: Tensor, names: Sequence[str], units: Sequence[str]
-) -> tuple[list[dict[str, Any]], list[dict[str, Tensor]]]:
-    """Rates plans ``[S, N, H, d]`` by energy score and best sample, and every model in every situation ``[N]``."""
-    rows, scores = [], []
-    for unit, columns in unit_groups(units).items():
-        row: dict[str, Any] = {"unit": unit, "columns": [names[column] for column in columns]}
-        per_situation = {}
-        for name, sampled in models.items():
-            score = energy_score(sampled[..., columns], true[..., columns])  # [N, H]
-            distance = (sampled - true)[..., columns].norm(dim=-1)  # [S, N, H]
-            row[name] = {
-                "energy_score": _over_steps(score.mean().item(), score.mean(0)),
-                "best_of": _over_steps(distance.mean(-1).amin(0).mean().item(), distance.amin(0).mean(0)),
-            }
-            per_situation[name] = score.mean(-1)
-        rows.append(row)
-        scores.append(per_situation)
-    return rows, scores
-
-
-def _over_steps(overall: float, per_step: Tensor) -> dict[str, Any]:
-    return {"overall": overall, "per_step": per_step.tolist()}
-
-
-def _relative(scores: list[dict[str, Tensor]], name: str, where: Tensor | None = None) -> float | None:
-    """Score over that of standing still, the mean over units; units in which nothing moves are left out."""
-    shares = []
-    for row in scores:
-        own, still = (row[key] if where is None else row[key][where] for key in (name, "standing_still"))
-        if still.mean() > 0:
-            shares.append((own.mean() / still.mean()).item())
-    return sum(shares) / len(shares) if shares else None
+def _score(sampled: Tensor, true: Tensor) -> dict[str, dict[str, Any]]:
+    """Rates plans ``[S, N, H, d]`` by energy score and best sample, over all and per step."""
+    score = energy_score(sampled, true)  # [N, H]
+    distance = (sampled - true).norm(dim=-1)  # [S, N, H]
+    return {
+        "energy_score": {"overall": score.mean().item(), "per_step": score.mean(0).tolist()},
+        "best_of": {
+            "overall": distance.mean(-1).amin(0).mean().item(),
+            "per_step": distance.amin(0).mean(0).tolist(),
+        },
+    }

@@ -2,7 +2,6 @@
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
 from torchrl_koap.modules.baselines.latents import (
-    FiniteScalarQuantizer,
     QuantizedInverseDynamics,
     VariationalInverseDynamics,
 )
@@ -11,16 +10,13 @@ from torchrl_koap.modules.baselines.regression import LinearInverseDynamics, Pri
 from torchrl_koap.modules.execution.agent import Agent
 from torchrl_koap.modules.execution.asynchronous import AsynchronousAgent
 from torchrl_koap.modules.execution.command_decoder import CommandDecoder, CommandRegression
-from torchrl_koap.modules.execution.command_limits import CommandLimits
 from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
 from torchrl_koap.modules.execution.factory import make_policy
-from torchrl_koap.modules.execution.followers import Follower, InverseDynamicsFollower, blend_plan
-from torchrl_koap.modules.execution.mpc import MPC
-from torchrl_koap.modules.execution.noise import NoiseStreams
+from torchrl_koap.modules.execution.followers import blend_plan
+from torchrl_koap.modules.execution.mpc import MPC, ResponseModel
 from torchrl_koap.modules.execution.policy import PlanningPolicy
 from torchrl_koap.modules.execution.policy_env import PolicyEnv, policy_transforms
-from torchrl_koap.modules.execution.response_model import ResponseModel
-from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import (
     LatentActionFourier,
@@ -34,7 +30,6 @@ from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_d
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.denoisers import MLPDenoiser
 from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
-from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.modules.planning.unet import TemporalUnet
 from torchrl_koap.modules.ridge import RidgeFit, ridge
@@ -46,15 +41,11 @@ __all__ = [
     "Agent",
     "AsynchronousAgent",
     "CommandDecoder",
-    "CommandLimits",
     "CommandRegression",
     "DiffusionPolicy",
     "Execution",
     "ExecutionConfig",
-    "FiniteScalarQuantizer",
-    "Follower",
     "InverseDynamics",
-    "InverseDynamicsFollower",
     "KoopmanInverseDynamics",
     "KoopmanLifting",
     "KoopmanOperator",
@@ -62,12 +53,9 @@ __all__ = [
     "LatentActionLSTM",
     "LatentActionMLP",
     "LatentActionModule",
-    "LatentInverseDynamics",
     "LinearActionDecoder",
     "LinearInverseDynamics",
     "MLPDenoiser",
-    "NoiseSchedule",
-    "NoiseStreams",
     "NonlinearInverseDynamics",
     "Normalizer",
     "PlanningPolicy",

@@ -230,13 +230,6 @@ class LatentInverseDynamics(InverseDynamics):
 
     Keyword Args:
         **kwargs: columns and normalisers, see :class:`InverseDynamics`.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import NonlinearInverseDynamics  # a subclass
-        >>> model = NonlinearInverseDynamics(2, 2)
-        >>> model.out_keys, model.infer(torch.randn(3, 16, 2)).shape
-        (['latent_action', 'action'], torch.Size([3, 16, 32]))
     """
 
     samples_latents = False  # whether sample() draws from a distribution

@@ -2,7 +2,7 @@
 """Loss modules."""
 
 from torchrl_koap.objectives.action import ActionLoss
-from torchrl_koap.objectives.denoising import DenoisingLoss, DiffusionPolicyLoss, PlannerLoss
+from torchrl_koap.objectives.denoising import DiffusionPolicyLoss, PlannerLoss
 from torchrl_koap.objectives.koap import (
     KOAPLoss,
     KoopmanDynamicsLoss,
@@ -13,7 +13,6 @@ from torchrl_koap.objectives.latents import QuantizedDynamicsLoss, VariationalLo
 
 __all__ = [
     "ActionLoss",
-    "DenoisingLoss",
     "DiffusionPolicyLoss",
     "KOAPLoss",
     "KoopmanDynamicsLoss",

@@ -43,16 +43,6 @@ class DenoisingLoss(NetworkLoss):
     Raises:
         ValueError: if ``reduction`` is unknown; at the call if an entry has another shape than the network needs.
         KeyError: at the call if an entry is missing.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
-        >>> from torchrl_koap.objectives import PlannerLoss  # a subclass
-        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
-        >>> loss = PlannerLoss(planner, create_target_params=False, reduction="none")
-        >>> loss(TensorDict({"state": torch.randn(8, 16, 2)}, [8]))["loss_planner"].shape
-        torch.Size([8, 14, 2])
     """
 
     network: ConditionalSampler

@@ -148,65 +148,61 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     """Plays the actions of the first successful rollout, or of the first one, again in the simulator and films them.
 
     The simulator repeats itself exactly, so the film shows what happened, as long as the context is the recorded one to
-    the last digit (float64). Entries: ``action`` ``[E, T, act]`` (NaN after the end), ``outcome`` ``[E]``, and
-    ``context`` ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw (rad).
+    the last digit (float64), or the environment of Gymnasium begins by its seed. Entries: ``action`` ``[E, T, act]``
+    (NaN after the end), ``outcome`` ``[E]``, and ``context`` ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw
+    (rad).
 
     Raises:
         NothingToDraw: if actions were not kept, or the task is not known.
         NotFilmed: if the scene has no camera, or no OpenGL library can be used; the message says what to install.
         ValueError: for a wrong shape, or no context where one is needed.
     """
-    task = run.task
-    if run.evaluation.get("env") and "action" in rollouts:
-        return _film_in_gymnasium(rollouts, run)
-    if task is None or task.env is None or "action" not in rollouts:
+    task, made = run.task, run.evaluation
+    if "action" not in rollouts or not (made.get("env") or (task is not None and task.env is not None)):
         raise NothingToDraw("the rollouts hold no actions of a task with a simulator")
+    won = np.flatnonzero(entry(rollouts, "outcome", [None]) == SUCCESS)
+    index = int(won[0]) if len(won) else 0
+    width = None if made.get("env") or task is None else task.action_dim
+    actions = entry(rollouts, "action", [None, None, width])[index]
+    actions = actions[np.isfinite(actions).all(1)]
+    stride = max(2, -(-len(actions) // FILM_FRAMES))
+    if made.get("env"):
+        return Film(_gymnasium_frames(made, index, actions, stride), 2 / (run.control_hz or CONTROL_HZ))
     if task.scene.camera is None:
         raise NotFilmed(f"task {task.name!r} names no camera of a simulator to film it with")
-    won, context = np.flatnonzero(entry(rollouts, "outcome", [None]) == SUCCESS), None
-    index = int(won[0]) if len(won) else 0
-    actions = entry(rollouts, "action", [None, None, task.action_dim])[index]
-    actions = actions[np.isfinite(actions).all(1)].astype(np.float64)
+    context = None
     if task.bodies:
         if "context" not in rollouts:
             raise ValueError(f"task {task.name!r} starts differently every time: a film needs the 'context'")
         context = entry(rollouts, "context", [None, len(task.bodies), 3])[index].astype(np.float64)[None]
-    stride = max(2, -(-len(actions) // FILM_FRAMES))
     try:
-        return Film(list(_film_frames(actions, task, context, stride)), 2 / task.control_hz)
+        return Film(list(_film_frames(actions.astype(np.float64), task, context, stride)), 2 / task.control_hz)
     except RuntimeError as error:
         raise NotFilmed(error) from error
 
 
-def _film_in_gymnasium(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
-    """The same in an environment of Gymnasium, which its seed makes begin as it did."""
+def _gymnasium_frames(made: Mapping[str, Any], index: int, actions: np.ndarray, stride: int) -> list[np.ndarray]:
+    """The same in the environment of Gymnasium of an ``eval.json``."""
     import gymnasium  # it and the simulator take seconds
 
     from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode
     from torchrl_koap.evaluation.config import environment_arguments
 
-    won = np.flatnonzero(entry(rollouts, "outcome", [None]) == SUCCESS)
-    index = int(won[0]) if len(won) else 0
-    actions = entry(rollouts, "action", [None, None, None])[index]
-    actions = actions[np.isfinite(actions).all(1)]
-    given = environment_arguments(run.evaluation.get("env_kwargs") or ())
-    frames: list[np.ndarray] = []
+    given, frames = environment_arguments(made.get("env_kwargs") or ()), list[np.ndarray]()
     try:
-        made = gymnasium.make(run.evaluation["env"], **(given | {"render_mode": "rgb_array"}))
-        with contextlib.closing(made) as env:
+        with contextlib.closing(gymnasium.make(made["env"], **(given | {"render_mode": "rgb_array"}))) as env:
             episode = GymnasiumEpisode(env, 0, max_steps=len(actions))
-            episode.reset(seed=run.evaluation["episode"][index]["seed"])
-            stride = max(2, -(-len(actions) // FILM_FRAMES))
+            episode.reset(seed=made["episode"][index]["seed"])
             for number, action in enumerate(actions):
                 if number % stride == 0:
                     frames.append(np.asarray(env.render(), np.uint8))
                 episode.step(action)
             frames.append(np.asarray(env.render(), np.uint8))
     except Exception as error:  # of an environment of somebody else
-        raise NotFilmed(f"environment {run.evaluation['env']!r} was not filmed: {error}") from error
+        raise NotFilmed(f"environment {made['env']!r} was not filmed: {error}") from error
     if any(frame.ndim != 3 or frame.shape != frames[0].shape for frame in frames):
-        raise NotFilmed(f"environment {run.evaluation['env']!r} draws no picture [height, width, 3]")
-    return Film(frames, 2 / (run.control_hz or CONTROL_HZ))
+        raise NotFilmed(f"environment {made['env']!r} draws no picture [height, width, 3]")
+    return frames
 
 
 def _film_frames(actions: np.ndarray, task: Task, context: np.ndarray | None, stride: int) -> Iterator[np.ndarray]:

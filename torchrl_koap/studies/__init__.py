@@ -4,19 +4,12 @@
 from torchrl_koap.lookup import exports
 
 # imported when first asked for: pictures need a reader of run directories, not TorchRL
-__getattr__ = exports(
-    __name__,
-    {
-        "Cell": "torchrl_koap.studies.cells",
-        "Machines": "torchrl_koap.studies.launchers",
-        "Study": "torchrl_koap.studies.study",
-        "run_study": "torchrl_koap.studies.run",
-    },
-)
+_MODULES = {
+    "Cell": "torchrl_koap.studies.cells",
+    "Machines": "torchrl_koap.studies.launchers",
+    "Study": "torchrl_koap.studies.study",
+    "run_study": "torchrl_koap.studies.run",
+}
+__getattr__ = exports(__name__, _MODULES)
 
-__all__ = [  # noqa: F822
-    "Cell",
-    "Machines",
-    "Study",
-    "run_study",
-]
+__all__ = list(_MODULES)

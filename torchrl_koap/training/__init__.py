@@ -19,16 +19,4 @@ _MODULES = {
 }
 __getattr__ = exports(__name__, _MODULES)
 
-__all__ = [  # noqa: F822
-    "METHODS",
-    "Method",
-    "Phase",
-    "TrainConfig",
-    "Trained",
-    "fit",
-    "get_method",
-    "load_demonstrations",
-    "register_method",
-    "resolve",
-    "train",
-]
+__all__ = list(_MODULES)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
 from torchrl_koap.modules import CommandDecoder
-from torchrl_koap.modules.planning.relative_positions import relative_features
+from torchrl_koap.modules.planning.relative_positions import RelativePositionFeatures
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 
@@ -46,7 +46,8 @@ def build_decoder(task: Task) -> CommandDecoder:
         names = ", ".join(task.action_names[column] for column in sorted(rest))
         raise ValueError(f"task {task.name!r} cannot have its commands regressed: nothing tells the actions {names}")
     repeated = list(range(task.observation_dim))[task.command_columns]
-    commands, features = [repeated[i] for i in actions], relative_features(task.relative_columns())
+    commands, pairs = [repeated[i] for i in actions], task.relative_columns()
+    features = RelativePositionFeatures(pairs) if pairs else None
     return CommandDecoder(task.state_dim, commands, actions, action_dim=task.action_dim, features=features)
 
 

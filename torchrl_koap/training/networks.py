@@ -10,7 +10,7 @@ from torch import nn
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, DiffusionPolicy, MLPDenoiser, Normalizer, StatePlanner, TemporalUnet
-from torchrl_koap.modules.planning.relative_positions import relative_features
+from torchrl_koap.modules.planning.relative_positions import RelativePositionFeatures
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig
 from torchrl_koap.tasks import HORIZON, Task
 from torchrl_koap.training.method import Method
@@ -52,7 +52,8 @@ def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
 def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
     """What planner and Diffusion Policy take alike, with a network for sequences of that many columns."""
     lookup(NETWORKS, section.network, "planner.network")
-    features = relative_features(task.relative_columns())
+    pairs = task.relative_columns()
+    features = RelativePositionFeatures(pairs) if pairs else None
     seen = section.frames * task.state_dim + (0 if features is None else features.num_features)
     if section.network == "unet":
         network: nn.Module = TemporalUnet(

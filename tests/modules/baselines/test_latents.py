@@ -23,12 +23,8 @@ from inverse_dynamics_test_base import (
 from loss_test_base import LossTestBase
 from tensordict import TensorDict
 
-from torchrl_koap.modules import (
-    FiniteScalarQuantizer,
-    QuantizedInverseDynamics,
-    SupervisedInverseDynamics,
-    VariationalInverseDynamics,
-)
+from torchrl_koap.modules import QuantizedInverseDynamics, SupervisedInverseDynamics, VariationalInverseDynamics
+from torchrl_koap.modules.baselines.latents import FiniteScalarQuantizer
 from torchrl_koap.objectives import ActionLoss, QuantizedDynamicsLoss, VariationalLoss
 
 SPAN = range(2, 6)

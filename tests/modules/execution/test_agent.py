@@ -13,7 +13,6 @@ from torchrl_koap.modules import (
     Agent,
     DiffusionPolicy,
     Execution,
-    InverseDynamicsFollower,
     PlanningPolicy,
     PolicyEnv,
     StatePlanner,
@@ -21,6 +20,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     make_policy,
 )
+from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 from torchrl_koap.modules.execution.noise import NoiseStreams
 
 STEPS = 13

@@ -18,7 +18,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     make_policy,
 )
-from torchrl_koap.modules.execution.export import FACTS, SUFFIXES, ExportError, export_part, exportable, relative_gap
+from torchrl_koap.modules.execution.export import FACTS, SUFFIXES, ExportError, export_policy, exportable, relative_gap
 
 needs_onnx = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
@@ -26,22 +26,20 @@ needs_onnx = pytest.mark.skipif(
 )
 COLUMNS = {
     "observations": {"cx": "m", "cy": "m", "x": "m", "y": "m"},
-    "states": {"x": "m", "y": "m"},
     "actions": {"dx": "m", "dy": "m", "grip": ""},
 }
 
 
-def policy(ranges=None, columns=None, **execution):
+def policy(ranges=None, **execution):
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
-    controller = make_koopman_inverse_dynamics(2 if columns is None else len(columns), 3)
+    controller = make_koopman_inverse_dynamics(2, 3)
     return make_policy(
         planner,
         controller,
         state_of=(2, 3),
         changes=(0, 1),
         commanded={"commands": [0, 1], "states": [0, 1]},
-        columns=columns,
         ranges=ranges,
         control_hz=30.0,
         execution=Execution(**execution),
@@ -69,10 +67,9 @@ def test_the_stateless_policy_is_the_open_loop_one():
     torch.testing.assert_close(actions[:, 0], whole.act(observed, plan, 0))
 
 
-@pytest.mark.parametrize("part", ["policy", "controller", "denoiser"])
-def test_every_part_comes_back_from_its_file(part, tmp_path):
-    what = exportable(policy(), part, columns=COLUMNS)
-    loaded = export_part(what, tmp_path / f"{part}.pt2")
+def test_a_policy_comes_back_from_its_file(tmp_path):
+    what = exportable(policy(), columns=COLUMNS)
+    loaded = export_policy(what, tmp_path / "policy.pt2")
     other = [value + 0.1 for value in what.batch(7)]  # the batch is dynamic
     with torch.no_grad():
         torch.testing.assert_close(loaded(*other), what.module(*other), atol=1e-5, rtol=1e-5)
@@ -84,7 +81,7 @@ def test_an_origin_is_exported(tmp_path):
     what = exportable(far, columns=COLUMNS)
     observed, noise = what.inputs["observations"], what.inputs["noise"]
     assert what.facts["inputs"]["observations"]["type"] == "float64" and observed.abs().max() > 1e6
-    actions, _ = export_part(what, tmp_path / "policy.pt2")(observed, noise)
+    actions, _ = export_policy(what, tmp_path / "policy.pt2")(observed, noise)
     near = (observed - torch.tensor(origins[0], dtype=torch.float64)).float()
     expected, _ = far.decode_ahead(near, noise)
     torch.testing.assert_close(
@@ -94,9 +91,7 @@ def test_an_origin_is_exported(tmp_path):
 
 def test_a_diffusion_policy_is_exported_too(tmp_path):
     what = exportable(chunks(), columns=COLUMNS)
-    assert export_part(what, tmp_path / "policy.pt2")(*what.inputs.values())[0].shape == (1, 4, 3)
-    with pytest.raises(ValueError, match="has no inverse dynamics to export"):
-        exportable(chunks(), "controller", columns=COLUMNS)
+    assert export_policy(what, tmp_path / "policy.pt2")(*what.inputs.values())[0].shape == (1, 4, 3)
 
 
 @needs_onnx
@@ -108,7 +103,7 @@ def test_onnx_is_called_as_its_metadata_say(tmp_path):
         usual = 0.99 * float(policy().decode_ahead(frames, noise)[0][..., 0].abs().median())
         whole = policy(ranges=[(-usual / 2, usual / 2), None, None], replan_interval=3)  # widened by half
         expected, held = whole.decode_ahead(frames, noise)
-    export_part(exportable(whole, columns=COLUMNS), tmp_path / "policy.onnx", kind="onnx")
+    export_policy(exportable(whole, columns=COLUMNS), tmp_path / "policy.onnx", kind="onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
     facts = session.get_modelmeta().custom_metadata_map
     inputs, outputs = json.loads(facts["inputs"]), json.loads(facts["outputs"])
@@ -123,16 +118,16 @@ def test_onnx_is_called_as_its_metadata_say(tmp_path):
 
 
 def test_facts_are_in_the_file_of_torch_export(tmp_path):
-    export_part(exportable(policy(columns=[1]), "controller", columns=COLUMNS), tmp_path / "a.pt2")
+    export_policy(exportable(policy(), columns=COLUMNS), tmp_path / "a.pt2")
     found = {FACTS: ""}
     torch.export.load(tmp_path / "a.pt2", extra_files=found)
     facts = json.loads(found[FACTS])
-    assert facts["inputs"]["states"] == {
-        "shape": ["batch", 19, 1],
+    assert facts["inputs"]["observations"] == {
+        "shape": ["batch", 5, 4],
         "type": "float32",
-        "meaning": "raw units, oldest frame first: those observed, then those planned",
-        "columns": ["y"],
-        "units": ["m"],
+        "meaning": "raw units, oldest frame first, the present one last; at the start the first one is repeated",
+        "columns": ["cx", "cy", "x", "y"],
+        "units": ["m"] * 4,
     }
     assert facts["outputs"]["actions"]["columns"] == ["dx", "dy", "grip"]
     assert facts["steps_per_plan"] == 4 and "open loop between plans" in facts["note"]
@@ -149,16 +144,14 @@ def test_differences_are_relative():
 @pytest.mark.timeout(1800)  # minutes of g++
 def test_aotinductor(tmp_path):
     what = exportable(policy(), columns=COLUMNS)
-    loaded = export_part(what, tmp_path / "policy.aoti.pt2", kind="aoti")
+    loaded = export_policy(what, tmp_path / "policy.aoti.pt2", kind="aoti")
     assert loaded.get_metadata()["steps_per_plan"] == "4"
 
 
 def test_faults(tmp_path):
-    what = exportable(policy(), "controller", columns=COLUMNS)
+    what = exportable(policy(), columns=COLUMNS)
     with pytest.raises(ValueError, match="unknown export format 'onxx'; did you mean 'onnx'"):
-        export_part(what, tmp_path / "x", kind="onxx")
-    with pytest.raises(ValueError, match="unknown part of a policy 'denoisr'; did you mean 'denoiser'"):
-        exportable(policy(), "denoisr", columns=COLUMNS)
+        export_policy(what, tmp_path / "x", kind="onxx")
     with pytest.raises(ExportError, match="differs from the policy by"):
-        export_part(what, tmp_path / "x.pt2", tolerance=-1.0)
+        export_policy(what, tmp_path / "x.pt2", tolerance=-1.0)
     assert set(SUFFIXES) == {"torch", "onnx", "aoti"}

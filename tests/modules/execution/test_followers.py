@@ -12,12 +12,11 @@ from torchrl_koap.modules import (
     CommandDecoder,
     CommandRegression,
     Execution,
-    InverseDynamicsFollower,
     ResponseModel,
     blend_plan,
     make_policy,
 )
-from torchrl_koap.modules.execution.followers import command_rest, remaining_plan
+from torchrl_koap.modules.execution.followers import InverseDynamicsFollower, command_rest, remaining_plan
 from torchrl_koap.tasks.action_rules import ActionRule
 
 

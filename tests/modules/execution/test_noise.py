@@ -13,13 +13,12 @@ from torchrl_koap.modules import (
     Agent,
     Execution,
     MLPDenoiser,
-    NoiseStreams,
     PolicyEnv,
     StatePlanner,
     make_koopman_inverse_dynamics,
     make_policy,
 )
-from torchrl_koap.modules.execution.noise import StartNoise
+from torchrl_koap.modules.execution.noise import NoiseStreams, StartNoise
 
 
 def test_a_stream_is_that_of_its_seed_whatever_else_is_drawn():
@@ -42,7 +41,7 @@ def test_any_batch_is_written():
 class Still(StatePlanner):
     """Plans that are their own start noise, so that actions tell every bit of it."""
 
-    def sample(self, history, noise=None, generator=None):
+    def sample(self, history, noise=None):
         return noise
 
 

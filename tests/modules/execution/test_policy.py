@@ -23,12 +23,12 @@ from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.modules import (
     DiffusionPolicy,
     Execution,
-    InverseDynamicsFollower,
     PlanningPolicy,
     TemporalUnet,
     make_policy,
     policy_transforms,
 )
+from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 LENGTHS = ((5, 3, 11), (9,), (1, 2, 7, 4), (12, 6), (4, 4, 8))
 KINDS = ["feedback", "open_loop", "chunks"]

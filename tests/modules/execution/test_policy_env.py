@@ -15,7 +15,6 @@ from toy_gym import reach
 from torchrl_koap.modules import (
     DiffusionPolicy,
     Execution,
-    InverseDynamicsFollower,
     PlanningPolicy,
     PolicyEnv,
     StatePlanner,
@@ -25,6 +24,7 @@ from torchrl_koap.modules import (
 from torchrl_koap.modules import (
     make_policy as build,
 )
+from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 
 def feedback(**execution):

@@ -9,7 +9,8 @@ from sampler_test_base import SamplerTestBase, walks
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner, TemporalUnet
+from torchrl_koap.modules import MLPDenoiser, StatePlanner, TemporalUnet
+from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.planning.planner import LinearForecast
 
 

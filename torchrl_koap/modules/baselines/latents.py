@@ -33,15 +33,6 @@ class FiniteScalarQuantizer(nn.Module):
     Args:
         features (int): size ``m`` of what is quantised; a linear map takes it to the entries of the codes, and a second
             one the codes back to ``m``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import FiniteScalarQuantizer
-        >>> quantizer = FiniteScalarQuantizer(16)
-        >>> quantizer(torch.randn(5, 7, 16)).shape
-        torch.Size([5, 7, 16])
-        >>> quantizer.quantize(torch.tensor([-9.0, -9.0, 0.0, 0.2, 9.0, 9.0, 0.0, 0.4])).tolist()
-        [-1.0, -1.0, 0.0, 0.0, 0.75, 1.0, 0.0, 0.5]
     """
 
     def __init__(self, features: int):

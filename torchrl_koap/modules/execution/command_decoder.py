@@ -107,7 +107,7 @@ class CommandRegression(Follower):
 
     Keyword Args:
         **options: ``blend`` and ``action_rule``, which tells the other entries of the action, see
-            :class:`~torchrl_koap.modules.Follower`.
+            ``Follower``.
 
     Examples:
         >>> import torch

@@ -46,14 +46,6 @@ class CommandLimits(nn.Module):
     Raises:
         ValueError: for a gain or lead where no action is a change of a command, one out of range, or columns that
             differ in number.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import CommandLimits
-        >>> limits = CommandLimits([0, 1], lead=0.1, commands=[0, 1], positions=[2, 3])
-        >>> ahead = torch.tensor([[0.59, 0.2, 0.5, 0.2]])  # commanded and measured xy (m)
-        >>> limits(ahead, torch.full([2], 0.02))
-        (tensor([0.0100, 0.0200]), tensor(False))
     """
 
     def __init__(

@@ -17,22 +17,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 from torchrl_koap.modules.execution.policy import PlanningPolicy
-from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 SUFFIXES = {"torch": ".pt2", "onnx": ".onnx", "aoti": ".aoti.pt2"}
-PARTS = ("policy", "controller", "denoiser")
 FACTS = "facts.json"  # inside of a file of torch.export
 _BATCHES = (1, 3)  # that what is read back is tried with
 _MEANINGS = {
     "observations": "raw units, oldest frame first, the present one last; at the start the first one is repeated",
     "noise": "standard normal numbers, drawn anew for every call",
-    "states": "raw units, oldest frame first: those observed, then those planned",
     "actions": "raw units, the next control step first",
     "limited": "which of these actions had left their range and were held at its end",
 }
@@ -49,7 +44,7 @@ class ExportError(RuntimeError):
     """An export that is impossible here, or whose numbers are not those of the policy."""
 
 
-class _WholePolicy(nn.Module):
+class _Stateless(nn.Module):
     """Observations ``[B, history, obs]`` and noise to the next actions ``[B, interval, act]``, and which were held."""
 
     def __init__(self, policy: PlanningPolicy):
@@ -61,32 +56,9 @@ class _WholePolicy(nn.Module):
         return self.policy.to_robot(actions), held
 
 
-class _Controller(nn.Module):
-    """Windows of states ``[B, T, d]`` to actions ``[B, T, act]``."""
-
-    def __init__(self, controller: InverseDynamics):
-        super().__init__()
-        self.controller = controller
-
-    def forward(self, states: Tensor) -> Outputs:
-        out = self.controller(TensorDict({self.controller.in_key: states}, batch_size=states.shape[:1]))
-        return (out.get(self.controller.out_key),)
-
-
-class _Denoiser(nn.Module):
-    """Noisy sequences ``[B, H, w]``, noise levels ``[B]`` and conditions ``[B, c]`` to predictions ``[B, H, w]``."""
-
-    def __init__(self, denoiser: nn.Module):
-        super().__init__()
-        self.denoiser = denoiser
-
-    def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Outputs:
-        return (self.denoiser(sequence, time, condition),)
-
-
 @dataclass(frozen=True)
 class Exportable:
-    """A part of a policy as a plain module on tensors.
+    """A policy as a plain module on tensors.
 
     Args:
         module (nn.Module): from the inputs, in their order, to a tuple of tensors; any batch size.
@@ -106,54 +78,25 @@ class Exportable:
         return tuple(torch.cat([value + 0.1 * index for index in range(size)]) for value in self.inputs.values())
 
 
-def exportable(policy: PlanningPolicy, part: str = "policy", *, columns: Mapping[str, Mapping[str, str]]) -> Exportable:
-    """A part of a policy as a plain module.
+def exportable(policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str]]) -> Exportable:
+    """Returns a policy as a plain module.
 
     Args:
         policy (PlanningPolicy): the policy.
-        part (str): ``"policy"``, its ``"controller"``, or the planner's ``"denoiser"``.
 
     Keyword Args:
-        columns (mapping): name to unit of every column of ``"observations"``, ``"states"`` and ``"actions"``.
-
-    Raises:
-        ValueError: for another part, or the controller of a policy that decodes by no inverse dynamics.
+        columns (mapping): name to unit of every column of ``"observations"`` and ``"actions"``.
     """
-    lookup(PARTS, part, "part of a policy")
-    planner, follower = policy.planner, policy.follower
-    like = next(planner.parameters())
-    generator = torch.Generator().manual_seed(0)
-    columns = {name: dict(entries) for name, entries in columns.items()}
-    outputs: tuple[str, ...]
-
-    def example(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator).to(like)
-
-    if part == "policy":
-        module: nn.Module = _WholePolicy(policy)
-        seen = 0.1 * example(1, policy.history, len(columns["observations"]))
-        if policy.origins is not None:
-            seen = seen.double() + policy.origins[0].to(seen.device)
-        inputs, outputs = {"observations": seen, "noise": example(1, *planner.noise_shape)}, ("actions", "limited")
-    elif part == "controller":
-        if not isinstance(follower, InverseDynamicsFollower):
-            raise ValueError("this policy has no inverse dynamics to export: its actions come from another model")
-        if follower.columns is not None:
-            entries = list(columns["states"].items())
-            columns["states"] = dict(entries[column] for column in follower.columns.tolist())
-        module = _Controller(follower.controller)
-        inputs = {"states": example(1, policy.history + planner.horizon, len(columns["states"]))}
-        outputs = ("actions",)
-    else:
-        module = _Denoiser(planner.denoiser)
-        condition = planner.encode_history(example(1, planner.history, planner.state_dim))
-        inputs = {"sequence": example(1, *planner.noise_shape), "time": example(1).abs(), "condition": condition}
-        outputs = ("prediction",)
-    module.eval()
+    planner, generator = policy.planner, torch.Generator().manual_seed(0)
+    sizes = (1, policy.history, len(columns["observations"])), (1, *planner.noise_shape)
+    seen, noise = (torch.randn(*size, generator=generator).to(next(planner.parameters())) for size in sizes)
+    seen = 0.1 * seen
+    if policy.origins is not None:
+        seen = seen.double() + policy.origins[0].to(seen.device)
+    module, inputs, outputs = _Stateless(policy).eval(), {"observations": seen, "noise": noise}, ("actions", "limited")
     with torch.no_grad():
         found = dict(zip(outputs, module(*inputs.values()), strict=True))
     facts = {
-        "part": part,
         "inputs": _tensors(inputs, columns),
         "outputs": _tensors(found, columns),
         "control_hz": policy.control_hz,
@@ -167,18 +110,17 @@ def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, s
     """Shape, type, meaning, names and units of tensors by name."""
     found: dict[str, Any] = {}
     for name, value in tensors.items():
-        found[name] = {"shape": ["batch", *value.shape[1:]], "type": str(value.dtype).removeprefix("torch.")}
-        if name in _MEANINGS:
-            found[name]["meaning"] = _MEANINGS[name]
+        shape, kind = ["batch", *value.shape[1:]], str(value.dtype).removeprefix("torch.")
+        found[name] = {"shape": shape, "type": kind, "meaning": _MEANINGS[name]}
         if name in columns:
             found[name] |= {"columns": list(columns[name]), "units": list(columns[name].values())}
     return found
 
 
-def export_part(
+def export_policy(
     what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5
 ) -> Callable[..., Outputs]:
-    """Writes a part of a policy, of :func:`exportable`, and compares what is read back with the original.
+    """Writes a policy, of :func:`exportable`, and compares what is read back with the original.
 
     The batch of the file is dynamic: it is tried with one robot and with three. The facts are in the file:
     ``torch.export.load(file, extra_files={"facts.json": ""})``, the metadata of an ONNX model, entry by entry as JSON,

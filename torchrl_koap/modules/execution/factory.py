@@ -13,9 +13,8 @@ from torchrl_koap.modules.execution.command_decoder import CommandDecoder, Comma
 from torchrl_koap.modules.execution.command_limits import CommandLimits, Ranges
 from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import ActionRule, Follower, InverseDynamicsFollower
-from torchrl_koap.modules.execution.mpc import MPC
+from torchrl_koap.modules.execution.mpc import MPC, ResponseModel
 from torchrl_koap.modules.execution.policy import PlanningPolicy
-from torchrl_koap.modules.execution.response_model import ResponseModel
 
 
 def make_policy(
@@ -33,7 +32,6 @@ def make_policy(
     control_hz: float | None = None,
     observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
     origins: tuple[Sequence[float], Sequence[float]] | None = None,
-    follower: Follower | None = None,
 ) -> PlanningPolicy:
     """Makes a policy of planner and controller: observations in, an action per control step out.
 
@@ -50,13 +48,12 @@ def make_policy(
         state_of (callable, or sequence of int): as for :class:`~torchrl_koap.modules.PlanningPolicy`, like
             ``execution``, ``max_steps``, ``control_hz``, ``observe`` and ``origins``.
         columns (sequence of int, optional): columns of the state that an inverse dynamics reads. Default: all.
-        action_rule (callable, optional): as for :class:`~torchrl_koap.modules.Follower`.
+        action_rule (callable, optional): as for ``Follower``.
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
         commanded (mapping, optional): for each of these the observation column that repeats the command
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
-        follower (Follower, optional): follows plans in place of the controller, such as the simulator's inverse.
 
     Returns:
         PlanningPolicy: the policy.
@@ -74,8 +71,7 @@ def make_policy(
         (5, 'feedback')
     """
     execution = Execution() if execution is None else execution
-    if follower is None and controller is not None:
-        follower = _follow(planner, controller, execution, columns, action_rule)
+    follower = None if controller is None else _follow(planner, controller, execution, columns, action_rule)
     limits, margin = None, execution.limits
     ranges = None if ranges is None or margin == math.inf else [_widened(r, margin) for r in ranges]
     if execution.gain != 1 or execution.lead or ranges is not None:

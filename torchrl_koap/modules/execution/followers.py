@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
@@ -30,15 +29,6 @@ class Follower(nn.Module):
 
     Attributes:
         knows_command (bool): it reads the last command. It then looks at every step, and its actions take no gain.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import Follower
-        >>> class Straight(Follower):
-        ...     def forward(self, observations, states, plan, steps=1):
-        ...         return torch.cat([states[..., -1:, :], plan], -2).diff(dim=-2)[..., :steps, :]
-        >>> Straight()(torch.zeros(1, 4), torch.zeros(1, 2), torch.ones(14, 2))
-        tensor([[1., 1.]])
     """
 
     knows_command = False
@@ -69,9 +59,6 @@ class Follower(nn.Module):
         """
         raise NotImplementedError
 
-    def attach(self, env: EnvBase) -> None:
-        """Is told the batch of environments whose episodes are about to begin; needs none by default."""
-
 
 class InverseDynamicsFollower(Follower):
     """Decodes actions from the window of observed and planned states.
@@ -86,13 +73,6 @@ class InverseDynamicsFollower(Follower):
     Keyword Args:
         columns (sequence of int, optional): columns of the state that the controller reads. Default: all.
         **options: ``blend`` and ``action_rule``, see :class:`Follower`.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import InverseDynamicsFollower, make_koopman_inverse_dynamics
-        >>> follower = InverseDynamicsFollower(make_koopman_inverse_dynamics(2, 2))
-        >>> follower(torch.zeros(3, 5, 4), torch.zeros(3, 5, 2), torch.zeros(3, 14, 2)).shape
-        torch.Size([3, 1, 2])
     """
 
     def __init__(self, controller: InverseDynamics, *, columns: Sequence[int] | None = None, **options: Any):

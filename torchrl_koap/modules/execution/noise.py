@@ -27,12 +27,6 @@ class NoiseStreams:
 
     Keyword Args:
         block (int): steps that are drawn at once, ``policy.max_steps``.
-
-    Examples:
-        >>> from torchrl_koap.modules import NoiseStreams
-        >>> both, one = NoiseStreams([7, 8], (14, 2), block=3), NoiseStreams([8], (14, 2), block=3)
-        >>> bool((both.draw()[1] == one.draw()[0]).all())
-        True
     """
 
     def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, block: int):

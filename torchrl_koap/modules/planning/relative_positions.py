@@ -60,11 +60,6 @@ class RelativePositionFeatures(nn.Module):
         return torch.cat(parts, -1)
 
 
-def relative_features(pairs: Sequence[Sequence[slice]]) -> RelativePositionFeatures | None:
-    """Makes the features of a task from its columns, ``Task.relative_columns()``; None where it has no pair of them."""
-    return RelativePositionFeatures(pairs) if pairs else None
-
-
 def _turn_back(vector: Tensor, yaw: Tensor) -> Tensor:
     x, y = vector.unbind(-1)
     cosine, sine = yaw.unbind(-1)

@@ -164,7 +164,6 @@ class ConditionalSampler(TensorDictModuleBase):
         self,
         history: Tensor,
         noise: Tensor | None = None,
-        generator: torch.Generator | None = None,
         *,
         prefix: Tensor | None = None,
     ) -> Tensor:
@@ -173,7 +172,6 @@ class ConditionalSampler(TensorDictModuleBase):
         Args:
             history (Tensor): observed states, the present one last.
             noise (Tensor, optional): start noise ``[*B, H, width]``. Default: drawn.
-            generator (torch.Generator, optional): source of what is drawn.
             prefix (Tensor, optional): first frames ``[*B, k, width]`` that the sequence has to have, ``k`` below the
                 horizon: what is executed anyway while it is sampled (real-time chunking, arXiv 2506.07339).
 
@@ -183,7 +181,7 @@ class ConditionalSampler(TensorDictModuleBase):
         condition = self.encode_history(history)
         expected = (*history.shape[:-2], *self.noise_shape)
         if noise is None:
-            noise = torch.randn(expected, dtype=history.dtype, device=history.device, generator=generator)
+            noise = torch.randn(expected, dtype=history.dtype, device=history.device)
         if noise.shape != expected:
             raise ValueError(
                 f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, columns]), got {list(noise.shape)}"
