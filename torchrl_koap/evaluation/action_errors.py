@@ -44,9 +44,7 @@ def first_actions(
     """Decodes actions on the labelled steps of some trajectories: the same steps for every controller.
 
     The windows have ``BEFORE`` frames of history, of which a trajectory's first is repeated, and ``AFTER`` of future.
-
-    Returns:
-        tuple of Tensor: predicted and true actions ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
+    Returned are predicted and true actions ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
     """
     wanted = torch.isin(data["episode"], torch.as_tensor(episodes, device=data["episode"].device))
     numbers, lengths = data["episode"][wanted].unique(return_counts=True)
@@ -67,14 +65,9 @@ def errors_outside_budget(
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Measures errors on the trajectories that have labels of which none was in the budget.
 
-    Args:
-        controller (nn.Module): the trained controller.
-        data (TensorDictBase): flat, as the controller sees it, with all labels that there are.
-        labelled (TensorDictBase): the same after the budget was applied.
-        task (Task): names and units of the actions.
-
-    Returns:
-        tuple: of :func:`summarise_errors`, or a ``note`` why there is none; ``predicted`` and ``true`` ``[N, act]``.
+    The flat data are as the controller sees them, with all labels that there are, and after the budget was applied
+    (``labelled``). Returned is what :func:`summarise_errors` finds, or a ``note`` why there is none; and the actions
+    ``predicted`` and ``true`` ``[N, act]``.
     """
     outside = episodes_outside(data, labelled)
     predicted, true, episode = first_actions(controller, data, outside)

@@ -168,12 +168,8 @@ class SuggestConfig:
 class SuggestedLabels:
     """What ``suggestions.json`` holds; printed as a table.
 
-    Args:
-        penalty (float): ridge of the run's decoder.
-        labelled_steps (int): labels of the run that the choice builds on.
-        labelled_episodes (list of int): trajectories with a label in the run.
-        suggestions (list of dict): ``rank``, ``episode``, ``steps`` to label and ``score``, best first.
-        data (list of str): options of ``koap train`` that name task and data set.
+    The ridge of the run's decoder; steps and trajectories with a label in the run; ``suggestions`` with ``rank``,
+    ``episode``, ``steps`` to label and ``score``, best first; options of ``koap train`` that name task and data set.
 
     Examples:
         >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels

@@ -142,8 +142,7 @@ def choose_contexts(
 ) -> tuple[list[int] | None, np.ndarray | None]:
     """Returns number and pose of the context of every rollout; None for a task in which all episodes start alike.
 
-    Raises:
-        ValueError: if there are too few contexts, or they were asked for where the task has none.
+    Too few contexts, and those asked for where the task has none, are refused.
     """
     if not task.objects:
         _refuse_contexts(rollouts_per_context, contexts_file, f"task {task.name!r}")
@@ -191,9 +190,8 @@ def find_environment(
 ) -> RolloutEnvironment:
     """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures ``observe`` embeds.
 
-    Raises:
-        ValueError: if there is no such environment, it is not of the task's widths, it does not report success by the
-            key that was asked for, or contexts do not suffice.
+    One that does not exist, has other widths than the task, or does not report success by the key that was asked for is
+    refused, like contexts that do not suffice.
     """
     if config.env is None:
         numbers, contexts = choose_contexts(task, config.episodes, rollouts_per_context, contexts_file)

@@ -101,14 +101,7 @@ _IN_JSON = {"True": "true", "False": "false", "None": "null"}
 
 
 def check_rollouts(config: RolloutConfig) -> None:
-    """Refuses options that fit no run, before a run is loaded.
-
-    Args:
-        config (RolloutConfig): what was asked for.
-
-    Raises:
-        ValueError: naming the option.
-    """
+    """Refuses options that fit no run, before a run is loaded; the message names the option."""
     for name in ("episodes", "num_envs"):
         value = getattr(config, name)
         if value is not None and value < 1:
@@ -128,14 +121,7 @@ def check_rollouts(config: RolloutConfig) -> None:
 
 
 def check_options(config: EvalConfig) -> None:
-    """Refuses evaluation options that fit no run, before a run is loaded.
-
-    Args:
-        config (EvalConfig): what was asked for.
-
-    Raises:
-        ValueError: naming the option.
-    """
+    """Refuses evaluation options that fit no run, before a run is loaded; the message names the option."""
     check_rollouts(config)
     for name in ("batch_size", "rollouts_per_context", "samples"):
         value = getattr(config, name)

@@ -63,8 +63,7 @@ class RecordedPlanner(nn.Module):
 def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: int, seed: int = 0) -> Tensor:
     """Lets a planner continue its own plans, of each of which ``interval`` states are taken over.
 
-    Returns:
-        Tensor: planned states ``[E, max_steps, d]`` (or a few more), the first one the start ``[E, d]``.
+    Returned are planned states ``[E, max_steps, d]`` (or a few more), the first one the start ``[E, d]``.
     """
     generator = torch.Generator(start.device).manual_seed(seed)
     states = [start] * planner.history
@@ -103,13 +102,10 @@ def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
 def follow_recordings(
     policy: PlanningPolicy, task: Task, data: TensorDictBase, make_env: Callable[[int], Any], *, episodes: int
 ) -> list[TensorDict]:
-    """Rolls out a policy with recorded states in place of plans.
+    """Rolls out a policy with recorded states in place of plans, one episode for each of as many demonstrations.
 
-    Where some demonstrations have no action at all, as those of another embodiment, only the others are followed.
-
-    Returns:
-        list: an episode for each of as many demonstrations, spread evenly over the data, with :data:`RECORDED`
-        ``[T, 1]``.
+    They are spread evenly over the data; where some have no action at all, as those of another embodiment, only the
+    others are followed. Episodes have the entry :data:`RECORDED` ``[T, 1]``.
     """
     lengths = trajectory_lengths(data).tolist()
     own = torch.arange(len(lengths))

@@ -32,12 +32,6 @@ def error_unit(part: str, task: Task) -> tuple[str, float]:
     """Returns the unit in which errors of a part of the state are shown, none for several units, and the factor to it.
 
     Where the task says no units, positions are in m and joints in rad.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.findings import error_unit
-        >>> from torchrl_koap.tasks import get_task
-        >>> error_unit("measured_xy", get_task("avoiding")), error_unit("measured_joints", get_task("avoiding"))
-        (('mm', 1000.0), ('mrad', 1000.0))
     """
     if not task.observation_units:
         return ("", 1.0) if task.env is None else thousandths("rad" if "joints" in part else "m")

@@ -47,9 +47,8 @@ class LatencyConfig:
 def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
     """Measures median times of a plan and of a control step between plans, at batch 1; three of each come before.
 
-    Returns:
-        dict: ``plan_ms``, what a step with a plan takes longer (ms), ``control_ms`` (ms), ``control_hz``, the rate of
-        control with plans spread over the steps (Hz).
+    In ms what a step with a plan takes longer, ``plan_ms``, and ``control_ms``; ``control_hz`` is the rate of control
+    with plans spread over the steps (Hz).
     """
     device = device_of(policy)
     observed = torch.zeros(1, policy.history, observation_dim, device=device)
@@ -74,12 +73,7 @@ def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: in
 
 
 def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, Any]:
-    """Runs :func:`run_control_loop` with a trained policy; ``koap latency`` calls this.
-
-    Raises:
-        ValueError: for fewer than one step or a rate that is not positive.
-        RunDirectoryError: if the folder is no finished run.
-    """
+    """Runs :func:`run_control_loop` with a trained policy; ``koap latency`` calls this."""
     if config.steps < 1:
         raise ValueError(f"steps must be >= 1, got {config.steps}")
     set_up_torch(config.threads, "cpu")
@@ -100,21 +94,8 @@ def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, An
 def run_control_loop(agent: Agent, observations: Sequence[Any] | np.ndarray, *, control_hz: float) -> dict[str, Any]:
     """Hands an agent an observation per tick of a clock and counts the actions that come after the next tick.
 
-    Returns:
-        dict: ``steps``, ``late_steps``, ``step_ms`` (what a step may take), and ``p50``, ``p99`` and ``max`` of the
-        time from an observation to its action (ms).
-
-    Raises:
-        ValueError: if the rate is not positive.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.evaluation.latency import run_control_loop
-        >>> class Still:
-        ...     def reset(self): pass
-        ...     def act(self, observation): return 0
-        >>> run_control_loop(Still(), np.zeros((5, 2)), control_hz=100.0)["steps"]
-        5
+    Returned are ``steps``, ``late_steps``, ``step_ms`` (what a step may take), and ``p50``, ``p99`` and ``max`` of the
+    time from an observation to its action (ms). A rate that is not positive is an error.
     """
     if not (np.isfinite(control_hz) and control_hz > 0):
         raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz}")
@@ -147,17 +128,8 @@ def time_calls(
 ) -> dict[str, dict[str, float]]:
     """Times functions that are called in turn, so that a busy machine slows all of them alike.
 
-    Ten calls of each come before those that count.
-
-    Returns:
-        dict: by name ``p50`` and ``p99`` in ms, and ``ratio``, the median of its time over that of the first function
-        in the same turn.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.latency import time_calls
-        >>> sorted(time_calls({"add": torch.add, "mul": torch.mul}, (torch.ones(2), torch.ones(2)), repeats=3)["mul"])
-        ['p50', 'p99', 'ratio']
+    Ten calls of each come before those that count. By name: ``p50`` and ``p99`` in ms, and ``ratio``, the median of its
+    time over that of the first function in the same turn.
     """
     taken: dict[str, list[float]] = {name: [] for name in functions}
     with torch.no_grad():

@@ -46,8 +46,7 @@ def spectrum(eigenvalues: Tensor) -> dict[str, Any]:
 def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> TensorDict:
     """Infers the latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
 
-    Returns:
-        TensorDict: ``[M]`` with ``latent_action [M, m]``, ``state``, ``action``, ``has_action [M]``, ``episode [M]``.
+    Entries ``[M]``: ``latent_action [M, m]``, ``state``, ``action``, ``has_action [M]``, ``episode [M]``.
     """
     keys = [STATE, ACTION, HAS_ACTION, EPISODE]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
@@ -60,13 +59,10 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
 
 
 def split_trajectories(episode: Tensor, labelled: Tensor) -> Tensor:
-    """Draws the numbers of half of the trajectories, to fit on, those with a label in the budget first.
+    """Draws the numbers of half of the trajectories, two or more, to fit on, those with a label in the budget first.
 
     The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many. Of every
     step are given its trajectory ``[N]`` and whether the budget labels it ``[N]``.
-
-    Raises:
-        ValueError: if there is only one trajectory.
     """
     names = episode.unique()
     if len(names) < 2:
@@ -98,11 +94,8 @@ def prediction_errors(
     linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others. The Koopman model was
     trained on the states of all of them.
 
-    Returns:
-        dict: by model and part the root mean square distance after ``1 .. horizon`` steps, in raw units.
-
-    Raises:
-        ValueError: if the horizon is below 1, or a trajectory is too short for it.
+    By model and part the root mean square distance after ``1 .. horizon`` steps is returned, in raw units. A horizon
+    below 1, or above what a trajectory holds, is an error.
     """
     if horizon < 1:
         raise ValueError(f"horizon must be >= 1 step, got {horizon}")
@@ -188,11 +181,9 @@ def analyse_latent(
 ) -> dict[str, Any]:
     """Measures spectrum, multi-step errors (fewer steps where trajectories are short) and what a linear probe explains.
 
-    Args:
-        controller (KoopmanInverseDynamics): the model, in evaluation mode, on the device of the data.
-        data (TensorDictBase): flat ``[N]`` with all labels that there are, as the controller sees them.
-        labelled (Tensor): steps labelled in the budget, bool ``[N]``.
-        parts (mapping): columns of the state by name.
+    The controller is in evaluation mode, on the device of the flat data ``[N]``, which have all labels that there are,
+    as the controller sees them; ``labelled`` are those in the budget, bool ``[N]``, ``parts`` columns of the state by
+    name.
 
     Returns:
         dict: ``eigenvalues``, ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`

@@ -130,14 +130,7 @@ def _faults(found: Mapping[str, Any]) -> list[str]:
 
 
 def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
-    """Says how many commands of a policy left the demonstrated range.
-
-    Args:
-        policy (PlanningPolicy): one that has acted.
-
-    Returns:
-        dict: ``limited_commands``, and a sentence in ``faults`` if there are any.
-    """
+    """Says how many commands of a policy left the demonstrated range, with a sentence in ``faults`` if any did."""
     limited, commands = policy.limited.tolist()
     if not limited:
         return {"limited_commands": 0}

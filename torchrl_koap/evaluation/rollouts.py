@@ -73,12 +73,12 @@ def roll_out(
     given: Callable[[slice], TensorDictModuleBase] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[TensorDict]:
-    """Runs one episode per seed.
+    """Runs one episode per seed, on which alone the planner's noise depends; returns each ``[steps]``, cut at its end.
 
     Args:
         policy (PlanningPolicy): the policy.
         make_env (callable): makes an environment of a given number of parallel episodes.
-        seeds (sequence of int): one per episode; the planner's noise depends on nothing else.
+        seeds (sequence of int): one per episode.
 
     Keyword Args:
         max_steps (int): control steps at most.
@@ -87,9 +87,6 @@ def roll_out(
         given (callable, optional): ``given(episodes)`` writes what the planner reads in those episodes in place of
             start noise.
         progress (callable, optional): called with the number of episodes finished.
-
-    Returns:
-        list of TensorDict: one per episode, ``[steps]``, cut at its end.
     """
     if not len(seeds) or (batch_size is not None and batch_size < 1):
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")

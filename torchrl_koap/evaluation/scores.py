@@ -39,13 +39,11 @@ def score(
 ) -> dict[str, Any]:
     """Success (in ``rates``) with its 95 % interval, entropy of the modes of successful episodes, a row per episode.
 
-    Modes and collisions are told of where there are any.
+    Modes and collisions are told of where there are any. There is a seed per episode of
+    :func:`~torchrl_koap.evaluation.rollouts.roll_out`; ``mode_index`` maps the leaf ``mode`` to a number, -1 if
+    incomplete; ``num_modes`` is the base of the entropy's logarithm.
 
-    Args:
-        episodes (sequence of TensorDict): from :func:`~torchrl_koap.evaluation.rollouts.roll_out`.
-        seeds (sequence of int): one per episode.
-        num_modes (int): base of the logarithm of the entropy; modes are not told of if it is 1.
-        mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
+    Keyword Args:
         contexts (sequence of int, optional): number of the context of every episode. With it ``mode_entropy`` is the
             mean over contexts, None below two rollouts per context, and ``pooled_mode_entropy`` is that of all
             successful episodes together.

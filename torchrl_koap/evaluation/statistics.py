@@ -16,11 +16,7 @@ _RESAMPLES, _TAIL = 500, (1 - 0.95) / 2  # of a bootstrap; share outside its int
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Returns both ends, in 0..1, of the Wilson score interval (95 %) of a success rate.
-
-    Raises:
-        ValueError: if there are no trials, or more successes than trials.
-    """
+    """Returns both ends, in 0..1, of the Wilson score interval (95 %) of a success rate of at least one trial."""
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"expected 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
     interval = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
@@ -37,9 +33,6 @@ def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
     """Entropy of the modes seen, logarithm base ``num_modes``: 1 if all are equally frequent, 0 for a single one.
 
     There is a mode ``0 .. num_modes - 1`` per successful episode; D3IL counts no others.
-
-    Raises:
-        ValueError: for a mode out of range.
     """
     for mode in modes:
         if not 0 <= mode < num_modes:
@@ -68,13 +61,9 @@ def expected_entropy(episodes: int, num_modes: int) -> float:
 def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsolved: str = "skip") -> float | None:
     """Mean over contexts of the entropy of the modes seen in each, logarithm base ``num_modes``.
 
-    A single rollout per context always gives 0: the figure says something from two on.
-
-    ``unsolved`` says what contexts without success count: ``"skip"`` leaves them out (Sorting, Stacking), ``"zero"``
-    counts them as 0 (Aligning). None if there is nothing to average.
-
-    Raises:
-        ValueError: for a mode out of range, or another ``unsolved``.
+    A single rollout per context always gives 0: the figure says something from two on. ``unsolved`` says what contexts
+    without success count: ``"skip"`` leaves them out (Sorting, Stacking), ``"zero"`` counts them as 0 (Aligning). None
+    if there is nothing to average.
     """
     if unsolved not in ("skip", "zero"):
         raise ValueError(f"unsolved must be 'skip' or 'zero', got {unsolved!r}")
@@ -85,15 +74,9 @@ def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsol
 def bootstrap_interval(units: Sequence, statistic: Callable[[Sequence], float | None]) -> tuple[float, float] | None:
     """Percentile interval (95 %) of a statistic under resampling of independent units, shifted by the bias.
 
-    Resamples hold fewer distinct units than the sample; an entropy is lower on them. The interval is moved by as much
-    as their mean lies beside the statistic of the sample. Every call draws the same resamples.
-
-    Args:
-        units (sequence): what was sampled independently: episodes, or contexts with all their episodes.
-        statistic (callable): from a list of units to a number, or None where it is not defined.
-
-    Returns:
-        tuple or None: low and high end; None if the statistic is never defined.
+    Units are what was sampled independently: episodes, or contexts with all their episodes. Resamples hold fewer
+    distinct units than the sample; an entropy is lower on them. The interval is moved by as much as their mean lies
+    beside the statistic of the sample. Every call draws the same resamples. None if the statistic is never defined.
     """
     generator = random.Random(0)
     values = [statistic(generator.choices(units, k=len(units))) for _ in range(_RESAMPLES)]

@@ -186,12 +186,8 @@ class InverseDynamics(TensorDictModuleBase):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Selects what :meth:`fit_labels`, whose other arguments these are, fits a decoder to.
 
-        Args:
-            read (callable): maps raw states ``[N, T, d]`` and a range of frames to what the decoder reads of them,
-                ``[N, frames, m]``.
-
-        Returns:
-            tuple of Tensor: inputs ``[n, m]``, normalised actions ``[n, act]``, and groups ``[n]`` if they were given.
+        ``read`` maps raw states ``[N, T, d]`` and a range of frames to what the decoder reads of them, ``[N, frames,
+        m]``. Returned are inputs ``[n, m]``, normalised actions ``[n, act]``, and groups ``[n]`` if they were given.
         """
         states = read_entry(self, windows, self.in_key, "set_keys(state=...)")
         action = check_actions(read_entry(self, windows, self.out_key, "set_keys(action=...)"), self.out_key, states)

@@ -156,12 +156,8 @@ def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
     .. math::
         a_{t,i} \approx \sum_s w_s v_{t,s,i} \qquad \text{for every axis } i
 
-    A trajectory that hardly moves along one axis says little about that axis; together they determine the few numbers
-    ``w`` well.
-
-    Args:
-        steps (Tensor): steps ``v`` of each axis' own coordinate, ``[N, S, act]``, raw units.
-        action (Tensor): actions ``[N, act]``, raw units.
+    with steps ``v [N, S, act]`` of each axis' own coordinate and actions ``[N, act]``, both in raw units. A trajectory
+    that hardly moves along one axis says little about that axis; together they determine the few numbers ``w`` well.
     """
     rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
     unit = rows.square().sum(-1).mean()
@@ -192,27 +188,19 @@ def thin_svd(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tensor, *, centred: bool) -> Tensor:
-    r"""Computes mean squared errors of ridge regressions on every group of rows, predicted without it.
+    r"""Computes mean squared errors ``[P, act]`` of ridge regressions on every group of rows, predicted without it.
 
-    With the left singular vectors ``U`` and the shrinkages ``s`` of the directions a ridge predicts
-    :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` left out have the errors
-    :math:`(I - H_{GG})^{-1} (Y - \hat Y)_G`, exactly. For a group of more rows than there are directions the smaller
-    system is solved (Woodbury's identity, with :math:`V = U_G \mathrm{diag}(s)^{1/2}`):
+    With the left singular vectors ``U`` ``[N, r]`` and the shrinkages ``s`` of the directions, a row for every
+    regression ``[P, r]``, a ridge predicts :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` left
+    out have the errors :math:`(I - H_{GG})^{-1} (Y - \hat Y)_G`, exactly. For a group of more rows than there are
+    directions the smaller system is solved (Woodbury's identity, with :math:`V = U_G \mathrm{diag}(s)^{1/2}`):
 
     .. math::
         (I - V V^T)^{-1} E = E + V (I - V^T V)^{-1} V^T E
 
-    Args:
-        left (Tensor): left singular vectors of what is regressed on, ``[N, r]``.
-        shrinks (Tensor): shrinkages of the directions between 0 and 1, a row for every regression, ``[P, r]``.
-        target (Tensor): ``[N, act]``, without their mean where that is fitted.
-        groups (Tensor): group of every row, int64 ``[N]``.
-
-    Keyword Args:
-        centred (bool): whether the mean is fitted too; it counts as one more direction that is not shrunk.
-
-    Returns:
-        Tensor: ``[P, act]``; infinite where nothing is left to take a mean of.
+    Where the mean is fitted too (``centred``) it counts as one more direction that is not shrunk; the target ``[N,
+    act]`` is then without it. ``groups`` are int64 ``[N]``. Errors are infinite where nothing is left to take a mean
+    of.
     """
     coefficients = shrinks.unsqueeze(-1) * (left.mT @ target)  # [P, r, act]
     if centred and len(left) == 1:

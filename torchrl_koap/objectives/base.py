@@ -18,18 +18,9 @@ from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 class NetworkLoss(LossModule):
     """Base class of all losses here: one network, keys that can be renamed, a reduction.
 
-    A subclass has the dataclass ``_AcceptedKeys`` and names in :attr:`required` the entries that must be there.
-
-    Args:
-        network (nn.Module): the network to train.
-
-    Keyword Args:
-        create_target_params (bool): keep an averaged copy of the weights in ``target_network_params``.
-        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``.
-
-    Raises:
-        ValueError: for an unknown reduction.
-        TypeError: for a network of another kind than :attr:`trains`.
+    A subclass has the dataclass ``_AcceptedKeys`` and names in :attr:`required` the entries that must be there. With
+    ``create_target_params`` an averaged copy of the weights is kept in ``target_network_params``; the reduction is
+    ``"mean"``, ``"sum"`` or ``"none"``. Another one, and a network of another kind than :attr:`trains`, are errors.
     """
 
     trains: tuple[type[nn.Module], ...] = (nn.Module,)
@@ -96,11 +87,8 @@ class NetworkLoss(LossModule):
 class WindowLoss(NetworkLoss):
     """Base class of the losses on windows of states of which some frames have an action label.
 
-    Args:
-        network (InverseDynamics): the controller; its entries of states and actions are those of the loss.
-
-    Keyword Args:
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+    States and actions are read where the network, an InverseDynamics, has them. Reductions are ``"mean"`` (default),
+    ``"sum"`` and ``"none"`` (``[*B, frames]``, 0 where masked).
     """
 
     @dataclass

@@ -24,10 +24,9 @@ class DenoisingLoss(NetworkLoss):
 
     With a normalised sequence ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per sequence::
 
-        L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - target |^2
+        L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - x_0 |^2
 
-    where the schedule's prediction type says whether the target is the clean sequence or the noise. A subclass says
-    what a batch holds (:meth:`read`).
+    A subclass says what a batch holds (:meth:`read`).
 
     Args:
         network (ConditionalSampler): network to train, its normalisers already fitted.
@@ -39,10 +38,6 @@ class DenoisingLoss(NetworkLoss):
             (``"none"``: 0 where they do not). Defaults to ``"mean"``.
         dtype (torch.dtype, optional): of the denoiser's matrix products, such as ``torch.bfloat16``. Default: that of
             its weights.
-
-    Raises:
-        ValueError: if ``reduction`` is unknown; at the call if an entry has another shape than the network needs.
-        KeyError: at the call if an entry is missing.
     """
 
     network: ConditionalSampler
@@ -59,11 +54,9 @@ class DenoisingLoss(NetworkLoss):
         self.dtype = dtype
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Reads raw histories and sequences of a batch, and which of their steps count.
+        """Reads raw histories ``[*B, h, d]`` and sequences ``[*B, H, width]``, and which of their steps count.
 
-        Returns:
-            tuple: histories ``[*B, h, d]``, sequences ``[*B, H, width]`` and the steps that count, bool ``[*B, H, 1]``,
-            or None where all do.
+        The steps are bool ``[*B, H, 1]``, or None where all count.
         """
         raise NotImplementedError
 

@@ -99,11 +99,7 @@ def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
 
 
 def read_episodes(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Returns the positions ``[length, 2]`` (m) of each episode without the padding, and modes and outcomes ``[E]``.
-
-    Raises:
-        ValueError: if an entry is missing or has a wrong shape.
-    """
+    """Returns the positions ``[length, 2]`` (m) of each episode without the padding, and modes and outcomes ``[E]``."""
     paths = _paths(rollouts, "position", [None, None, 2])
     mode, outcome = (entry(rollouts, key, [len(paths)]).astype(int) for key in ("mode", "outcome"))
     return paths, mode, outcome

@@ -101,13 +101,10 @@ def run_cell(folder: str | Path) -> None:
 
 
 def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int], float]] | None:
-    """Reads what a cell found, None if it is not finished.
+    """Reads what a cell found, None if it is not finished; a damaged ``result.json`` is refused.
 
     These are columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`, and outcomes as
     :data:`~torchrl_koap.studies.paired_comparison.Outcome`.
-
-    Raises:
-        RunDirectoryError: if ``result.json`` is damaged.
     """
     path = Path(folder) / FOUND
     if not path.exists():

@@ -52,10 +52,8 @@ class CameraReport:
 def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Recordings, Task]:
     """Reads data sets with camera frames as one: what ``koap convert`` wrote, or where a task is given any recordings.
 
-    The task has the embeddings among its columns; without one it is that of the first source.
-
-    Raises:
-        DataError: if the columns of two sources differ, or one is not converted.
+    The task has the embeddings among its columns; without one it is that of the first source. Sources whose columns
+    differ, and one that is not converted, are refused.
     """
     found = []
     for source in sources:
@@ -68,11 +66,7 @@ def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Reco
 
 
 def join_recordings(parts: Sequence[Recordings]) -> Recordings:
-    """Lays recordings with the same columns one after the other, with the cameras that all of them have.
-
-    Raises:
-        DataError: if the columns of two of them differ.
-    """
+    """Lays recordings with the same columns one after the other, with the cameras that all of them have."""
     first = parts[0]
     for other in parts[1:]:
         if other.state_names != first.state_names or other.actions[0].shape[1] != first.actions[0].shape[1]:

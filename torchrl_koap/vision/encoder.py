@@ -85,11 +85,7 @@ class FrozenImageEncoder(ObservationTransform):
 
     @torch.no_grad()
     def features(self, frames: Tensor) -> Tensor:
-        """Computes pooled features ``[*B, F]`` of frames, uint8 ``[*B, H, W, 3]``.
-
-        Raises:
-            ValueError: for frames of another dtype, or without three colours.
-        """
+        """Computes pooled features ``[*B, F]`` of frames, uint8 ``[*B, H, W, 3]``; all else is refused."""
         if frames.dtype != torch.uint8:
             raise ValueError(f"frames must be uint8 in 0 to 255, got {frames.dtype}")
         if frames.ndim < 3 or frames.shape[-1] != 3:

@@ -53,11 +53,7 @@ class Projection(nn.Module):
 
     @classmethod
     def fit(cls, features: Tensor, dim: int) -> Projection:
-        """Fits ``dim`` components to features ``[N, F]``.
-
-        Raises:
-            ValueError: if there are fewer frames or features than components, or all frames are alike.
-        """
+        """Fits ``dim`` components to features ``[N, F]``, more of both, of frames that are not all alike."""
         if min(features.shape) <= dim:
             raise ValueError(f"{dim} components need more frames and features than that, got {list(features.shape)}")
         features = features.double()
@@ -83,12 +79,7 @@ class Projection(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> Projection:
-        """Reads a file that :meth:`save` wrote; no network is needed.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if it is damaged.
-        """
+        """Reads a file that :meth:`save` wrote; no network is needed. One that is missing or damaged is refused."""
         if not Path(path).is_file():
             raise FileNotFoundError(f"no projection: there is no file {path}")
         check_file(path)
@@ -121,11 +112,7 @@ class Projection(nn.Module):
         return 1 - float(left), float(left) ** 0.5
 
     def forward(self, features: Tensor) -> Tensor:
-        """Computes components ``[*B, d]`` of features ``[*B, F]``.
-
-        Raises:
-            ValueError: if the features are of another size.
-        """
+        """Computes components ``[*B, d]`` of features ``[*B, F]``; refuses those of another size."""
         if features.shape[-1] != len(self.mean):
             raise ValueError(
                 f"the projection was fitted on {len(self.mean)} features, got {features.shape[-1]}: another network,"

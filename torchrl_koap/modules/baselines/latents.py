@@ -28,11 +28,8 @@ class FiniteScalarQuantizer(nn.Module):
 
     after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle one: they lie half a level
     lower, and the shift ``s`` keeps 0 at the code 0. There is no codebook to train and no term for it in a loss; a
-    codebook is the 1000 codes there are of four entries with 8, 5, 5 and 5 levels; a code has two of them.
-
-    Args:
-        features (int): size ``m`` of what is quantised; a linear map takes it to the entries of the codes, and a second
-            one the codes back to ``m``.
+    codebook is the 1000 codes there are of four entries with 8, 5, 5 and 5 levels; a code has two of them. A linear map
+    takes the ``features`` ``[*B, m]`` to the entries of a code, and a second one takes codes back.
     """
 
     def __init__(self, features: int):
@@ -109,9 +106,7 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
     def predict_step(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor]:
         """Predicts the next step of raw states ``[*B, T, d]`` from the past and the code of the transition.
 
-        Returns:
-            tuple of Tensor: the prediction and the step ``x_{t+1} - x_t`` itself, both ``[*B, len(frames), d]`` and
-            divided by the step's spread.
+        Returned are the prediction and the step ``x_{t+1} - x_t`` itself, ``[*B, len(frames), d]``, over its spread.
         """
         read, size = self.reader(self.normalize_state(state), frames), self.reader.state_dim
         past, step, _ = read.tensor_split(((self.num_past + 1) * size, (self.num_past + 2) * size), -1)
@@ -152,9 +147,8 @@ class VariationalInverseDynamics(LatentInverseDynamics):
     def posterior(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Infers the distribution of the latents of a window of raw states ``[*B, T, d]``.
 
-        Returns:
-            tuple of Tensor: what every frame read ``[*B, len(frames), 3 d]``, at unit scale; mean and log-variance of
-            the latents ``[*B, len(frames), m]``.
+        Returned are what every frame read ``[*B, len(frames), 3 d]``, at unit scale, and mean and log-variance of the
+        latents ``[*B, len(frames), m]``.
         """
         read = self.reader(self.normalize_state(state))  # [*B, T, F]
         context, _ = self.context(read.reshape(-1, *read.shape[-2:]))

@@ -98,16 +98,10 @@ class CommandRegression(Follower):
     .. math::
         a_t = f(p_{t+1}) - f(x_t) + \rho\, (f(x_t) - c_t)
 
-    with the decoded command ``f`` (:class:`CommandDecoder`), the plan ``p`` bent into the present state, the last
-    command ``c``, which the policy knows, and the feedback gain ``rho = 0.3``. The first part moves what is seen; the
-    second keeps what is not seen where demonstrations had it.
-
-    Args:
-        controller (CommandDecoder): the command of a state, and the columns that it is about.
-
-    Keyword Args:
-        **options: ``blend`` and ``action_rule``, which tells the other entries of the action, see
-            ``Follower``.
+    with the decoded command ``f`` (the ``controller``, a :class:`CommandDecoder`), the plan ``p`` bent into the present
+    state, the last command ``c``, which the policy knows, and the feedback gain ``rho = 0.3``. The first part moves
+    what is seen; the second keeps what is not seen where demonstrations had it. The rule of actions tells the other
+    entries.
 
     Examples:
         >>> import torch

@@ -27,17 +27,17 @@ class CommandLimits(nn.Module):
         a' = \operatorname{clip}(c + g a - x,\; -l,\; l) - (c - x)
 
     with the last command ``c``, the measured position ``x``, an action ``a`` that changes the command, the gain ``g``
-    and the lead ``l``. Where a robot is blocked, at the end of its reach or by what it pushes against, every plan that
-    leads on adds to the command, which nothing takes back (integrator windup): the command ends metres away, and what
-    is decided from then on hardly moves the robot. With a limit it answers as soon as plans turn back.
+    and the lead ``l``, 0 for none, in the units of the actions. Where a robot is blocked, at the end of its reach or by
+    what it pushes against, every plan that leads on adds to the command, which nothing takes back (integrator windup):
+    the command ends metres away, and what is decided from then on hardly moves the robot. With a limit it answers as
+    soon as plans turn back.
 
     Args:
         actions (sequence of int): action columns that change the command; needed for a gain or lead.
 
     Keyword Args:
         ranges (sequence, optional): least and greatest number of every action column, None for one without limit.
-        gain (float): ``g``.
-        lead (float, optional): ``l``, in the units of the actions; 0 sets no limit.
+        gain, lead (float): ``g`` and ``l``.
         commands (sequence of int): observation columns that repeat the last command; needed for a lead.
         positions (sequence of int): state columns of what each of them moves; likewise.
         state_of (callable, optional): from observations ``[*B, obs]`` to states ``[*B, d]``. Default: they are the
@@ -79,10 +79,8 @@ class CommandLimits(nn.Module):
     def forward(self, observations: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """What is left of an action ``[*B, act]``, by observations ``[*B, history, obs]``, the present one last.
 
-        What is within the limits stays the same bit for bit: a rounding error changes episodes with contacts.
-
-        Returns:
-            tuple: the action ``[*B, act]``, and whether a column left its range, bool ``[*B]``.
+        What is within the limits stays the same bit for bit: a rounding error changes episodes with contacts. The
+        second tensor says whether a column left its range, bool ``[*B]``.
         """
         held = self._in_range(action)
         return self._paced(observations, held), (held != action).any(-1)

@@ -58,10 +58,10 @@ class _Stateless(nn.Module):
 
 @dataclass(frozen=True)
 class Exportable:
-    """A policy as a plain module on tensors.
+    """A policy as a plain module on tensors, of any batch size.
 
     Args:
-        module (nn.Module): from the inputs, in their order, to a tuple of tensors; any batch size.
+        module (nn.Module): from the inputs, in their order, to a tuple of tensors.
         inputs (dict): an example of every input by name, batch 1.
         outputs (tuple of str): names of what comes out.
         facts (dict): what a caller has to know, as JSON: shapes, names and units of the columns, order of frames,
@@ -79,14 +79,7 @@ class Exportable:
 
 
 def exportable(policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str]]) -> Exportable:
-    """Returns a policy as a plain module.
-
-    Args:
-        policy (PlanningPolicy): the policy.
-
-    Keyword Args:
-        columns (mapping): name to unit of every column of ``"observations"`` and ``"actions"``.
-    """
+    """Returns a policy as a plain module, with name to unit of every column of ``"observations"`` and ``"actions"``."""
     planner, generator = policy.planner, torch.Generator().manual_seed(0)
     sizes = (1, policy.history, len(columns["observations"])), (1, *planner.noise_shape)
     seen, noise = (torch.randn(*size, generator=generator).to(next(planner.parameters())) for size in sizes)
@@ -120,7 +113,7 @@ def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, s
 def export_policy(
     what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5
 ) -> Callable[..., Outputs]:
-    """Writes a policy, of :func:`exportable`, and compares what is read back with the original.
+    """Writes a policy, of :func:`exportable`, and compares what is read back with the original; returns the former.
 
     The batch of the file is dynamic: it is tried with one robot and with three. The facts are in the file:
     ``torch.export.load(file, extra_files={"facts.json": ""})``, the metadata of an ONNX model, entry by entry as JSON,
@@ -130,9 +123,6 @@ def export_policy(
         kind (str): ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) or ``"aoti"``
             (AOTInductor; needs a C++ compiler).
         tolerance (float): largest difference to the original, relative to the largest number of its output.
-
-    Returns:
-        callable: what was read back; takes the inputs as tensors and returns a tuple of outputs.
 
     Raises:
         ValueError: for another kind.

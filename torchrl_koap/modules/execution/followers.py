@@ -27,8 +27,7 @@ class Follower(nn.Module):
         action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` has the
             last word on the actions of a window, such as a gripper's number; ``task.action_rule``.
 
-    Attributes:
-        knows_command (bool): it reads the last command. It then looks at every step, and its actions take no gain.
+    One that ``knows_command`` reads the last command: it looks at every step, and its actions take no gain.
     """
 
     knows_command = False
@@ -66,13 +65,8 @@ class InverseDynamicsFollower(Follower):
     Before anything is decoded the plan is *blended* into the present state (:func:`blend_plan`). An inverse dynamics is
     fitted to motions that happened, in which no step leaps; a plan that begins beside the robot it follows badly.
 
-    Args:
-        controller (InverseDynamics): or another module with ``num_past`` that reads a window of states ``[*B, T, d]``
-            and writes actions ``[*B, T, act]``.
-
-    Keyword Args:
-        columns (sequence of int, optional): columns of the state that the controller reads. Default: all.
-        **options: ``blend`` and ``action_rule``, see :class:`Follower`.
+    The controller is an InverseDynamics, or another module with ``num_past`` that reads a window of states ``[*B, T,
+    d]`` and writes actions ``[*B, T, act]``; ``columns`` of the state are those that it reads, all by default.
     """
 
     def __init__(self, controller: InverseDynamics, *, columns: Sequence[int] | None = None, **options: Any):

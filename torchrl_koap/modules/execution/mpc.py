@@ -85,10 +85,8 @@ class ResponseModel(nn.Module):
     def coordinates(self, positions: Tensor, lead: Tensor, changes: Tensor) -> Tensor:
         """What the next step is linear in, ``[*B, J, 2 memory + 1]``.
 
-        Args:
-            positions (Tensor): measured ``[*B, memory + 1, J]``, the present one last.
-            lead (Tensor): distance from the present position to the command ``[*B, J]``.
-            changes (Tensor): of the command ``[*B, memory, J]``, the latest last.
+        Measured positions are ``[*B, memory + 1, J]``, the present one last; the distance from there to the command
+        ``[*B, J]``; changes of the command ``[*B, memory, J]``, the latest last.
         """
         steps = positions.diff(dim=-2).flip(-2).movedim(-2, -1)
         return torch.cat([steps, lead.unsqueeze(-1), changes.flip(-2).movedim(-2, -1)], -1)
@@ -100,8 +98,7 @@ class ResponseModel(nn.Module):
 
         Args:
             positions (Tensor): measured ``[*B, memory + 1, J]``, the present one last.
-            command (Tensor): the last command ``[*B, J]``.
-            changes (Tensor): that led to it ``[*B, memory, J]``, the latest last.
+            command, changes (Tensor): the last command ``[*B, J]``, and what led to it ``[*B, memory, J]``.
             future (Tensor): the changes to come ``[*B, N, J]``; the last one is not seen within N steps.
 
         Keyword Args:
@@ -117,10 +114,9 @@ class ResponseModel(nn.Module):
         return torch.stack(predicted, -2)
 
     def impulse_matrix(self, steps: int) -> Tensor:
-        """Effect of every future change of the command on the next ``N = steps`` positions.
+        """Effect of future changes of the command on the next ``N = steps`` positions, float64 ``[N, J, N - 1, J]``.
 
-        Returns:
-            Tensor: float64 ``[N, J, N - 1, J]``: of the change in step ``k`` of axis ``j`` (last two) on the positions.
+        The last two are step and axis of the change, the first two those of the position.
         """
         axes = self.num_axes
         pushes = torch.eye(steps * axes, dtype=torch.float64, device=self.weight.device)
@@ -135,16 +131,9 @@ class ResponseModel(nn.Module):
     ) -> ResponseModel:
         """Fits this model to measured steps by ridge regression, and returns it.
 
-        Args:
-            coordinates (Tensor): ``[n, J, 2 memory + 1]`` (:meth:`coordinates`).
-            steps (Tensor): what followed ``[n, J]``.
-
-        Keyword Args:
-            penalty (float): ridge penalty, relative to the coordinates' mean squares.
-            coupled (bool): an axis may answer the commands of others; else each one is fitted by itself.
-
-        Raises:
-            ValueError: if there is no step, or the shapes do not fit.
+        Coordinates are ``[n, J, 2 memory + 1]`` (:meth:`coordinates`), the steps that followed ``[n, J]``; the penalty
+        is relative to the coordinates' mean squares. Axes that are ``coupled`` may answer the commands of others, else
+        each one is fitted by itself. No step, and shapes that do not fit, are errors.
         """
         count, axes, size = len(steps), self.num_axes, 2 * self.memory + 1
         if not count or coordinates.shape != (count, axes, size) or steps.shape != (count, axes):

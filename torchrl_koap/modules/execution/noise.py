@@ -18,15 +18,9 @@ NOISE = "noise"
 class NoiseStreams:
     """Draws standard normal noise of episodes, which depends on an episode's seed and step alone.
 
-    Numbers are drawn for a block of steps at once: torch fills tensors in groups of 16, so that draws step by step
-    would be others.
-
-    Args:
-        seeds (sequence of int): one per episode.
-        shape (sequence of int): shape of one draw, ``policy.noise_shape``.
-
-    Keyword Args:
-        block (int): steps that are drawn at once, ``policy.max_steps``.
+    There is a seed per episode. Numbers are drawn for a block of steps at once (``policy.max_steps``), since torch
+    fills tensors in groups of 16, so that draws step by step would be others. A draw has the shape
+    ``policy.noise_shape``.
     """
 
     def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, block: int):
@@ -54,14 +48,7 @@ class NoiseStreams:
 
 
 class StartNoise(TensorDictModuleBase):
-    """Writes the noise of the next step, in front of a policy.
-
-    Args:
-        streams (NoiseStreams): where it comes from, a stream per environment.
-
-    Keyword Args:
-        noise_key (NestedKey): entry that is written, ``planner.noise_key``. Defaults to ``"noise"``.
-    """
+    """Writes the noise of the next step, in front of a policy: a stream per environment, to ``planner.noise_key``."""
 
     def __init__(self, streams: NoiseStreams, *, noise_key: NestedKey = NOISE):
         super().__init__()
@@ -77,14 +64,7 @@ class NoiseTransform(Transform):
     """Writes start noise at every reset and step of an environment; number ``i`` of a batch draws with ``seed + i``.
 
     TorchRL hands a seed to the innermost environment alone; :class:`~torchrl_koap.modules.PolicyEnv` hands it to this
-    transform too.
-
-    Args:
-        shape (sequence of int): as for :class:`NoiseStreams`.
-
-    Keyword Args:
-        block (int): as for :class:`NoiseStreams`.
-        noise_key (NestedKey): entry that is written, ``planner.noise_key``. Defaults to ``"noise"``.
+    transform too. Arguments are those of :class:`NoiseStreams`, and the entry that is written, ``planner.noise_key``.
     """
 
     def __init__(self, shape: Sequence[int], *, block: int, noise_key: NestedKey = NOISE):

@@ -146,9 +146,8 @@ class PlanningPolicy(TensorDictModuleBase):
     def plan(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
         """Makes what is executed next: planned states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
 
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, raw units.
-            noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
+        Observations are ``[*B, history, obs]`` in raw units, noise ``[*B, *noise_shape]`` standard normal, random by
+        default.
         """
         states = self.state_of(observations)
         chunk = self.sample(states, noise)
@@ -159,10 +158,8 @@ class PlanningPolicy(TensorDictModuleBase):
     def sample(self, states: Tensor, noise: Tensor | None = None, **options: Any) -> Tensor:
         """Samples what the planner plans, ``[*B, H, w]``, at the temperature of the execution.
 
-        Args:
-            states (Tensor): the last observed states ``[*B, history, d]``.
-            noise (Tensor, optional): as for :meth:`plan`.
-            **options: of the planner's ``sample``, such as the ``prefix``.
+        The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`; options are of the planner's
+        ``sample``, such as the ``prefix``.
         """
         if noise is None:
             shape = (*states.shape[:-2], *self.noise_shape)
@@ -173,10 +170,7 @@ class PlanningPolicy(TensorDictModuleBase):
     def act(self, observations: Tensor, plan: Tensor, age: Tensor | int) -> Tensor:
         """The action ``[*B, act]`` of a step, command limits included.
 
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, raw units.
-            plan (Tensor): of :meth:`plan`.
-            age (Tensor or int): steps since it was made ``[*B]``.
+        Observations are ``[*B, history, obs]`` in raw units, the plan is of :meth:`plan`, ``age [*B]`` steps old.
         """
         left = remaining_plan(plan, age)
         if self._decodes:
@@ -192,11 +186,7 @@ class PlanningPolicy(TensorDictModuleBase):
         """Plans and decodes the actions of the next steps at once.
 
         This is what is exported, stateless and without branches on data: whoever calls it keeps the last observations
-        and counts steps. Actions are as if the robot moved as it is commanded.
-
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, raw units.
-            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
+        and counts steps. Actions are as if the robot moved as it is commanded. Arguments as for :meth:`plan`.
 
         Returns:
             tuple: the actions ``[*B, replan_interval, act]``, and which of them were held in their range, bool

@@ -37,15 +37,8 @@ class NoiseAdjustedComponents(nn.Module):
     with the covariance ``C`` of the states and ``R`` of the white noise in them
     (:func:`~torchrl_koap.modules.koopman.smoothing.noise_covariance`): the minimum noise fraction transform (Green et
     al. 1988), at unit spread. Where columns differ in their noise, principal components follow the noisiest;
-    these follow the best measured. No column counts as measured to more than 1 % of its spread, and components that
-    stand out by less than a factor of two are 0, but for the first.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        num_components (int): number ``k`` of components.
-
-    Raises:
-        ValueError: for more components than columns.
+    these follow the best measured. No column counts as measured to more than 1 % of its spread, and components that stand out
+    by less than a factor of two are 0, but for the first. There are at most as many as columns, 1 to ``d``.
     """
 
     analysis: Tensor
@@ -114,15 +107,8 @@ def isomap(points: Tensor, dims: int) -> Tensor:
     eigenvalues and -vectors of the landmarks' doubly centred squared distances: Isomap (Tenenbaum et al. 2000) with
     landmarks (de Silva and Tenenbaum 2003). Where the graph falls apart it gets more neighbours until it does not.
 
-    Args:
-        points (Tensor): ``[N, d]``; the first 200 of them are the landmarks, so they should be in no order.
-        dims (int): number ``m`` of coordinates. Those that the landmarks do not span are 0.
-
-    Returns:
-        Tensor: ``[N, m]``, the one of widest spread first, each at unit spread.
-
-    Raises:
-        ValueError: for less than two points.
+    Of points ``[N, d]`` the first 200 are the landmarks, so they should be in no order; less than two are an error.
+    Coordinates ``[N, dims]`` stand at unit spread, that of widest spread first; those that landmarks do not span are 0.
     """
     if len(points) < 2:
         raise ValueError(f"coordinates along a surface need at least two points, got {len(points)}")
@@ -168,14 +154,8 @@ class CompactLifting(TensorDictModuleBase):
     reconstruction error, as it does where something moves by itself beside the robot. The coordinates of the other are
     0.
 
-    Args:
-        state_dim (int): size ``d`` of a state.
-        coordinates (int): ``m``; a lifted state has ``3 m`` entries.
-
-    Keyword Args:
-        hidden_dims (sequence of int): widths of all networks. Defaults to ``(128, 128)``.
-        in_key (NestedKey): states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): lifted states ``[*B, T, 3 m]``. Defaults to ``"lifted_state"``.
+    States are ``[*B, T, d]``, lifted ones ``[*B, T, 3 m]`` with ``m`` the ``coordinates``; ``hidden_dims`` are the
+    widths of all networks.
     """
 
     kept: Tensor

@@ -32,8 +32,8 @@ class LatentActionModule(TensorDictModuleBase):
     Keyword Args:
         num_past, look_ahead, relative, clamped: of the reader (:class:`~torchrl_koap.modules.WindowReader`), with the
             paper's defaults: one frame before, one 8 ahead, frames instead of steps.
-        in_key (NestedKey): window of states ``[*B, T, d]`` in the network's units. Defaults to ``"state"``.
-        out_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
+        in_key, out_key (NestedKey): window of states ``[*B, T, d]`` in the network's units, and latent actions
+            ``[*B, T, m]``.
 
     Examples:
         >>> import torch
@@ -77,12 +77,10 @@ class LatentActionModule(TensorDictModuleBase):
         return self.reader.gather(state, frames)
 
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor] | None:
-        """Says where a latent action holds the steps along some state columns, and their size per unit of it.
+        """Says where a latent action holds the steps along some state columns; None if it does not hold them.
 
-        Returns:
-            tuple of Tensor or None: entries of the latent action, int64 ``[S, len(axes)]``, and factors of that shape
-                that turn them into steps in the networks' units; ``S = num_past + len(look_ahead)``. None if it does
-                not hold them.
+        These are entries of the latent action, int64 ``[S, len(axes)]`` with ``S = num_past + len(look_ahead)``, and
+        factors of that shape that turn them into steps in the networks' units.
         """
         return None
 
@@ -132,20 +130,17 @@ class LatentActionLSTM(LatentActionModule):
 
 
 class LatentActionMLP(LatentActionModule):
-    """Infers latent actions by a perceptron on the concatenated frames.
+    """Infers latent actions by a perceptron on the concatenated frames, of widths ``hidden_dims``.
 
-    Args as for :class:`LatentActionModule`, and:
-
-    Keyword Args:
-        hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
+    Args as for :class:`LatentActionModule`.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import LatentActionMLP
         >>> infer = LatentActionMLP(2, 8, num_past=4, look_ahead=(2, 4, 8), relative=True)
-        >>> infer(TensorDict({"state": torch.randn(16, 2)}, []))["latent_action"].shape
-        torch.Size([16, 8])
+        >>> infer(TensorDict({"state": torch.randn(5, 16, 2)}, [5]))["latent_action"].shape
+        torch.Size([5, 16, 8])
     """
 
     def __init__(self, state_dim: int, latent_dim: int, *, hidden_dims: Sequence[int] = (128, 128), **kwargs):
@@ -251,14 +246,12 @@ class LinearActionDecoder(TensorDictModuleBase):
         action_dim (int): size of an action.
 
     Keyword Args:
-        in_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
-        out_key (NestedKey): actions ``[*B, T, act]`` in normalised units. Defaults to ``"action"``.
+        in_key, out_key (NestedKey): latent actions ``[*B, T, m]``, and actions ``[*B, T, act]`` in normalised units.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules import LinearActionDecoder
-        >>> from torchrl_koap.modules.ridge import ridge
+        >>> from torchrl_koap.modules import LinearActionDecoder, ridge
         >>> decoder, latent = LinearActionDecoder(4, 2), torch.randn(50, 4)
         >>> decoder.assign(ridge(latent, latent[:, :2]))
         >>> td = decoder(TensorDict({"latent_action": latent}, [50]))

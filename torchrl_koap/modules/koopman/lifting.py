@@ -27,13 +27,12 @@ class KoopmanLifting(TensorDictModuleBase):
         latent_dim (int): size ``m`` of a lifted state.
 
     Keyword Args:
-        hidden_dims (sequence of int): widths of both networks. Defaults to ``(128, 128)``.
+        hidden_dims (sequence of int): widths of both networks.
         include_state (bool): the first ``d`` observables are the state itself, as in extended dynamic mode
-            decomposition; the other ``m - d`` are learned. Defaults to ``False``.
+            decomposition; the other ``m - d`` are learned.
         linear_skip (bool): add a linear map in both directions, which :meth:`prepare` sets to the principal components,
-            so that a nearly linear lifting costs the networks nothing. Defaults to ``False``.
-        in_key (NestedKey): states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): lifted states ``[*B, T, m]``. Defaults to ``"lifted_state"``.
+            so that a nearly linear lifting costs the networks nothing.
+        in_key, out_key (NestedKey): states ``[*B, T, d]`` and lifted states ``[*B, T, m]``.
 
     Raises:
         ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim`` or together with ``linear_skip``.
@@ -44,10 +43,8 @@ class KoopmanLifting(TensorDictModuleBase):
         >>> from torchrl_koap.modules import KoopmanLifting
         >>> lifting = KoopmanLifting(2, 8, include_state=True)
         >>> td = lifting(TensorDict({"state": torch.randn(5, 16, 2)}, [5]))
-        >>> td["lifted_state"].shape
-        torch.Size([5, 16, 8])
-        >>> bool((td["lifted_state"][..., :2] == td["state"]).all())
-        True
+        >>> td["lifted_state"].shape, bool((td["lifted_state"][..., :2] == td["state"]).all())
+        (torch.Size([5, 16, 8]), True)
     """
 
     def __init__(

@@ -26,23 +26,13 @@ class LatentActionSmoothed(LatentActionModule):
         w_t = (g(x_{t-n}), \dots, g(x_t), g(x_{t+2}), \dots, g(x_{t+k})), \quad
         u_t = (\gamma_1\, \phi(A w_t),\; \gamma_2\, \phi(x_{t-4}, \dots, x_{t+5}))
 
-    ``g`` is the lifting to a few coordinates, ``A`` the gain of a :class:`WienerSmoother` and ``phi`` the observables
-    of :class:`LatentActionFourier` (steps and random Fourier features). All of it comes from unlabelled windows
-    (:meth:`finish`). One of ``gamma`` is 1 and the other 0: :meth:`choose` is asked with the held-out error of the
-    labelled steps, within the budget.
+    ``g`` is the lifting to a few coordinates, shared with the Koopman model, ``A`` the gain of a
+    :class:`WienerSmoother` and ``phi`` the observables of :class:`LatentActionFourier` (steps and ``num_features``
+    random Fourier features). All of it comes from unlabelled windows (:meth:`finish`). One of ``gamma`` is 1 and the
+    other 0: :meth:`choose` is asked with the held-out error of the labelled steps, within the budget.
 
     With a lifting that keeps the state (``include_state``, all columns) the first block is the smoothed state itself.
-
-    Args:
-        lifting (KoopmanLifting or CompactLifting): the lifting ``g``, shared with the Koopman model.
-        num_features (int): Fourier features of each block.
-
-    Keyword Args:
-        **kwargs: ``num_past``, ``look_ahead`` (of the lifted block; no shorter than the raw one's) and keys, see
-            :class:`LatentActionModule`.
-
-    Raises:
-        ValueError: if the raw block would read frames that the lifted one does not.
+    The raw block may not read frames that the lifted one does not. Keywords as for :class:`LatentActionModule`.
     """
 
     gates: Tensor

@@ -37,14 +37,9 @@ class WienerSmoother(nn.Module):
 
     @torch.no_grad()
     def fit(self, windows: Tensor, consecutive: Tensor) -> None:
-        """Fits the gain; no label is read.
+        """Fits the gain to windows ``[N, F, dim]`` of the frames that are smoothed together; no label is read.
 
-        Args:
-            windows (Tensor): ``[N, F, dim]``, the frames that are smoothed together.
-            consecutive (Tensor): ``[N, T, dim]`` with ``T >= 5`` frames one control step apart, for the noise.
-
-        Raises:
-            ValueError: for windows of another shape.
+        The noise is that of ``consecutive`` frames one control step apart, ``[N, T, dim]`` with ``T >= 5``.
         """
         if windows.shape[-2:] != (self.num_frames, self.dim):
             raise ValueError(f"windows must be [N, {self.num_frames}, {self.dim}], got {list(windows.shape)}")
@@ -64,13 +59,8 @@ def noise_covariance(windows: Tensor) -> Tensor:
     r"""Computes the covariance of white measurement noise from the autocovariances of steps at lags 1, 2 and 3.
 
     With steps :math:`v_t = x_{t+1} - x_t` of a smooth motion plus noise of covariance ``R``, noise adds ``2 R`` at lag
-    0 and ``-R`` at lag 1. A parabola in the lag through lags 2 and 3 says what the motion alone has at lag 1.
-
-    Args:
-        windows (Tensor): ``[N, T, d]`` with ``T >= 5``.
-
-    Returns:
-        Tensor: symmetric and positive semidefinite ``[d, d]``, float64.
+    0 and ``-R`` at lag 1. A parabola in the lag through lags 2 and 3 says what the motion alone has at lag 1. Windows
+    are ``[N, T, d]`` with ``T >= 5``; the result ``[d, d]`` is symmetric and positive semidefinite, float64.
     """
     if windows.ndim != 3 or windows.shape[-2] < 5:
         raise ValueError(f"noise_covariance needs windows [N, T >= 5, d], got {list(windows.shape)}")

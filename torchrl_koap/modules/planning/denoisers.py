@@ -14,8 +14,7 @@ EMBEDDING_DIM = 32  # of a step
 class StepEmbedding(nn.Module):
     """Embeds times as sines and cosines of geometrically spaced frequencies, then a two-layer network.
 
-    Args:
-        embedding_dim (int): width of the embedding, even and at least 4.
+    The width ``embedding_dim`` is even and at least 4.
     """
 
     def __init__(self, embedding_dim: int):
@@ -37,13 +36,9 @@ class StepEmbedding(nn.Module):
 class ConditionEncoder(nn.Module):
     """Embeds a condition with entries of order one: Fourier features (Tancik et al. 2020), then a two-layer network.
 
-    Where to pass an obstacle changes within centimetres; sines of up to ``2^(frequencies - 1)`` half turns per unit
-    let a small network learn such edges in a fraction of the steps.
-
-    Args:
-        condition_dim (int): number ``c`` of condition columns.
-        frequencies (int): octaves of sines and cosines per column; 0 leaves the plain columns.
-        width (int): width of the embedding.
+    Where to pass an obstacle changes within centimetres; sines of up to ``2^(frequencies - 1)`` half turns per unit let
+    a small network learn such edges in fewer steps. Of each of the ``condition_dim`` columns there are so many octaves
+    of sines and cosines, beside the plain column; ``width`` is that of the embedding.
     """
 
     def __init__(self, condition_dim: int, *, frequencies: int, width: int):
@@ -60,9 +55,7 @@ class ConditionEncoder(nn.Module):
 
 
 class Denoiser(nn.Module):
-    """Base class of denoisers: input checks, one batch dimension, embedded time and condition.
-
-    A subclass writes :meth:`denoise`.
+    """Base class of denoisers: input checks, one batch dimension, embedded time and condition; a subclass denoises.
 
     Args:
         state_dim (int): number ``d`` of state columns.
@@ -88,12 +81,9 @@ class Denoiser(nn.Module):
         raise NotImplementedError
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Predicts clean sequences ``[*B, H, d]`` from noisy ones.
+        """Predicts clean sequences of noisy ones ``[*B, H, d]``, for times and conditions.
 
-        Args:
-            sequence (Tensor): noisy sequences ``[*B, H, d]``.
-            time (Tensor): ``[*B]`` in training steps.
-            condition (Tensor): ``[*B, c]``.
+        Times are ``[*B]`` in training steps, conditions ``[*B, c]``.
         """
         if sequence.ndim < 2 or sequence.shape[-1] != self.state_dim:
             raise ValueError(f"sequence must be [*B, H, {self.state_dim}] (state_dim), got {list(sequence.shape)}")

@@ -14,22 +14,13 @@ _BATCH = 512  # sequences that are sampled at a time
 
 
 def energy_score(samples: Tensor, true: Tensor) -> Tensor:
-    r"""Computes the energy score of sampled distributions; smaller is better, in the unit of the samples.
+    r"""Computes the energy score ``[*B]`` of samples ``[S, *B, d]``, in their unit; smaller is better.
 
     .. math:: \mathrm{ES} = \mathbb{E}\,\|X - y\| - \tfrac{1}{2}\, \mathbb{E}\,\|X - X'\|
 
-    Its mean is least for samples of the true distribution with all its modes. The second mean is over pairs of
-    different samples. Of a single sample the score is the distance.
-
-    Args:
-        samples (Tensor): ``[S, *B, d]``.
-        true (Tensor): ``[*B, d]``.
-
-    Returns:
-        Tensor: ``[*B]``.
-
-    Raises:
-        ValueError: if shapes disagree.
+    with what is true, ``y [*B, d]``. Its mean is least for samples of the true distribution with all its modes. The
+    second mean is over pairs of different samples. Of a single sample the score is the distance. Shapes that disagree
+    are an error.
     """
     if samples.ndim < 2 or samples.shape[1:] != true.shape:
         raise ValueError(f"wanted samples [S, *B, d] and true [*B, d], got {list(samples.shape)}, {list(true.shape)}")
@@ -59,15 +50,8 @@ def sample_sequences(sampler: ConditionalSampler, history: Tensor, *, samples: i
 def relative_score(samples: Tensor, true: Tensor, reference: Tensor, groups: Sequence[Sequence[int]]) -> float:
     """Computes the energy score of ``[S, N, H, d]`` as a share of that of a reference, such as standing still.
 
-    Args:
-        samples (Tensor): ``[S, N, H, d]``.
-        true (Tensor): ``[N, H, d]``, like the reference.
-        reference (Tensor): what is compared with.
-        groups (sequence): columns of one unit each, over which shares are averaged; those in which the reference makes
-            no error are left out.
-
-    Returns:
-        float: 1 for samples as good as the reference, NaN if nothing moves.
+    True and reference are ``[N, H, d]``. Shares are averaged over ``groups`` of columns of one unit each; those in
+    which the reference makes no error are left out, and NaN is returned if nothing moves.
     """
     shares = []
     for columns in map(list, groups):

@@ -37,10 +37,8 @@ Denoise = Callable[[Tensor, NoiseLevel], Tensor]
 def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
     """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0): clean sequences ``[*B, H, d]``.
 
-    Args:
-        denoise (callable): ``denoise(x, level)`` gives the clean sequence ``[*B, H, d]`` seen in ``x``.
-        x (Tensor): start noise ``[*B, H, d]``.
-        levels (sequence of NoiseLevel): stops from much noise to none, one more than steps.
+    ``denoise(x, level)`` gives the clean sequence seen in ``x``, of noise ``[*B, H, d]`` at first; the levels go from
+    much noise to none, one more than steps.
     """
     for level, after in zip(levels[:-1], levels[1:], strict=True):
         sample = denoise(x, level)
@@ -49,10 +47,7 @@ def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
 
 
 def dpm_solver_2m(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
-    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2).
-
-    Args as for :func:`ddim`.
-    """
+    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2); as :func:`ddim`."""
     previous, previous_step = None, 0.0
     for level, after in zip(levels[:-1], levels[1:], strict=True):
         sample = denoise(x, level)
@@ -119,20 +114,10 @@ class NoiseSchedule(nn.Module):
         *,
         prefix: Tensor | None = None,
     ) -> Tensor:
-        """Turns noise into sequences ``[*B, H, d]``.
+        """Turns standard normal noise ``[*B, H, d]`` into sequences, by ``network(x [*B, H, d], time [*B])``.
 
-        Args:
-            network (callable): ``network(x [*B, H, d], time [*B]) -> [*B, H, d]``, the clean sequence.
-            noise (Tensor): start noise ``[*B, H, d]``, standard normal.
-            num_steps (int): number of solver steps.
-            solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
-
-        Keyword Args:
-            prefix (Tensor, optional): first frames ``[*B, k, d]`` that the clean sequence has to have: they replace
-                what the network says at every step, so that the rest is made to fit them.
-
-        Raises:
-            ValueError: for an unknown solver or a number of steps out of range.
+        The network gives the clean sequence. The first frames of a ``prefix`` ``[*B, k, d]`` replace what it says at
+        every step, so that the rest is made to fit them. Errors as of :meth:`noise_levels`, and for an unknown solver.
         """
         run, levels, batch = lookup(SOLVERS, solver, "solver"), self.noise_levels(num_steps), noise.shape[:-2]
 

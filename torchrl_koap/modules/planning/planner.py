@@ -21,18 +21,14 @@ _PENALTIES = tuple(10.0**power for power in range(-6, 8))  # the last one leaves
 
 
 class LinearForecast(nn.Module):
-    r"""Subtracts a ridge regression on the condition from a sequence, and adds it again.
+    r"""Subtracts a ridge regression on the condition ``[*B, c]`` from a flat sequence ``[*B, w]``, and adds it again.
 
     .. math:: y = (x - W c - b - \text{offset}) / \text{scale}
 
-    A network that has seen the motions to fifty goals may overfit to these fifty and be wrong between them. A
-    linear map of as many numbers as the condition has carries over to new goals wherever the motion is nearly linear in
-    what was observed, and elsewhere its penalty, chosen on trajectories left out, makes it vanish. What it takes off
-    depends on the condition alone, so no distribution of plans is ruled out by it.
-
-    Args:
-        condition_dim (int): number ``c`` of condition columns.
-        width (int): number ``w`` of columns of the flat sequence.
+    A network that has seen the motions to fifty goals may overfit to these fifty and be wrong between them. A linear
+    map of as many numbers as the condition has carries over to new goals wherever the motion is nearly linear in what
+    was observed, and elsewhere its penalty, chosen on trajectories left out, makes it vanish. What it takes off depends
+    on the condition alone, so no distribution of plans is ruled out by it.
     """
 
     def __init__(self, condition_dim: int, width: int):
@@ -44,11 +40,8 @@ class LinearForecast(nn.Module):
     def fit(self, condition: Tensor, sequence: Tensor, groups: Tensor | None = None) -> float:
         """Fits the ridge and the statistics of what it leaves over, and returns the penalty chosen.
 
-        Args:
-            condition (Tensor): normalised conditions ``[N, c]``.
-            sequence (Tensor): normalised sequences ``[N, w]``.
-            groups (Tensor, optional): trajectory of every row ``[N]``; they are left out one at a time to choose the
-                penalty. Default: one row at a time.
+        Of normalised conditions ``[N, c]`` and sequences ``[N, w]``, trajectories (``groups [N]``) are left out one at
+        a time to choose the penalty, or single rows where there are none.
         """
         groups = torch.arange(len(condition), device=condition.device) if groups is None else groups
         rows = slice(None, None, -(-len(condition) // _MOST_ROWS))

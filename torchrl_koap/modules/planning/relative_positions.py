@@ -22,15 +22,13 @@ class RelativePositionFeatures(nn.Module):
     .. math::
         d = R(-\theta) (p - o), \qquad (d,\; \tanh(d / 0.05\,\mathrm{m}),\; \tanh(d / 0.015\,\mathrm{m}))
 
-    for every position ``p`` to an origin ``o`` with yaw ``theta``; heights are not turned.
+    for every position ``p`` to an origin ``o`` with yaw ``theta``; heights are not turned. Histories of states ``[*B,
+    h, d]`` give ``[*B, num_features]``, by their last frame.
 
     Args:
         pairs (sequence): state columns of up to four parts each: a position of 2 or 3 columns; the position it is seen
             from, whose height is taken as it is where it has 2; ``cos, sin`` of the yaw of the frame it is seen in;
             ``cos, sin`` of a yaw to be told relative to that frame, too.
-
-    Shape:
-        history of states ``[*B, h, d]`` to ``[*B, num_features]``; the last frame counts.
     """
 
     def __init__(self, pairs: Sequence[Sequence[slice]]):

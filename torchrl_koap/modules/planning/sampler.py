@@ -87,11 +87,7 @@ class ConditionalSampler(TensorDictModuleBase):
         return self.horizon, self._width
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Maps raw sequences ``[*B, H, width]``, after raw histories ``[*B, h, d]``, to the normalised ones.
-
-        Raises:
-            ValueError: for sequences of another shape.
-        """
+        """Maps raw sequences ``[*B, H, width]``, after raw histories ``[*B, h, d]``, to normalised ones."""
         raise NotImplementedError
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
@@ -148,8 +144,7 @@ class ConditionalSampler(TensorDictModuleBase):
         Args:
             condition (Tensor): of :meth:`encode_history`, ``[*B, h * d + f]``.
             sequence (Tensor): clean normalised sequences ``[*B, H, width]``.
-            noise (Tensor, optional): of the same shape. Default: random.
-            time (Tensor, optional): ``[*B]`` in training steps. Default: random.
+            noise, time (Tensor, optional): of the same shape, and ``[*B]`` in training steps. Default: random.
             dtype (torch.dtype, optional): of the denoiser's matrix products. Default: that of its weights.
         """
         with torch.no_grad():
