@@ -14,7 +14,8 @@ from tensordict import TensorDict
 
 from torchrl_koap.data import open_dataset
 from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
-from torchrl_koap.vision import Observer, cameras_of, load_backbone
+from torchrl_koap.vision import Observer, load_backbone
+from torchrl_koap.vision.projection import cameras_of
 
 OWN = "tiny_network:random_layer"
 GROUNDS = run.grounds()

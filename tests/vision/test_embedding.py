@@ -14,8 +14,9 @@ from torchrl_koap.data import load_ted, read_about, read_recordings, save_demons
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.vision import Observer, Projection, backbones, load_cameras, load_encoder
+from torchrl_koap.vision import Observer, Projection, backbones, load_encoder
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
+from torchrl_koap.vision.projection import load_cameras
 
 OWN = "tiny_network:random_layer"
 

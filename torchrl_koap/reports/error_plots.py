@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.reports.pictures import NothingToDraw, picture
-from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.run_facts import RunFacts, mapping
 from torchrl_koap.reports.style import (
     BLUE,
     FAINT,
@@ -194,7 +194,7 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
 )
 def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws errors of sampled plans over the horizon beside those of baselines that need no learning."""
-    plan = _part(result, "plan_errors")
+    plan = mapping(mapping(result).get("plan_errors"))
     if "unit" not in plan:
         raise NothingToDraw("no plan was evaluated on recorded data")
     rows = plan["unit"]
@@ -232,7 +232,7 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
 )
 def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws errors of decoded actions by column and unit, beside a ridge's and those of always the mean action."""
-    parts = [(name, part) for name, part in _part(result, "action_errors").items() if "column" in part]
+    parts = [(name, part) for name, part in mapping(mapping(result).get("action_errors")).items() if "column" in part]
     if not parts:
         raise NothingToDraw("no action was evaluated on recorded data")
     units = list(dict.fromkeys(row["unit"] for _, part in parts for row in part["column"]))
@@ -264,12 +264,6 @@ def _draw_bars(axes: Axes, rows: Sequence[Mapping[str, Any]], unit: str) -> None
     axes.set_ylabel(f"RMSE ({shown or 'units of the data'})")
     axes.set_axisbelow(True)
     tidy(axes, grid=True)
-
-
-def _part(result: Any, name: str) -> Mapping[str, Any]:
-    """An entry of ``eval.json``; empty where it is absent, as in that of rollouts, or the file is damaged."""
-    part = result.get(name) if isinstance(result, Mapping) else None
-    return part if isinstance(part, Mapping) else {}
 
 
 def _list_names(names: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from torchrl_koap.reports.run_facts import RunFacts, number
+from torchrl_koap.reports.run_facts import RunFacts, mapping, number
 from torchrl_koap.tasks.columns import thousandths
 
 _ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
@@ -54,11 +54,12 @@ def evaluation_rows(run: RunFacts) -> list[Row]:
 
 def _labels(run: RunFacts) -> Row | None:
     names = ("labelled_transitions", "total_transitions", "trajectories_touched", "total_trajectories")
-    seen, steps, touched, recordings = (_number_in(run.summary.get("labels"), name) for name in names)
+    found = mapping(run.summary.get("labels"))
+    seen, steps, touched, recordings = (number(found.get(name)) for name in names)
     if seen is None or steps is None:
         return None
     where = [] if touched is None or recordings is None else [f"in {touched:,} of {recordings:,} recordings"]
-    there = _number_in(run.summary.get("labels"), "available_transitions")
+    there = number(found.get("available_transitions"))
     if there is not None and seen < there < steps:
         where.append(f"the data have {there:,} labels")
     return Row("labels", f"{seen:,} of {steps:,} steps", "; ".join(where))
@@ -66,12 +67,12 @@ def _labels(run: RunFacts) -> Row | None:
 
 def _planner(run: RunFacts) -> list[Row]:
     """How the planner was trained, and why that ended; nothing for a method that has none."""
-    found, asked = run.summary.get("planner"), run.config.get("planner")
-    if not isinstance(asked, Mapping) or not number(run.summary.get("planner_parameters")):
+    found, asked = mapping(run.summary.get("planner")), mapping(run.config.get("planner"))
+    if not asked or not number(run.summary.get("planner_parameters")):
         return []
     if asked.get("source") is not None:
         return [Row("planner", f"that of {asked['source']}", "not trained here")]
-    updates, kept, score = (_number_in(found, name) for name in ("updates", "kept_update", "best_held_out_score"))
+    updates, kept, score = (number(found.get(name)) for name in ("updates", "kept_update", "best_held_out_score"))
     if updates is None:
         return []
     value = f"{updates:,.0f} updates{_seconds(run, 'planner')}"
@@ -93,18 +94,14 @@ def _controller(run: RunFacts) -> Row | None:
     method, updates = run.config.get("method"), number(run.summary.get("controller_updates"))
     if not isinstance(method, str) or updates is None:
         return None
-    labels = _number_in(run.summary.get("decoder_fit"), "labels_used")
+    labels = number(mapping(run.summary.get("decoder_fit")).get("labels_used"))
     trained = f"{method}, {updates:,} updates{_seconds(run, 'controller')}"
     return Row("controller", trained, "" if labels is None else f"fitted to {labels:,} labels")
 
 
 def _seconds(run: RunFacts, part: str) -> str:
-    seconds = _number_in(run.summary.get("train_seconds"), part)
+    seconds = number(mapping(run.summary.get("train_seconds")).get(part))
     return "" if seconds is None or seconds < 1 else f" in {seconds:.0f} s"  # a finished part takes none when resumed
-
-
-def _number_in(source: Any, name: str) -> float | int | None:
-    return number(source.get(name)) if isinstance(source, Mapping) else None
 
 
 def _plan_errors(run: RunFacts) -> list[Row]:
@@ -146,8 +143,8 @@ def _columns(row: Mapping[str, Any]) -> str:
 
 def _loop(run: RunFacts) -> Row | None:
     """How a policy acts on a linear model of the robot."""
-    found = run.evaluation.get("loop")
-    if not isinstance(found, Mapping):
+    found = mapping(run.evaluation.get("loop"))
+    if not found:
         return None
     if "note" in found:
         return Row("closed loop", _NOT_MEASURED, found["note"])

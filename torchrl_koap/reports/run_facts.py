@@ -22,6 +22,11 @@ def number(value: Any) -> float | int | None:
     return value
 
 
+def mapping(value: Any) -> Mapping[str, Any]:
+    """Returns the value if it is a mapping, else an empty one: files may be damaged."""
+    return value if isinstance(value, Mapping) else {}
+
+
 @dataclass(frozen=True)
 class RunFacts:
     """Holds what is known about a run: its task, if anybody here knows it, and its JSON files.
@@ -82,8 +87,7 @@ class RunFacts:
     @property
     def rates(self) -> Mapping[str, Mapping[str, Any]]:
         """Shares of the rollouts by name, success first: ``rate``, ``low``, ``high`` and ``episodes`` of each."""
-        found = self.evaluation.get("rates")
-        known = found.items() if isinstance(found, Mapping) else ()
+        known = mapping(self.evaluation.get("rates")).items()
         return {name: values for name, values in known if isinstance(values, Mapping)}
 
     def success(self, entry: str = "rate") -> float | None:
@@ -105,20 +109,17 @@ class RunFacts:
     @property
     def execution(self) -> Mapping[str, Any]:
         """How plans became actions in the evaluation; empty where nobody says so."""
-        found = self.evaluation.get("execution")
-        return found if isinstance(found, Mapping) else {}
+        return mapping(self.evaluation.get("execution"))
 
     @property
     def labels(self) -> float | None:
         """Labelled transitions, None if nobody counted."""
-        account = self.summary.get("labels")
-        return number(account.get("labelled_transitions")) if isinstance(account, Mapping) else None
+        return number(mapping(self.summary.get("labels")).get("labelled_transitions"))
 
     @property
     def action_errors(self) -> Mapping[str, Any]:
         """Errors of decoded actions by the labels that they were measured on; each may be a note why there is none."""
-        found = self.evaluation.get("action_errors")
-        return found if isinstance(found, Mapping) else {}
+        return mapping(self.evaluation.get("action_errors"))
 
     def evaluated(self, name: str) -> float | None:
         """Returns a number of the evaluation, None if it is not there."""
@@ -126,8 +127,7 @@ class RunFacts:
 
     def experiment(self, name: str) -> float | None:
         """Returns the success of an experiment of ``koap inspect``, None if it was not made."""
-        found = self.inspection.get(name)
-        return number(found.get("rate")) if isinstance(found, Mapping) else None
+        return number(mapping(self.inspection.get(name)).get("rate"))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], str]:

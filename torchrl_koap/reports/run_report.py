@@ -13,7 +13,7 @@ from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, draw_pictures
 from torchrl_koap.reports.rows import evaluation_rows, training_rows
-from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.run_facts import RunFacts, mapping
 
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
@@ -76,16 +76,15 @@ def _subtitle(run: RunFacts) -> str:
     shown = []
     for option in ("controller.preset", "dataset", "run.seed"):
         section, _, name = option.rpartition(".")
-        options = run.config.get(section) if section else run.config
-        if isinstance(options, Mapping) and _given(options, name):
+        options = mapping(run.config.get(section)) if section else run.config
+        if _given(options, name):
             shown.append(f"{name} {options[name]}")
     return " · ".join([str(run.folder), *shown])
 
 
 def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
     """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
-    outside = run.action_errors.get("outside_budget")
-    no_actions = outside.get("note") if isinstance(outside, Mapping) else None
+    no_actions = mapping(run.action_errors.get("outside_budget")).get("note")
     figures: list[dict[str, Any]] = []
     missing: dict[str, list[str]] = {}
     for name, item in all_pictures().items():
@@ -118,7 +117,7 @@ def _eval_command(run: RunFacts) -> str:
     if evaluation.get("kind") == "offline":
         evaluation = {"seed": evaluation.get("seed")}
     episode = evaluation.get("episode")
-    first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
+    first = mapping(episode[0]) if isinstance(episode, list) and episode else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
     options |= dict(run.execution) | {key: evaluation.get(key) for key in _ABOUT_ENV}
     for key, value in options.items():

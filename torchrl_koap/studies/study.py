@@ -24,7 +24,8 @@ from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.trained import build_networks
-from torchrl_koap.vision import Observer, cameras_of
+from torchrl_koap.vision import Observer
+from torchrl_koap.vision.projection import cameras_of
 
 DEFAULT_TASK = "avoiding"
 PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")

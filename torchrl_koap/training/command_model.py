@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
 from torchrl_koap.modules import CommandDecoder
-from torchrl_koap.modules.planning.relative_positions import RelativePositionFeatures
+from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 

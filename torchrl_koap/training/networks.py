@@ -10,7 +10,7 @@ from torch import nn
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, DiffusionPolicy, MLPDenoiser, Normalizer, StatePlanner, TemporalUnet
-from torchrl_koap.modules.planning.relative_positions import RelativePositionFeatures
+from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig
 from torchrl_koap.tasks import HORIZON, Task
 from torchrl_koap.training.method import Method

@@ -30,7 +30,8 @@ from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
 from torchrl_koap.training.policy_facts import command_ranges, policy_facts
-from torchrl_koap.vision import Observer, Projection, load_cameras
+from torchrl_koap.vision import Observer, Projection
+from torchrl_koap.vision.projection import load_cameras
 
 FORMAT, VERSION = "torchrl_koap policy", 2
 

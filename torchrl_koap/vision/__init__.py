@@ -4,7 +4,7 @@
 from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
 from torchrl_koap.vision.encoder import FrozenImageEncoder
 from torchrl_koap.vision.observer import Observer
-from torchrl_koap.vision.projection import Projection, cameras_of, load_cameras, load_encoder, projection_of
+from torchrl_koap.vision.projection import Projection, load_encoder, projection_of
 
 __all__ = [
     "Backbone",
@@ -12,9 +12,7 @@ __all__ = [
     "Observer",
     "Projection",
     "WeightsError",
-    "cameras_of",
     "load_backbone",
-    "load_cameras",
     "load_encoder",
     "projection_of",
 ]

@@ -143,36 +143,12 @@ def projection_of(task: str) -> Path:
 
 
 def load_cameras(folder: str | Path) -> dict[str, Projection]:
-    """Reads the projections in a folder, such as ``cameras`` of a run; no network is needed.
-
-    Returns:
-        dict: by the name of the camera.
-
-    Raises:
-        ValueError: if one is damaged.
-
-    Examples:
-        >>> from torchrl_koap.vision import load_cameras
-        >>> load_cameras("a run without cameras")
-        {}
-    """
+    """Reads the projections in a folder, such as ``cameras`` of a run, by the name of the camera; needs no network."""
     return {file.stem: Projection.load(file) for file in sorted(Path(folder).glob("*.safetensors"))}
 
 
 def cameras_of(dataset: str | Path | None) -> dict[str, Projection]:
-    """Reads the projections that ``koap embed`` wrote beside a data set.
-
-    Args:
-        dataset (str or Path, optional): the data set.
-
-    Returns:
-        dict: by the name of the camera; empty where the data are no embeddings.
-
-    Examples:
-        >>> from torchrl_koap.vision import cameras_of
-        >>> cameras_of(None)
-        {}
-    """
+    """Reads the projections that ``koap embed`` wrote beside a data set; none where its columns are no embeddings."""
     stored = None if dataset is None else stored_folder(Path(dataset).expanduser())
     return {} if stored is None else load_cameras(stored.parent / CAMERAS)
 

@@ -36,8 +36,8 @@ class NoiseAdjustedComponents(nn.Module):
 
     with the covariance ``C`` of the states and ``R`` of the white noise in them
     (:func:`~torchrl_koap.modules.koopman.smoothing.noise_covariance`): the minimum noise fraction transform (Green et
-    al. 1988), at unit spread. Where columns differ in their noise, principal components follow the noisiest;
-    these follow the best measured. No column counts as measured to more than 1 % of its spread, and components that stand out
+    al. 1988), at unit spread. Where columns differ in their noise, principal components follow the noisiest; these
+    follow the best measured. No column counts as measured to more than 1 % of its spread, and components that stand out
     by less than a factor of two are 0, but for the first. There are at most as many as columns, 1 to ``d``.
     """
 
