@@ -19,11 +19,12 @@ from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation import diagnosis, inspection
 from torchrl_koap.evaluation.diagnosis import (
-    RecordedFutures,
+    RECORDED_FUTURE,
     RecordedPlanner,
     contexts_of,
     coverage,
     follow_recordings,
+    hand_on,
     left_recordings,
     planner_rollout,
     recorded_futures,
@@ -163,14 +164,15 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
 
 
 def test_recorded_futures_travel_in_an_entry_of_their_own():
-    recorded = RecordedFutures(torch.arange(2 * 3 * 14 * 2.0).reshape(2, 3, 14, 2))
+    futures = torch.arange(2 * 3 * 14 * 2.0).reshape(2, 3, 14, 2)
+    recorded = hand_on(futures)
     planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2))
     policy = make_policy(planner, EchoController(), state_of=(0, 1), execution=Execution(replan_interval=1, blend=0.0))
     observed, init = torch.zeros(2, 2, 2), torch.ones(2, 1, dtype=torch.bool)
     for step in (0, 1, 2, 2):
         td = TensorDict({"observation_history": observed, "is_init": init, "noise": torch.full((2, 1), torch.nan)}, [2])
         td = policy(recorded(td))
-        assert torch.equal(td["action"][:, 2:], recorded.futures[:, step, 0])
+        assert torch.equal(td["action"][:, 2:], futures[:, step, 0])
 
 
 def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
@@ -181,12 +183,12 @@ def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
     plans = []
 
     def noted(policy, make_env, seeds, *, given, **_):
-        plans.extend(given(slice(index, index + 1)).futures for index in seeds)
+        plans.extend(given(slice(index, index + 1))(TensorDict())[RECORDED_FUTURE] for index in seeds)
         return [episode(0.0, steps=24) for _ in seeds]
 
     monkeypatch.setattr(diagnosis, "roll_out", noted)
     planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
     policy = make_policy(planner, EchoController(), state_of=(0, 1))
     followed = follow_recordings(policy, AVOIDING, data, None, episodes=5)
-    assert [futures[0, 0, 0, 0].item() for futures in plans] == [4.0, 5.0]
+    assert [future[0, 0, 0].item() for future in plans] == [4.0, 5.0]
     assert [part["recorded"].sum().item() for part in followed] == [18, 18]  # frames of a path but its first

@@ -9,16 +9,17 @@ leave the plans, and how far they leave the demonstrations.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torchrl_koap.data import trajectory_lengths
-from torchrl_koap.evaluation.rollouts import roll_out
+from torchrl_koap.evaluation.rollouts import device_of, roll_out
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
@@ -28,21 +29,10 @@ RECORDED_FUTURE = "recorded_future"
 RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end
 
 
-class RecordedFutures(TensorDictModuleBase):
-    """Writes the recorded states ``[E, steps, H, d]`` that follow the current step, for a :class:`RecordedPlanner`."""
-
-    def __init__(self, futures: Tensor):
-        super().__init__()
-        self.in_keys: list[str] = []
-        self.out_keys = [RECORDED_FUTURE]
-        self.register_buffer("futures", futures, persistent=False)
-        self.step = 0
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the futures of the current step (the last ones when the record is over) and moves on."""
-        tensordict.set(RECORDED_FUTURE, self.futures[:, min(self.step, self.futures.shape[1] - 1)])
-        self.step += 1
-        return tensordict
+def hand_on(futures: Tensor) -> TensorDictModule:
+    """Writes the recorded states ``[E, steps, H, d]`` after the current step, the last ones when a record is over."""
+    steps = itertools.chain(futures.unbind(1), itertools.repeat(futures[:, -1]))
+    return TensorDictModule(steps.__next__, in_keys=[], out_keys=[RECORDED_FUTURE])
 
 
 class RecordedPlanner(nn.Module):
@@ -55,7 +45,7 @@ class RecordedPlanner(nn.Module):
         self.history, self.horizon = planner.history, planner.horizon
 
     def sample(self, history: Tensor, future: Tensor) -> Tensor:
-        """The futures ``[*B, H, d]`` that :class:`RecordedFutures` wrote, of histories ``[*B, h, d]``."""
+        """The futures ``[*B, H, d]`` that :func:`hand_on` writes, of histories ``[*B, h, d]``."""
         return future.expand(*history.shape[:-2], -1, -1)
 
 
@@ -130,7 +120,7 @@ def follow_recordings(
         list(range(len(chosen))),
         max_steps=task.max_steps,
         contexts=contexts_of(task, starts.double()).numpy() if task.objects else None,
-        given=lambda part: RecordedFutures(futures[part]),
+        given=lambda part: hand_on(futures[part].to(device_of(policy))),
     )
     for episode, index in zip(followed, chosen, strict=True):
         episode[RECORDED] = (torch.arange(len(episode)) < len(paths[index]) - 1).unsqueeze(-1)

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -18,7 +18,7 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION, PLAN
 from torchrl_koap.modules import ExecutionConfig, PlanningPolicy, policy_transforms
-from torchrl_koap.modules.execution.noise import NOISE, NoiseStreams, StartNoise
+from torchrl_koap.modules.execution.noise import NOISE, NoiseStreams
 from torchrl_koap.training.trained import Trained
 
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
@@ -92,8 +92,8 @@ def roll_out(
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
-    device, noise_key = device_of(policy), policy.planner.noise_key or NOISE
-    size, episodes = batch_size or min(len(seeds), AT_ONCE), []
+    noise_key, episodes = policy.planner.noise_key or NOISE, []
+    size = batch_size or min(len(seeds), AT_ONCE)
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
@@ -103,12 +103,13 @@ def roll_out(
         if given is not None:
             noise = given(slice(begin, begin + len(part)))
         else:
-            noise = StartNoise(NoiseStreams(part, policy.noise_shape, block=policy.max_steps), noise_key=noise_key)
+            streams = NoiseStreams(part, policy.noise_shape, block=policy.max_steps)
+            noise = TensorDictModule(streams.draw, in_keys=[], out_keys=[noise_key])
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(
                 max_steps,
-                TensorDictSequential(noise.to(device), policy),
+                TensorDictSequential(noise, policy),
                 auto_reset=False,
                 tensordict=env.reset(**start),
                 break_when_any_done=False,

@@ -18,7 +18,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     make_policy,
 )
-from torchrl_koap.modules.execution.noise import NoiseStreams, StartNoise
+from torchrl_koap.modules.execution.noise import NoiseStreams, NoiseTransform
 
 
 def test_a_stream_is_that_of_its_seed_whatever_else_is_drawn():
@@ -34,7 +34,7 @@ def test_a_stream_is_that_of_its_seed_whatever_else_is_drawn():
 
 
 def test_any_batch_is_written():
-    td = StartNoise(NoiseStreams(range(6), (5, 2), block=1), noise_key="z")(TensorDict(batch_size=[2, 3]))
+    td = NoiseTransform((5, 2), block=1, noise_key="z")._call(TensorDict(batch_size=[2, 3]))
     assert td["z"].shape == (2, 3, 5, 2)
 
 

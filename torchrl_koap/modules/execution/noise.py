@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
@@ -41,24 +40,6 @@ class NoiseStreams:
         self._left -= 1
         return self._draws[:, self.block - 1 - self._left]
 
-    def write(self, tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
-        """Writes the noise of the next step, a stream for every element of the batch."""
-        noise = self.draw().reshape(*tensordict.batch_size, *self.shape)
-        return tensordict.set(key, noise.to(tensordict.device or noise.device))
-
-
-class StartNoise(TensorDictModuleBase):
-    """Writes the noise of the next step, in front of a policy: a stream per environment, to ``planner.noise_key``."""
-
-    def __init__(self, streams: NoiseStreams, *, noise_key: NestedKey = NOISE):
-        super().__init__()
-        self.in_keys: list[NestedKey] = []
-        self.out_keys, self.streams = [noise_key], streams
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the noise."""
-        return self.streams.write(tensordict, self.out_keys[0])
-
 
 class NoiseTransform(Transform):
     """Writes start noise at every reset and step of an environment; number ``i`` of a batch draws with ``seed + i``.
@@ -81,7 +62,8 @@ class NoiseTransform(Transform):
         count = next_tensordict.batch_size.numel()
         if len(self._streams) != count:
             self._streams = NoiseStreams(range(self.seed, self.seed + count), self.shape, block=self.block)
-        return self._streams.write(next_tensordict, self.out_keys[0])
+        noise = self._streams.draw().reshape(*next_tensordict.batch_size, *self.shape)
+        return next_tensordict.set(self.out_keys[0], noise.to(next_tensordict.device or noise.device))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
