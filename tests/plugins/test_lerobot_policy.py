@@ -14,7 +14,7 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, load_policy
 from torchrl_koap.data import read_recordings
-from torchrl_koap.modules.execution.noise import NoiseStreams
+from torchrl_koap.modules.execution.policy_env import NoiseStreams
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
 INSTALL = "is not installed: pip install ./integrations/lerobot_policy_koap (docs/howto/lerobot.md)"

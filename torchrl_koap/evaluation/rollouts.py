@@ -18,7 +18,7 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION, PLAN
 from torchrl_koap.modules import ExecutionConfig, PlanningPolicy, policy_transforms
-from torchrl_koap.modules.execution.noise import NOISE, NoiseStreams
+from torchrl_koap.modules.execution.policy_env import NOISE, NoiseStreams
 from torchrl_koap.training.trained import Trained
 
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise

@@ -21,7 +21,7 @@ from torchrl_koap.modules import (
     make_policy,
 )
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
-from torchrl_koap.modules.execution.noise import NoiseStreams
+from torchrl_koap.modules.execution.policy_env import NoiseStreams
 
 STEPS = 13
 

@@ -18,7 +18,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     make_policy,
 )
-from torchrl_koap.modules.execution.noise import NoiseStreams, NoiseTransform
+from torchrl_koap.modules.execution.policy_env import NoiseStreams, NoiseTransform
 
 
 def test_a_stream_is_that_of_its_seed_whatever_else_is_drawn():

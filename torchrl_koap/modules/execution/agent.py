@@ -14,8 +14,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_koap.keys import observed_numbers
-from torchrl_koap.modules.execution.noise import NoiseStreams
 from torchrl_koap.modules.execution.policy import IS_INIT, PlanningPolicy
+from torchrl_koap.modules.execution.policy_env import NoiseStreams
 
 KEPT = 10_000  # latencies of the last steps
 
