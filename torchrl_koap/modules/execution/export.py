@@ -113,7 +113,7 @@ def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, s
 def export_policy(
     what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5
 ) -> Callable[..., Outputs]:
-    """Writes a policy, of :func:`exportable`, and compares what is read back with the original; returns the former.
+    """Writes a policy, of :func:`exportable`, and returns what is read back, which is compared with the original.
 
     The batch of the file is dynamic: it is tried with one robot and with three. The facts are in the file:
     ``torch.export.load(file, extra_files={"facts.json": ""})``, the metadata of an ONNX model, entry by entry as JSON,
