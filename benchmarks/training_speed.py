@@ -13,6 +13,7 @@ and augmentation included, step by step, with a compiled denoiser, and with the 
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -47,7 +48,7 @@ RESULTS = Path(__file__).parent / "results"
 SPEED = ("part", "variant", "parameters", "updates_per_second", "plan_1_ms", "plan_60_ms", "command")
 PRECISION = ("processor", "units", "width", "depth", "batch", "float32", "bfloat16", "ratio")
 COMMAND = "OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner"
-CUDA = ("device", "network", "batch", "precision", "eager", "compiled", "replayed", "processor")
+CUDA = ("device", "network", "batch", "precision", "eager", "compiled", "replayed", "one_core", "beside")
 BATCH, UPDATES = 512, 600
 SIZES = ((512, 4, 512), (512, 4, 256), (256, 3, 128))  # width, residual layers, batch
 
@@ -157,7 +158,7 @@ def on_gpu() -> None:
         if tuple(map(str, key)) not in done:
             ways: tuple[dict[str, bool], ...] = ({}, {"compiled": True}, {"replay": True})
             rates = [*(loop_rate(network, device="cuda", **way) for way in ways), loop_rate(network, device="cpu")]
-            row = (*key, *(f"{rate:.0f}" for rate in rates))
+            row = (*key, *(f"{rate:.0f}" for rate in rates), f"{os.getloadavg()[0]:.0f} busy cores of {os.cpu_count()}")
             print(*row, flush=True)
             write(row)
 

@@ -144,10 +144,9 @@ def test_short_trajectories_are_named():
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
-def test_indices_live_with_the_data(device):
-    buffer = make_window_buffer(demonstrations().to(device), 16, 4, labelled_share=0.5)
-    batch, info = buffer.sample(return_info=True)
-    assert info["index"].device.type == device == batch["action"].device.type
+def test_batches_live_with_the_data(device):
+    batch = make_window_buffer(demonstrations().to(device), 16, 4, labelled_share=0.5).sample()
+    assert batch["action"].device.type == device
     assert set(seen(batch)) <= set(by_hand(LENGTHS, 16))
 
 

@@ -49,7 +49,8 @@ def test_extra_batch_dimensions_equal_flattened(denoiser, dtype, device):
     nested = denoiser(x, time, condition)
     flat = denoiser(x.flatten(0, 1), time.flatten(), condition.flatten(0, 1))
     torch.testing.assert_close(nested.flatten(0, 1), flat)
-    torch.testing.assert_close(nested[1, 3], denoiser(x[1, 3], time[1, 3], condition[1, 3]), atol=1e-5, rtol=1e-4)
+    tolerance = {"atol": 1e-5, "rtol": 1e-4} if device == "cpu" else {"atol": 2e-3, "rtol": 2e-2}  # TF32 convolutions
+    torch.testing.assert_close(nested[1, 3], denoiser(x[1, 3], time[1, 3], condition[1, 3]), **tolerance)
     assert nested.dtype == dtype and nested.shape == x.shape
 
 
