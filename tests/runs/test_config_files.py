@@ -8,7 +8,7 @@ import json
 import pytest
 
 from torchrl_koap import ControllerConfig, ExecutionConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
-from torchrl_koap.runs.config_files import changed_options, from_json, to_json
+from torchrl_koap.runs.config_files import changed_options, from_json, to_json, version_of
 from torchrl_koap.runs.run_directory import RunDirectoryError
 
 
@@ -56,3 +56,7 @@ def test_changes_are_named_with_their_section():
     one = TrainConfig(out="run", planner=PlannerConfig(steps=3))
     other = TrainConfig(out="run", planner=PlannerConfig(steps=4), method="dd")
     assert changed_options(one, other) == ["method", "planner.steps"] and not changed_options(one, one)
+
+
+def test_a_package_without_metadata_has_no_version():
+    assert version_of("no_such_package") == "MISSING"

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import importlib.util
 import os
 import platform
@@ -17,6 +16,7 @@ import torch
 import tyro
 
 from torchrl_koap.commands.options import Command
+from torchrl_koap.runs.config_files import version_of
 from torchrl_koap.runs.device import has_bfloat16_units
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
@@ -50,11 +50,7 @@ class Doctor(Command):
 def machine_facts() -> dict[str, str]:
     """Facts about this machine, name to value."""
     facts = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in _PACKAGES:
-        try:
-            facts[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            facts[name] = "MISSING"
+    facts |= {name: version_of(name) for name in _PACKAGES}
     facts["processors"] = str(os.cpu_count())
     facts["torch threads"] = str(torch.get_num_threads())
     quick = has_bfloat16_units()

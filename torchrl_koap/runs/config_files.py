@@ -97,10 +97,16 @@ def _unknown(name: str, known: tuple[str, ...]) -> str:
 
 def versions() -> dict[str, str]:
     """Returns the versions of Python and of the packages that results depend on."""
-    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+    return {"python": platform.python_version()} | {name: version_of(name) for name in _PACKAGES}
 
 
-_version = functools.cache(importlib.metadata.version)
+@functools.cache
+def version_of(package: str) -> str:
+    """Returns the version of an installed package, or "MISSING", as of a checkout on ``PYTHONPATH``."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "MISSING"
 
 
 def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
