@@ -12,7 +12,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.modules.planning.noise_schedule import NUM_TRAIN_STEPS
 from torchrl_koap.objectives import PlannerLoss
-from torchrl_koap.runs.device import find_precision, has_bfloat16_units, set_up_torch
+from torchrl_koap.runs.device import default_threads, find_precision, has_bfloat16_units, set_up_torch
 from torchrl_koap.training.loop import SETTLED, train_phase
 
 
@@ -45,6 +45,15 @@ def test_bfloat16_by_name_is_obeyed_and_warns_where_it_is_emulated(units):
 def test_a_missing_gpu_is_said():
     with pytest.raises(ValueError, match="'cuda:1' was asked for, but torch finds no CUDA here"):
         set_up_torch(1, "cuda:1")
+
+
+@pytest.mark.parametrize("told", [None, "1"])
+def test_threads_are_those_of_the_environment(told, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if told:
+        monkeypatch.setenv("OMP_NUM_THREADS", told)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
+    assert default_threads() == (7 if told else 1)
 
 
 def test_no_number_of_threads_leaves_torch_alone():

@@ -54,7 +54,7 @@ FIRST = {
     "steps": (int, "updates of the planner at most (default: the task's)."),
     "seed": (int, "seed of label choice, initialisation and batches (default: 0)."),
     "device": (str, "cpu or cuda (default: cpu)."),
-    "threads": (int, "torch threads (default: 1)."),
+    "threads": (int, "torch threads (default: OMP_NUM_THREADS where it is set, else 1)."),
     "resume": (bool, "go on with an interrupted run."),
     "config": (Path, "JSON file of options, in the sections of `--help-all`; options of the call win."),
 }

@@ -137,7 +137,7 @@ class RunConfig:
 
     Attributes:
         seed: seed of label choice, initialisation and batches.
-        threads: torch threads.
+        threads: torch threads (default: OMP_NUM_THREADS where it is set, else 1).
         device: "cpu" or "cuda".
         precision: of the matrix products in the planner's training: "float32", "bfloat16" (several times quicker where
             the processor has units for it, many times slower where not), or "auto", which looks.
@@ -157,7 +157,7 @@ class RunConfig:
     """
 
     seed: int = 0
-    threads: int = 1
+    threads: int | None = None
     device: str = "cpu"
     precision: str = "auto"
     logger: str = "csv"

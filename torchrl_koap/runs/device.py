@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 
 import torch
@@ -49,6 +50,11 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
         return torch.cuda.is_bf16_supported(including_emulation=False)
     features = torch.cpu.get_capabilities()
     return any(features.get(name, False) for name in _BFLOAT16)
+
+
+def default_threads() -> int:
+    """Threads of a training: what ``OMP_NUM_THREADS`` says, else 1, since two beside another program wait for it."""
+    return torch.get_num_threads() if os.environ.get("OMP_NUM_THREADS") else 1
 
 
 def set_up_torch(threads: int | None, device: str) -> None:

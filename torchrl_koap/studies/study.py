@@ -197,7 +197,7 @@ class Study:
             task=cell.task,
             labels=LabelConfig(trajectories=cell.demonstrations),
             planner=self.planner,
-            run=self.run,
+            run=replace(self.run, threads=1),
         )
 
     def train_config(self, cell: Cell) -> TrainConfig:
@@ -212,7 +212,7 @@ class Study:
             planner=self.planner if folder is None else PlannerConfig(source=folder),
             controller=self.controller,
             execution=self.execution,
-            run=replace(self.run, seed=cell.seed),
+            run=replace(self.run, seed=cell.seed, threads=1),
         )
 
     def eval_config(self, cell: Cell) -> EvalConfig:

@@ -12,7 +12,7 @@ from torchrl_koap.modules import PRESETS
 from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, TrainConfig
 from torchrl_koap.runs.config_files import read_config
-from torchrl_koap.runs.device import find_precision
+from torchrl_koap.runs.device import default_threads, find_precision
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, Task
 from torchrl_koap.training.method import Method
@@ -63,7 +63,11 @@ def resolve(config: TrainConfig, task: Task) -> TrainConfig:
         planner=_planner(config.planner, method, task),
         controller=_controller(config.controller, method, task),
         execution=_execution(config.execution, method, task),
-        run=replace(config.run, precision=find_precision(config.run.precision, config.run.device)),
+        run=replace(
+            config.run,
+            threads=config.run.threads or default_threads(),
+            precision=find_precision(config.run.precision, config.run.device),
+        ),
     )
 
 
