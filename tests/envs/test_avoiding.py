@@ -11,11 +11,12 @@ import pytest
 import torch
 from env_test_base import EnvTestBase, act, assert_starts_as_recorded, recordings_of, replay, start_recorded
 from shared_data import HUMAN
+from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import StepCounter
 
-from torchrl_koap.envs.avoiding import OBSTACLES, AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 
 needs_human = pytest.mark.skipif(not HUMAN.exists(), reason=f"no human demonstrations at {HUMAN}")
 
@@ -89,7 +90,7 @@ def test_reset_observation_and_latency_of_one_step():
     first = env.reset()["observation"][0]
     torch.testing.assert_close(first[:2], first[2:], rtol=0, atol=0)
     torch.testing.assert_close(first[:2], torch.tensor([0.524928, -0.279737], dtype=torch.float64), rtol=0, atol=1e-6)
-    step = torch.tensor([0.005, 0.010], dtype=torch.float64)
+    step = torch.tensor([0.020, 0.010], dtype=torch.float64)  # beyond the human range: executed unclipped
     before = torch.as_tensor(env.sims.tcp_position[0, :2])
     for k in range(1, 6):
         seen = act(env, step)["observation"][0]
@@ -180,38 +181,10 @@ def test_mode_flags_are_set_once():
         assert np.flatnonzero(env._mode[0]).tolist() == flags, (x, y)
 
 
-def test_mode_index_numbers_all_24():
-    flags = torch.zeros(2, 3, 4, 9, dtype=torch.bool)
-    for a in range(2):
-        for b in range(3):
-            for c in range(4):
-                flags[a, b, c, [a, 2 + b, 5 + c]] = True
-    torch.testing.assert_close(mode_index(flags), torch.arange(24).reshape(2, 3, 4))
-    incomplete = flags.clone()
-    incomplete[..., 5:] = False
-    assert (mode_index(incomplete) == -1).all()
-    with pytest.raises(ValueError, match="9 entries"):
-        mode_index(torch.zeros(3, 8))
-
-
-def test_actions_beyond_the_human_range_are_executed_unclipped():
-    env = AvoidingEnv(1, dtype=torch.float64)
-    start = env.reset()["observation"][0, :2]
-    seen = act(env, torch.tensor([0.05, 0.02], dtype=torch.float64))["observation"][0, :2]
-    torch.testing.assert_close(seen - start, torch.tensor([0.05, 0.02], dtype=torch.float64), rtol=0, atol=1e-12)
-
-
-def test_obstacles_lie_where_the_task_says():
-    model = AvoidingEnv(1).sims.model
-    for name, x, y, radius, half_height in OBSTACLES:
-        np.testing.assert_allclose(model.body(name).pos, [x, y, 0])
-        np.testing.assert_allclose(model.geom(name).size[:2], [radius, half_height])
-
-
 def test_collector_restarts_environments_that_end_at_different_times():
     actions = torch.stack([INTO_ROW_1, 1.3 * INTO_ROW_1, 0 * INTO_ROW_1]).float()
     env = TransformedEnv(AvoidingEnv(3, max_steps=37), StepCounter())
-    policy = TensorDictPolicy(actions)
+    policy = TensorDictModule(lambda _: actions, ["observation"], ["action"])
     collector = Collector(
         env, policy, frames_per_batch=3 * 90, total_frames=3 * 90, auto_register_policy_transforms=False
     )
@@ -228,12 +201,3 @@ def test_collector_restarts_environments_that_end_at_different_times():
     length = ends[0][0] + 1
     first, second = data["observation"][0, :length], data["observation"][0, length : 2 * length]
     torch.testing.assert_close(first, second, rtol=0, atol=0)
-
-
-class TensorDictPolicy(torch.nn.Module):
-    def __init__(self, actions):
-        super().__init__()
-        self.register_buffer("actions", actions)
-
-    def forward(self, tensordict):
-        return tensordict.set("action", self.actions)

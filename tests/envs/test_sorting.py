@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import SortingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
-from torchrl_koap.envs.sorting import BIN_X, BIN_Y, box_colours, mode_colours, mode_index
+from torchrl_koap.envs.sorting import BIN_X, BIN_Y, box_colours, mode_index
 
 SENSITIVE = (1, 2)  # episodes in which a change of 1e-8 rad grows to millimetres
 INTO_BOXES = torch.tensor([0.001, 0.010], dtype=torch.float64)
@@ -87,22 +84,6 @@ def test_all_numbers_of_boxes(num_boxes):
 def test_other_numbers_of_boxes_are_refused(num_boxes):
     with pytest.raises(ValueError, match="num_boxes must be one of 2, 4, 6"):
         SortingEnv(1, num_boxes=num_boxes)
-
-
-@pytest.mark.parametrize("num_boxes", [2, 4, 6])
-def test_modes_are_numbered_in_lexicographic_order(num_boxes):
-    sequences = sorted({*itertools.permutations([0, 1] * (num_boxes // 2))})
-    leaf = torch.tensor(sequences).reshape(2, -1, num_boxes)
-    assert mode_index(leaf).flatten().tolist() == list(range(len(sequences)))
-    assert [mode_colours(index, num_boxes) for index in range(len(sequences))] == sequences
-    leaf[..., -1] = -1
-    assert (mode_index(leaf) == -1).all()
-    assert len(sequences) == math.comb(num_boxes, num_boxes // 2)
-    assert box_colours(num_boxes).sum() == num_boxes // 2
-    with pytest.raises(ValueError, match=f"mode must be 0 to {len(sequences) - 1}"):
-        mode_colours(len(sequences), num_boxes)
-    with pytest.raises(ValueError, match="num_boxes"):
-        mode_index(torch.zeros(3, num_boxes + 1))
 
 
 def put(env, places):

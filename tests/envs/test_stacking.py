@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
 from env_test_base import ContextTestBase, act, assert_starts_as_recorded, contexts_of, recordings_of, replay
 
 from torchrl_koap.envs import StackingEnv
-from torchrl_koap.envs.stacking import mode_index
 from torchrl_koap.tasks import get_task
 
 STILL_OPEN = torch.tensor([0.0] * 7 + [0.08], dtype=torch.float64)
@@ -105,22 +102,6 @@ def test_gripper_threshold():
     np.testing.assert_allclose(env.sims.object_poses[:, :, 2], 0.011, atol=1e-3)  # popped up onto the table
 
 
-def test_fingers_hold_a_box():
-    env = StackingEnv(1, dtype=torch.float64, seed=0)
-    env.reset()
-    for _ in range(12):
-        act(env, STILL_OPEN)
-    x, y, z = env.sims.tcp_position[0]
-    put_boxes(env, [(x, y, z), *ON_TABLE[1:]])
-    for _ in range(40):
-        act(env, STILL_CLOSED)
-    assert env.sims.gripper_width[0] == pytest.approx(0.06, abs=2e-3)
-    assert abs(env.sims.object_poses[0, 0, 2] - z) < 0.03
-    for _ in range(30):
-        act(env, STILL_OPEN)
-    assert env.sims.object_poses[0, 0, 2] == pytest.approx(0.011, abs=1e-3)  # fell onto the table
-
-
 ON_TABLE = [(0.4, -0.2, 0.011), (0.4, -0.05, 0.011), (0.6, -0.1, 0.011)]
 PILED = [(0.50, 0.20, 0.011), (0.52, 0.20, 0.072), (0.49, 0.21, 0.133)]
 # positions of the boxes, and success with one, two and three boxes
@@ -158,17 +139,6 @@ def test_boxes_are_recorded_nearest_first_and_stay_recorded():
     away[:14] = np.concatenate([[0.4, -0.2, 0.011, 1, 0, 0, 0], [0.4, -0.05, 0.011, 1, 0, 0, 0]])
     env.sims.set_physics(0, away)
     assert act(env, STILL_OPEN)["mode"][0].tolist() == [1, 0, -1]
-
-
-def test_mode_index_numbers_the_orders():
-    orders = torch.tensor(list(itertools.permutations(range(3))))
-    assert mode_index(orders).tolist() == list(range(6))
-    unfinished = orders.clone()
-    unfinished[:, 2] = -1
-    assert mode_index(unfinished).tolist() == [-1] * 6
-    assert mode_index(torch.full((2, 5, 3), -1)).tolist() == [[-1] * 5] * 2
-    with pytest.raises(ValueError, match="3 entries"):
-        mode_index(torch.zeros(4, 2, dtype=torch.int64))
 
 
 @pytest.mark.parametrize("num_boxes", [0, 4, -1, "two"])

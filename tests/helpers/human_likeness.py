@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_koap.envs.experts.avoiding import clearance
+from torchrl_koap.envs.experts.avoiding import AvoidingExpert
 from torchrl_koap.tasks.avoiding import FINISH_Y
 
 MOVING = 3.0  # mm per step
@@ -33,7 +33,7 @@ def statistics(episode: np.ndarray) -> dict[str, float]:
         "rows after the finish line": len(command) - end,
         "length of the measured path (m)": np.linalg.norm(np.diff(measured, axis=0), axis=1).sum(),
         "last measured y (m)": measured[-1, 1],
-        "least clearance (mm)": 1e3 * clearance(episode),
+        "least clearance (mm)": 1e3 * AvoidingExpert.clearance(episode),
         "speed, mean while moving (mm/step)": speed[run].mean(),
         "speed, variation (std / mean)": speed[run].std() / speed[run].mean(),
         "command to measured, median (mm)": np.median(lag),

@@ -62,8 +62,8 @@ def test_the_environment_is_what_torchrl_expects():
 def test_the_expert_records_both_modes(demonstrations):
     data, report = demonstrations
     validate(data)
-    assert report.modes == [0, 1] * 6 and report.task.num_modes == 2
-    assert trajectory_lengths(data).tolist() == report.rows  # every step is kept, none lost to a conversion
+    assert report.each("mode") == [0, 1] * 6 and report.task.num_modes == 2
+    assert trajectory_lengths(data).tolist() == report.each("rows")  # every step is kept, none lost to a conversion
     # the robot moves as told, inside every trajectory
     moved = data["next", "observation"][:, :2] - data["observation"][:, :2]
     torch.testing.assert_close(moved, data["action"], rtol=0, atol=1e-6)

@@ -16,8 +16,8 @@ import torch
 from toy_task import TOY
 
 import torchrl_koap
-from torchrl_koap.envs import mode_index_of, sorting
-from torchrl_koap.tasks import TASKS, Action, Task, aligning, avoiding, get_task
+from torchrl_koap.envs import mode_index_of
+from torchrl_koap.tasks import TASKS, Action, Task, aligning, avoiding, get_task, sorting
 
 
 def test_tasks_cannot_be_changed():
@@ -115,7 +115,7 @@ LEAVES = {
     "stacking_1": (ORDERS[::2], [("red",), ("green",), ("blue",)]),
 }
 for _name, _boxes in {"sorting": 4, "sorting_2": 2, "sorting_6": 6, "po_sorting": 4}.items():
-    _orders = [sorting.mode_colours(mode, _boxes) for mode in range(TASKS[_name].num_modes)]
+    _orders = sorting.arrival_orders(_boxes)
     LEAVES[_name] = torch.tensor(_orders), [[("red", "blue")[colour] for colour in order] for order in _orders]
 
 
@@ -126,6 +126,15 @@ def test_modes_are_numbered_and_named_as_the_environment_tells_them(name):
     assert mode_index_of(name)(leaves).tolist() == list(range(modes.number)) and TASKS[name].num_modes == modes.number
     assert [modes.name_of(mode) for mode in range(modes.number)] == [", ".join(each) for each in words]
     assert modes.name_of(modes.number) == modes.name_of(-1) == "no mode"
+    undecided = leaves.clone()
+    undecided[:, :2] = 0 if name == "avoiding" else -1
+    assert (mode_index_of(name)(undecided) == -1).all()
+    assert mode_index_of(name)(leaves.expand(2, -1, -1)).shape == (2, modes.number)
+
+
+def test_a_leaf_of_another_task_is_refused():
+    with pytest.raises(ValueError, match=r"mode must have 9 entries on the last axis, got shape \[3, 8\]"):
+        mode_index_of("avoiding")(torch.zeros(3, 8))
 
 
 def test_a_path_of_avoiding_tells_its_mode():

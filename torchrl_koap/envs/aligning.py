@@ -12,6 +12,7 @@ from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks.aligning import BASE_HALF, DISTANCE_TOLERANCE, ROTATION_TOLERANCE
+from torchrl_koap.tasks.modes import place_among
 
 INSIDE_REACH = 0.051  # m; the rod is inside the tray if nearer to its centre than this
 # name, direction from the centre, colour
@@ -24,12 +25,8 @@ WALLS = (
 
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the mode ``[*B]``: 0 if the tray was last pushed from inside, 1 from outside.
-
-    Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`AligningEnv`, int64 ``[*B, 1]``; -1 before the first step.
-    """
-    return mode.squeeze(-1).to(torch.int64)
+    """Returns the number of the mode ``[*B]``: 0 if the tray was last pushed from inside, 1 from outside."""
+    return place_among(((0,), (1,)), mode)
 
 
 class AligningEnv(ManipulationEnv):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -11,27 +12,15 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import PANDA, scene
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_REACH, ROW_Y
+from torchrl_koap.tasks.modes import place_among
+
+# flags of every mode: one gap of the two, three and four of the rows
+_FLAGS = [[gap in gaps for gap in range(9)] for gaps in itertools.product((0, 1), (2, 3, 4), (5, 6, 7, 8))]
 
 
 def mode_index(flags: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the mode, ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x.
-
-    Args:
-        flags (torch.Tensor): leaf ``mode`` of :class:`AvoidingEnv`, bool or int ``[*B, 9]``.
-
-    Returns:
-        torch.Tensor: int64 ``[*B]``, 0 to 23; -1 while a row of obstacles has not been passed.
-
-    Raises:
-        ValueError: if the last axis does not hold nine flags.
-    """
-    if flags.shape[-1] != 9:
-        raise ValueError(f"mode flags must have 9 entries on the last axis, got shape {list(flags.shape)}")
-    flags = flags.to(torch.int64)
-    rows = flags.split([2, 3, 4], dim=-1)
-    complete = torch.stack([row.sum(-1) == 1 for row in rows]).all(0)
-    index = 12 * rows[0].argmax(-1) + 4 * rows[1].argmax(-1) + rows[2].argmax(-1)
-    return torch.where(complete, index, -torch.ones_like(index))
+    """Returns the number of the mode, ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x."""
+    return place_among(_FLAGS, flags)
 
 
 class AvoidingEnv(ManipulationEnv):

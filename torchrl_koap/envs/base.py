@@ -201,10 +201,14 @@ class ManipulationEnv(EpisodeState, EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
         rows = self._rows(tensordict, "_reset")
         self._draw_contexts(rows, contexts)
-        self.sims.reset(rows, np.asarray(self.START_JOINTS), self._place(rows), width=self.RESET_WIDTH)
-        self.sims.widths[rows] = controller.FINGER_OPEN
+        self._start(rows)
         self._begin_episode(rows)
         return self._leaves()
+
+    def _start(self, rows: np.ndarray) -> None:
+        """Puts the simulations into their first states, those of ``self._contexts[rows]``."""
+        self.sims.reset(rows, np.asarray(self.START_JOINTS), self._place(rows), width=self.RESET_WIDTH)
+        self.sims.widths[rows] = controller.FINGER_OPEN
 
     def _draw_contexts(self, rows: np.ndarray, contexts) -> None:
         if contexts is not None:
@@ -294,13 +298,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         return self._commands.copy()
 
     def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = "cage") -> np.ndarray:
-        """Draws one environment, uint8 [height, width, 3].
-
-        Args:
-            index (int): which environment.
-            width (int): width in pixels.
-            height (int): height in pixels.
-            camera (str): ``"front"`` (whole scene), ``"cage"`` (D3IL's view) or ``"wrist"``.
+        """Draws one environment, uint8 [height, width, 3]; cameras: ``"front"``, ``"cage"`` (D3IL's) and ``"wrist"``.
 
         Raises:
             RuntimeError: if no OpenGL library can be used.
@@ -330,14 +328,11 @@ class ManipulationEnv(EpisodeState, EnvBase):
         """
         row = {name: self.sims.log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
         row["gripper_width"] = row["gripper_width"][:, 0]
-        row |= self.logged_command()
+        if self.COMMAND_DIM == 7:  # a pose; joints are in the log already
+            row |= {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:]}
         row["time_stamp"] = self.sims.log_time.copy()
         row["sim_step"] = np.rint(self.sims.log_time / controller.TIMESTEP).astype(np.int64)
         return row
-
-    def logged_command(self) -> dict[str, np.ndarray]:
-        """Returns the command as the recorder names it, where the controller's log does not hold it."""
-        return {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:7]}
 
     def raw_objects(self) -> dict[str, np.ndarray]:
         """Returns the poses [n, 7] (m, quaternion) of the task's objects by name, as D3IL's recorder logs them."""

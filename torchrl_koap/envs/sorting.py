@@ -12,6 +12,7 @@ from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks.columns import tan_yaw
+from torchrl_koap.tasks.modes import place_among
 from torchrl_koap.tasks.sorting import (
     BIN_HALF,
     BIN_RANGE,
@@ -31,46 +32,13 @@ _COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
 
 
 def box_colours(num_boxes: int) -> np.ndarray:
-    """Returns the colours of the boxes in the order of the state: red ones (0), then blue ones (1), int64 [num_boxes].
-
-    Raises:
-        ValueError: if there is no such task.
-    """
-    sorting_task(num_boxes)  # refuses other numbers
+    """Returns the colours of the boxes in the order of the state, int64 [num_boxes]: red ones, then blue ones."""
     return np.repeat((RED, BLUE), num_boxes // 2)
 
 
-def mode_colours(mode: int, num_boxes: int = 4) -> tuple[int, ...]:
-    """Returns the colours (0 red, 1 blue), in order of arrival, of a mode.
-
-    Args:
-        mode (int): number of the mode: 0 to 5 with four boxes, 0 to 1 with two, 0 to 19 with six.
-        num_boxes (int): number of boxes.
-
-    Raises:
-        ValueError: if there is no such mode or number of boxes.
-    """
-    sequences = arrival_orders(len(box_colours(num_boxes)))
-    if not 0 <= mode < len(sequences):
-        raise ValueError(f"mode must be 0 to {len(sequences) - 1} with {num_boxes} boxes, got {mode}")
-    return sequences[mode]
-
-
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the order in which the colours arrived, in lexicographic order (red before blue).
-
-    Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`SortingEnv`, int64 ``[*B, num_boxes]``.
-
-    Returns:
-        torch.Tensor: int64 ``[*B]``; -1 if a box is missing.
-
-    Raises:
-        ValueError: if the last axis fits no number of boxes.
-    """
-    sequences = torch.tensor(arrival_orders(len(box_colours(mode.shape[-1]))), device=mode.device)
-    same = (mode.unsqueeze(-2) == sequences).all(-1)
-    return torch.where(same.any(-1), same.to(torch.int64).argmax(-1), -1)
+    """Returns the number of the order in which the colours arrived, in lexicographic order (red before blue)."""
+    return place_among(arrival_orders(mode.shape[-1]), mode)
 
 
 class SortingEnv(ManipulationEnv):
@@ -119,8 +87,9 @@ class SortingEnv(ManipulationEnv):
     MODE_ENTRIES, MODE_VALUES = None, 2
 
     def __init__(self, *args: Any, num_boxes: int = 4, **options: Any):
+        task = sorting_task(num_boxes)
         self._colours = box_colours(num_boxes)
-        super().__init__(*args, task=sorting_task(num_boxes), **options)
+        super().__init__(*args, task=task, **options)
         self._noted = self._episode["noted"]
 
     def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:

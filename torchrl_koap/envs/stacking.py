@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -14,31 +15,19 @@ from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import tan_yaw
+from torchrl_koap.tasks.modes import place_among
 from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
 
 OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them
 COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
+ORDERS = tuple(itertools.permutations(range(3)))  # in which the boxes can arrive: the modes
 JOINT_BOUND = 0.03  # rad per control step
 GRIPPER_BOUND = 0.08  # m
 
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5.
-
-    Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 ``[*B, 3]``: 0 red, 1 green, 2 blue, -1 none.
-
-    Returns:
-        torch.Tensor: int64 ``[*B]``; -1 while incomplete.
-
-    Raises:
-        ValueError: if the last axis has not 3 entries.
-    """
-    if mode.shape[-1] != 3:
-        raise ValueError(f"mode must have 3 entries on the last axis, got shape {list(mode.shape)}")
-    mode = mode.to(torch.int64)
-    first, second = mode[..., 0], mode[..., 1]
-    return (2 * first + (second > 3 - first - second)).masked_fill((mode < 0).any(-1), -1)
+    """Returns the number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5."""
+    return place_among(ORDERS, mode)
 
 
 def first_box(mode: torch.Tensor) -> torch.Tensor:
@@ -145,10 +134,6 @@ class StackingEnv(ManipulationEnv):
         arrived = distance[np.arange(len(rows)), nearest] <= ZONE_RADIUS
         place = (self._mode[rows] >= 0).sum(1)
         self._mode[rows[arrived], place[arrived]] = nearest[arrived]
-
-    def logged_command(self) -> dict[str, np.ndarray]:
-        """Nothing: joints are commanded."""
-        return {}  # the log holds them already
 
     def _scene(self) -> Any:
         return scene(rod=False, arm_alpha=1.0, link_collisions=True, add_objects=_add_boxes_and_target)

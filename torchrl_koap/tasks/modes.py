@@ -1,10 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The ways in which a task can be done: their number, and their names."""
+"""The ways in which a task can be done: their number, their names, and how an environment tells them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import torch
+from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -46,3 +50,15 @@ class Modes:
             index, digit = divmod(index, len(names))
             words.append(names[digit])
         return ", ".join(reversed(words))
+
+
+def place_among(leaves: Sequence[Sequence[int]], leaf: Tensor) -> Tensor:
+    """Returns which of the leaves of all modes a leaf ``mode`` ``[*B, entries]`` is, int64 ``[*B]``; -1: none of them.
+
+    Raises:
+        ValueError: if the leaf has another number of entries.
+    """
+    if leaf.shape[-1] != len(leaves[0]):
+        raise ValueError(f"mode must have {len(leaves[0])} entries on the last axis, got shape {list(leaf.shape)}")
+    same = (leaf.unsqueeze(-2) == torch.tensor(leaves, device=leaf.device)).all(-1)
+    return torch.where(same.any(-1), same.to(torch.int64).argmax(-1), -1)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 
 import pytest
-import torch
 
 from torchrl_koap.data import load_ted, read_about
 from torchrl_koap.envs.experts import demonstration_folder
@@ -32,10 +31,14 @@ def test_the_data_are_those_of_a_recording_in_memory(whole):
     folder, report = whole
     data, again = record_demonstrations("avoiding", COUNT, seed=3, num_threads=1)
     assert (load_ted(folder / "ted")[0] == data).all()
-    assert (report.modes, report.rows, report.attempts) == (again.modes, again.rows, again.attempts)
+    assert (report.each("mode"), report.each("rows"), report.each("attempts")) == (
+        again.each("mode"),
+        again.each("rows"),
+        again.each("attempts"),
+    )
     assert [path.name for path in folder.iterdir()] == ["ted"]
     notes = read_about(folder / "ted")["notes"]
-    assert notes["seed"] == 3 and notes["modes"] == report.modes and notes["attempts"] == report.attempts
+    assert notes["seed"] == 3 and notes["modes"] == report.each("mode") and notes["attempts"] == report.each("attempts")
 
 
 class Stop(Exception):
@@ -106,18 +109,3 @@ def test_nothing_is_written_for_wrong_arguments(tmp_path):
     with pytest.raises(ValueError, match="0 to 1, got 2"):
         record_to_folder(tmp_path / "demos", TASK, 2, disturbance=2)
     assert not (tmp_path / "demos").exists()
-
-
-def test_memory_holds_a_batch_of_episodes(tmp_path, monkeypatch):
-    """Files are there before the next batch is played."""
-    play, found = demonstration_folder.iterate_takes, []
-
-    def watched(*arguments, **options):
-        for take in play(*arguments, **options):
-            found.append(len(list((tmp_path / "unfinished").glob("*.npz"))) if found or take.index else 0)
-            yield take
-
-    monkeypatch.setattr(demonstration_folder, "iterate_takes", watched)
-    record_to_folder(tmp_path, TASK, COUNT, num_threads=1, batch_size=1)
-    assert found == [0, 1, 2]
-    assert load_ted(tmp_path / "ted")[0]["action"].dtype == torch.float32

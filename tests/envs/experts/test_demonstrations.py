@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -36,10 +34,10 @@ def recording():
 
 def test_report(recording):
     data, report, calls = recording
-    assert len(report.rows) == len(report.attempts) == EPISODES
-    assert trajectory_lengths(validate(data)).tolist() == [rows - 1 for rows in report.rows]
-    assert np.bincount(report.modes, minlength=24).min() == 1 and len(set(report.modes[24:])) == 2
-    assert sum(report.attempts) - EPISODES == sum(report.failures.values())
+    assert len(report.each("rows")) == len(report.each("attempts")) == EPISODES
+    assert trajectory_lengths(validate(data)).tolist() == [rows - 1 for rows in report.each("rows")]
+    assert np.bincount(report.each("mode"), minlength=24).min() == 1 and len(set(report.each("mode")[24:])) == 2
+    assert sum(report.each("attempts")) - EPISODES == sum(report.notes["discarded_attempts"].values())
     assert f"{EPISODES} demonstrations" in str(report)
     done = [call[0] for call in calls]
     assert done == sorted(done) and calls[-1] == (EPISODES, EPISODES)
@@ -48,9 +46,9 @@ def test_report(recording):
 def test_takes_are_the_rows_of_the_original_recorder(recording):
     data = recording[0]
     for take in iterate_takes("avoiding", EPISODES, seed=5, done=range(2, EPISODES)):
-        assert len(take.frames) == len(take.actions) + 1 == take.rows
+        assert len(take.frames) == len(take.actions) + 1 == take.log["rows"]
         assert np.allclose(take.frames[0, 2:], (0.524928, -0.279737), atol=1e-5)
-        np.testing.assert_array_equal(take.frames[:-1], data["observation"][data["episode"] == take.index])
+        np.testing.assert_array_equal(take.frames[:-1], data["observation"][data["episode"] == take.number])
 
 
 def test_demonstrations_are_successes_with_clearance(recording):
@@ -81,7 +79,7 @@ def test_replayed_actions_give_the_same_episode(recording):
             # the environment hands out the position of 1 ms before the recorder's
             assert np.allclose(seen[2:], frames[row, 2:], atol=1e-3, rtol=0)
         assert step["success"].item() and not step["collision"].item()
-        assert mode_index(step["mode"]).item() == report.modes[index]
+        assert mode_index(step["mode"]).item() == report.each("mode")[index]
 
 
 def test_modes_are_balanced():
@@ -92,24 +90,16 @@ def test_modes_are_balanced():
 
 
 def test_failed_attempts_are_counted_and_given_up_on(monkeypatch):
-    class Blind:
-        rules = AvoidingExpert.rules
-
-        def __init__(self, modes, contexts, seeds):
-            self.finished = np.zeros(len(modes), dtype=bool)
-
-        def act(self, observation):
-            return np.tile([-0.0006, 0.012], (len(observation), 1))  # straight into the first cylinder
-
-    monkeypatch.setattr("torchrl_koap.envs.experts.avoiding.AvoidingExpert", Blind)
+    into_the_first_cylinder = np.array([-0.0006, 0.012])
+    monkeypatch.setattr(AvoidingExpert, "act", lambda self, seen: np.tile(into_the_first_cylinder, (len(seen), 1)))
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
     with pytest.raises(RecordingError, match=r"episodes \[0, 1\].*'collision': 4"):
         record_demonstrations(episodes=2)
 
 
-@pytest.mark.parametrize(("limit", "reason"), [({"least_clearance": 1.0}, "close"), ({"most_rows": 30}, "slow")])
-def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, reason):
-    monkeypatch.setattr(AvoidingExpert, "rules", replace(AvoidingExpert.rules, **limit))
+@pytest.mark.parametrize(("limit", "value", "reason"), [("least_clearance", 1.0, "close"), ("most_rows", 30, "slow")])
+def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, value, reason):
+    monkeypatch.setattr(AvoidingExpert, limit, value)
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 1)
     with pytest.raises(RecordingError, match=f"'{reason}': 1"):
         record_demonstrations(episodes=1)
@@ -139,8 +129,11 @@ def test_same_seed_same_data_whatever_threads_progress_and_batch(task):
     again, other = record_demonstrations(
         task, 3, seed=3, num_threads=2, batch_size=2, progress=lambda done, total: calls.append(done)
     )
-    assert (data == again).all() and (report.modes, report.attempts) == (other.modes, other.attempts)
+    assert (data == again).all() and (report.each("mode"), report.each("attempts")) == (
+        other.each("mode"),
+        other.each("attempts"),
+    )
     assert calls == sorted(calls) and calls[-1] == 3 and 1 in calls
     assert data["has_action"].all() and validate(data) is data and data["action"].dtype == torch.float32
     assert torch.equal(torch.random.get_rng_state(), state)
-    assert int(data["episode"].max()) + 1 == len(report.modes) == 3
+    assert int(data["episode"].max()) + 1 == len(report.each("mode")) == 3

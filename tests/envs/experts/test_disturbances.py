@@ -98,14 +98,6 @@ def test_grippers_are_left_alone():
     assert disturbed_columns(get_task("aligning")).tolist() == [0, 1]
 
 
-def spells_of(report):
-    return [take["spells"] for take in report.takes]
-
-
-def chosen_of(report):
-    return [take["disturbed"] for take in report.takes]
-
-
 @pytest.fixture(scope="module")
 def disturbed():
     return record_demonstrations("avoiding", 6, seed=2, num_threads=1, disturbance=0.5)
@@ -114,13 +106,13 @@ def disturbed():
 def test_the_recording_says_how_often(disturbed):
     data, report = disturbed
     told = report.notes["disturbance"]
-    assert told["share"] == 0.5 and told["disturbed_demonstrations"] == sum(chosen_of(report)) > 0
+    assert told["share"] == 0.5 and told["disturbed_demonstrations"] == sum(report.each("disturbed")) > 0
     assert told["attempts_under_disturbance"] == sum(
-        attempts for attempts, chosen in zip(report.attempts, chosen_of(report), strict=True) if chosen
+        attempts for attempts, chosen in zip(report.each("attempts"), report.each("disturbed"), strict=True) if chosen
     )
-    assert sum(told["kept"].values()) == sum(map(len, spells_of(report))) > 0
+    assert sum(told["kept"].values()) == sum(map(len, report.each("spells"))) > 0
     lengths = trajectory_lengths(data).tolist()
-    for spells, chosen, length in zip(spells_of(report), chosen_of(report), lengths, strict=True):
+    for spells, chosen, length in zip(report.each("spells"), report.each("disturbed"), lengths, strict=True):
         assert chosen or not spells
         assert all(0 <= begin < end <= length for begin, end, _ in spells)
     assert "disturbed" in str(report)
@@ -130,9 +122,9 @@ def test_undisturbed_episodes_are_those_of_a_recording_without(disturbed):
     data, report = disturbed
     plain, without = record_demonstrations("avoiding", 6, seed=2, num_threads=1)
     assert "disturbance" not in without.notes and "disturbed" not in str(without)
-    for index, chosen in enumerate(chosen_of(report)):
+    for index, chosen in enumerate(report.each("disturbed")):
         same = np.array_equal(*(part["action"][part["episode"] == index] for part in (data, plain)))
-        assert same == (not spells_of(report)[index]) or chosen
+        assert same == (not report.each("spells")[index]) or chosen
 
 
 def test_recorded_actions_are_those_that_were_executed(disturbed, monkeypatch):
@@ -148,18 +140,18 @@ def test_recorded_actions_are_those_that_were_executed(disturbed, monkeypatch):
     data, report = record_demonstrations("avoiding", 1, seed=1, num_threads=1, disturbance=1.0, dtype=torch.float64)
     recorded = data["action"].numpy()
     last = np.array(done[-len(recorded) - 1 :])[1:]  # the first action is the state that the log begins with
-    assert report.attempts[0] >= 1 and np.allclose(recorded, last, atol=1e-12)
+    assert report.each("attempts")[0] >= 1 and np.allclose(recorded, last, atol=1e-12)
 
 
 def test_a_task_brings_its_share_of_disturbed_demonstrations():
     assert get_task("aligning").defaults.disturbance == 0.5 and get_task("avoiding").defaults.disturbance == 0
     _, report = record_demonstrations("aligning", 1, seed=2, num_threads=1)
-    assert report.notes["disturbance"]["share"] == 0.5 and chosen_of(report) == list(choose_disturbed(1, 0.5, 2))
+    assert report.notes["disturbance"]["share"] == 0.5 and report.each("disturbed") == list(choose_disturbed(1, 0.5, 2))
 
 
 def test_an_operator_brings_the_tool_back_to_its_height():
     data, report = record_demonstrations("aligning", 1, seed=2, num_threads=1, disturbance=1.0, dtype=torch.float64)
-    drifts, restored = [spell for spell in spells_of(report)[0] if spell[2] == "drift"], []
+    drifts, restored = [spell for spell in report.each("spells")[0] if spell[2] == "drift"], []
     command = torch.cat([data["observation"], data["next", "observation"][-1:]])[:, 2].numpy()
     for (begin, end, _), (later, _, _) in zip(drifts, [*drifts[1:], (len(command), 0, "")], strict=True):
         if begin > 60 and end + 15 < later:  # after the descent

@@ -22,10 +22,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_koap.envs.contexts import check_contexts
 from torchrl_koap.envs.experts.push_planning import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
-from torchrl_koap.tasks import get_task
+from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 from torchrl_koap.tasks.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 
 SAFE_HEIGHT = 0.25  # TCP height (m) at which the rod passes over the walls
@@ -63,37 +61,26 @@ CONTACTS = _contacts()
 
 
 class AligningExpert(Expert):
-    """Scripted expert of Aligning for a batch of episodes: pushes trays into their target poses, each in its mode.
+    """Scripted expert of Aligning: pushes trays into their target poses from inside (mode 0) or outside (1).
 
-    Args:
-        modes (sequence of int): 0 (from inside) or 1 (from outside); contexts and seeds as
-            :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
-
-    Raises:
-        ValueError: if the numbers of modes, contexts and seeds differ, or a mode or context is wrong.
+    It has finished when it has seen the tray in its place and let go.
     """
 
-    rules = RecordingRules(most_rows=399)
+    TASK, most_rows = "aligning", 399
 
-    def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
-        contexts = check_contexts(get_task("aligning"), contexts)
-        check_episodes(modes, seeds, contexts, 2)
-        if not set(modes) <= {_INSIDE, _OUTSIDE}:
-            raise ValueError(f"modes are 0 (inside) or 1 (outside), got {sorted(set(modes) - {_INSIDE, _OUTSIDE})}")
+    def __init__(self, modes: Sequence[int], contexts: np.ndarray, seeds: Sequence):
+        super().__init__(modes, contexts, seeds)
         self._players = [
             _Player(int(mode), context, np.random.default_rng(seed))
             for mode, context, seed in zip(modes, contexts, seeds, strict=True)
         ]
 
-    @property
-    def finished(self) -> np.ndarray:
-        """Which players have seen the tray in its place and let go, bool [n]."""
-        return np.array([player.finished for player in self._players])
-
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step: change of the commanded TCP position [n, 3] (m) under observations [n, 20]."""
-        observation = self._checked(observation, 20)
-        return np.stack([player.act(row) for player, row in zip(self._players, observation, strict=True)])
+        """Decides changes of the commanded TCP position [n, 3] (m) under observations [n, 20]."""
+        rows = zip(self._players, self._checked(observation), strict=True)
+        actions = np.stack([player.act(row) for player, row in rows])
+        self.finished[:] = [player.since_success > player.linger for player in self._players]
+        return actions
 
 
 def _yaw(quaternion: np.ndarray) -> float:
@@ -129,10 +116,6 @@ class _Player:
         self.slip = generator.normal(0.0, 0.002, 2)  # by which the rod comes down beside the intended place
         self.wobble = ar1_noise(generator, 6, 0.00025, (_HORIZON, 2))
         self._choose(context[0], context[1], None)
-
-    @property
-    def finished(self) -> bool:
-        return self.since_success > self.linger
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         self.command, self.tcp = observation[:3], observation[3:6]

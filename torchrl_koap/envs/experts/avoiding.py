@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
+from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS, ROW_Y
 
 FULL_PUSH = 0.0124  # m per control step at full deflection
@@ -51,43 +51,18 @@ _HAND_REST = 1 - np.cumsum(_HAND)  # share of a decision that is still to come a
 
 
 def mode_gaps(mode: int) -> tuple[int, int, int]:
-    """Returns which gap of each row a mode (0 to 23) takes, counted from small x.
-
-    Raises:
-        ValueError: if there is no such mode.
-    """
-    if not 0 <= mode < 24:
-        raise ValueError(f"mode must be 0 to 23, got {mode}")
+    """Returns which gap of each row a mode (0 to 23) takes, counted from small x."""
     return mode // 12, mode % 12 // 4, mode % 4
 
 
-def clearance(frames: np.ndarray) -> float:
-    """Computes the least distance of a recording ``[T, 4]`` between the rod, taken as upright, and any cylinder (m)."""
-    path = frames[:, 2:]
-    gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
-    return min(gaps) - ROD_RADIUS
-
-
 class AvoidingExpert(Expert):
-    """Scripted expert of Avoiding for a batch of episodes, one mode and one seed each.
-
-    Args:
-        modes (sequence of int): 0 to 23; seeds as :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
-
-    Raises:
-        ValueError: if a mode does not exist or the numbers of modes and seeds differ.
-    """
+    """Scripted expert of Avoiding; it has finished when it has let go after the finish line."""
 
     # the human demonstrations have at most 104 rows and pass the cylinders at 3 mm or more
-    rules = RecordingRules(
-        most_rows=120,
-        touching=lambda env: env.obstacle_contacts().any(1),
-        clearance=clearance,
-        least_clearance=0.003,
-    )
+    TASK, most_rows, least_clearance = "avoiding", 120, 0.003
 
-    def __init__(self, modes: Sequence[int], seeds: Sequence, contexts: None = None):
-        check_episodes(modes, seeds)
+    def __init__(self, modes: Sequence[int], contexts: None, seeds: Sequence):
+        super().__init__(modes, contexts, seeds)
         drawn = [_draw(mode, np.random.default_rng(seed)) for mode, seed in zip(modes, seeds, strict=True)]
         self._habits = SimpleNamespace(**{name: np.stack([each[name] for each in drawn]) for name in drawn[0]})
         count = len(modes)
@@ -101,14 +76,20 @@ class AvoidingExpert(Expert):
         self._commanded: np.ndarray | None = None
         self._measured: np.ndarray | None = None
 
-    @property
-    def finished(self) -> np.ndarray:
-        """Which players have let go after the finish line and would stop recording, bool [n]."""
-        return (self._crossed >= 0) & (self._time >= self._crossed + self._habits.linger)
+    def touching(self, env: Any) -> np.ndarray:
+        """Where the rod touches a cylinder, bool [n]."""
+        return env.obstacle_contacts().any(1)
+
+    @staticmethod
+    def clearance(frames: np.ndarray) -> float:
+        """Least distance of a recording ``[T, 4]`` between the rod, taken as upright, and any cylinder (m)."""
+        path = frames[:, 2:]
+        gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
+        return min(gaps) - ROD_RADIUS
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step: change of the commanded xy [n, 2] (m) under observations [n, 4]."""
-        observation = self._checked(observation, 4)
+        """Decides changes of the commanded xy [n, 2] (m) under observations [n, 4]."""
+        observation = self._checked(observation)
         seen = self._look(observation)
         decision = self._decide(seen, observation[:, 3])
         self._decisions = np.concatenate([decision[:, None], self._decisions[:, :-1]], axis=1)
@@ -117,6 +98,7 @@ class AvoidingExpert(Expert):
             self._decisions = np.where(begun[..., None], decision[:, None], 0.0)
         push = np.einsum("nkd,k->nd", self._decisions, _HAND) + self._habits.tremor[:, self._time % _HORIZON]
         self._time += 1
+        self.finished = (self._crossed >= 0) & (self._time >= self._crossed + self._habits.linger)
         return push
 
     def _look(self, observation: np.ndarray) -> np.ndarray:

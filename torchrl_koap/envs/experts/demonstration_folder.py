@@ -42,17 +42,11 @@ def record_to_folder(
 ) -> RecordingReport:
     """Records demonstrations into a folder; called again with the same arguments, it goes on where it was interrupted.
 
-    Args:
-        folder (str or Path): where ``ted`` shall lie.
-        task (Task): the task.
-        episodes (int): and the other arguments, see
-            :func:`~torchrl_koap.envs.experts.demonstrations.iterate_takes`.
+    Arguments, and further errors, are those of :func:`~torchrl_koap.envs.experts.demonstrations.iterate_takes`.
 
     Raises:
         FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
         LockedError: if another process records into the folder.
-        ValueError: if the task has no expert, or a number is out of range.
-        RecordingError: if an episode fails again and again.
     """
     start, disturbance = time.perf_counter(), share_disturbed(task, disturbance)
     task = get_task(task.source)
@@ -69,8 +63,8 @@ def record_to_folder(
             progress(len(done), episodes)
         for take in iterating(progress, done=done):
             files.add(take)
-        frames, actions, accounts = files.read()
-        report = RecordingReport(task, seed, accounts, time.perf_counter() - start, disturbance)
+        frames, actions, logs = files.read()
+        report = RecordingReport(task, seed, logs, time.perf_counter() - start, disturbance)
         save_ted(flatten_trajectories(frames, actions), files.ted, task, report.notes)
     shutil.rmtree(files.unfinished)
     return report
@@ -87,9 +81,8 @@ class _Files:
         if self.ted.exists():
             raise FileExistsError(f"{self.ted} exists already; choose another --out")
         there = json.loads(begun.read_text()) if begun.exists() else request
-        other = [
-            f"{key} {there.get(key)!r}, not {value!r}" for key, value in request.items() if there.get(key) != value
-        ]
+        asked = request.items()
+        other = [f"{key} {there.get(key)!r}, not {value!r}" for key, value in asked if there.get(key) != value]
         if other:
             raise FileExistsError(
                 f"{self.unfinished} holds an interrupted recording with {', '.join(other)}: ask for the same to go on,"
@@ -104,18 +97,18 @@ class _Files:
         return {index for index in range(self._episodes) if self._file(index).exists()}
 
     def add(self, take: Take) -> None:
-        with replacing_file(self._file(take.index)) as aside, open(aside, "wb") as file:
-            np.savez(file, frames=take.frames, actions=take.actions, account=json.dumps(take.account))
+        with replacing_file(self._file(take.number)) as aside, open(aside, "wb") as file:
+            np.savez(file, frames=take.frames, actions=take.actions, log=json.dumps(take.log))
 
     def read(self) -> tuple[list[torch.Tensor], list[torch.Tensor], list[dict]]:
-        """Frames, actions and account of all demonstrations."""
-        frames, actions, accounts = [], [], []
+        """Frames, actions and log of all demonstrations."""
+        frames, actions, logs = [], [], []
         for index in range(self._episodes):
             with np.load(self._file(index), allow_pickle=False) as held:
                 frames.append(torch.from_numpy(held["frames"]).float())
                 actions.append(torch.from_numpy(held["actions"]).float())
-                accounts.append(json.loads(held["account"].item()))
-        return frames, actions, accounts
+                logs.append(json.loads(held["log"].item()))
+        return frames, actions, logs
 
     def _file(self, index: int) -> Path:
         return self.unfinished / f"{index:0{max(3, len(str(self._episodes - 1)))}d}.npz"

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import functools
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,9 +22,9 @@ from tensordict import TensorDict
 from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.experts.disturbances import (
+    KINDS,
     Disturbances,
     choose_disturbed,
-    count_spells,
     disturbed_columns,
     share_disturbed,
 )
@@ -41,25 +42,15 @@ class RecordingError(RuntimeError):
     """An episode whose expert failed in every attempt."""
 
 
-@dataclass(frozen=True)
-class Take:
-    """One demonstration and what it took."""
+class Take(NamedTuple):
+    """One demonstration."""
 
-    index: int  # number of the demonstration
+    number: int
     frames: np.ndarray  # [T, obs]
     actions: np.ndarray  # [T - 1, act]
-    mode: int
-    rows: int  # control steps
-    attempts: int  # that it took, 1 if the first one was good
-    failures: dict[str, int]  # discarded attempts by reason
-    disturbed: bool = False  # whether the operator was
-    # disturbances of the attempt that was kept: first control step, the one after the last, kind
-    spells: tuple[tuple[int, int, str], ...] = ()
-
-    @property
-    def account(self) -> dict[str, Any]:
-        """All but frames and actions."""
-        return {name: value for name, value in vars(self).items() if name not in ("frames", "actions")}
+    # its mode, its rows (control steps), the attempts that it took, failures (discarded attempts by reason), whether it
+    # was disturbed, and spells: the disturbances of the attempt that was kept
+    log: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -69,75 +60,60 @@ class RecordingReport:
     Args:
         task (Task): the task.
         seed (int): seed of the recording.
-        takes (sequence of dict): :attr:`Take.account` of each demonstration, in their order.
+        logs (sequence of dict): :attr:`Take.log` of each demonstration, in their order.
         seconds (float): wall-clock time.
         disturbance (float): share of the demonstrations that was to be disturbed.
     """
 
     task: Task
     seed: int
-    takes: Sequence[Mapping[str, Any]]
+    logs: Sequence[Mapping[str, Any]]
     seconds: float = 0.0
     disturbance: float = 0.0
 
-    @property
-    def modes(self) -> list[int]:
-        """Mode of each demonstration."""
-        return [take["mode"] for take in self.takes]
-
-    @property
-    def rows(self) -> list[int]:
-        """Control steps of each demonstration."""
-        return [take["rows"] for take in self.takes]
-
-    @property
-    def attempts(self) -> list[int]:
-        """Attempts that each demonstration took."""
-        return [take["attempts"] for take in self.takes]
-
-    @property
-    def failures(self) -> dict[str, int]:
-        """Number of discarded attempts by reason."""
-        return {name: sum(take["failures"].get(name, 0) for take in self.takes) for name in FAULTS}
+    def each(self, fact: str) -> list[Any]:
+        """Returns one fact of every demonstration, such as ``"mode"`` or ``"rows"``."""
+        return [log[fact] for log in self.logs]
 
     @property
     def notes(self) -> dict[str, Any]:
         """What ``about.json`` says of the recording. Disturbances are told only where there are any."""
-        notes = {"seed": self.seed, "modes": self.modes, "attempts": self.attempts}
-        notes["discarded_attempts"] = self.failures
+        discarded = {name: sum(counts.get(name, 0) for counts in self.each("failures")) for name in FAULTS}
+        notes = {"seed": self.seed, "modes": self.each("mode"), "attempts": self.each("attempts")}
+        notes["discarded_attempts"] = discarded
         if not self.disturbance:
             return notes
-        chosen = [take["attempts"] for take in self.takes if take["disturbed"]]
+        chosen, spells = [log["attempts"] for log in self.logs if log["disturbed"]], self.each("spells")
+        kinds = Counter(kind for episode in spells for _, _, kind in episode)
         return notes | {
             "disturbance": {
                 "share": self.disturbance,
                 "disturbed_demonstrations": len(chosen),
                 "attempts_under_disturbance": sum(chosen),
                 "recovered_at_the_first_attempt": chosen.count(1),
-                "kept": count_spells([take["spells"] for take in self.takes]),
-                "spells": [[list(spell) for spell in take["spells"]] for take in self.takes],
+                "kept": {kind: kinds[kind] for kind in KINDS},
+                "spells": [[list(spell) for spell in episode] for episode in spells],
             }
         }
 
     def __str__(self) -> str:
-        discarded = ", ".join(f"{count} {reason}" for reason, count in self.failures.items() if count) or "none"
-        counts = [self.modes.count(mode) for mode in range(self.task.num_modes)]
-        return (
-            f"{len(self.modes)} demonstrations of {self.task.name} in {len(set(self.modes))} modes"
-            f" ({', '.join(map(str, counts))}), {min(self.rows)} to {max(self.rows)} rows, {self.seconds:.1f} s;"
-            f" {self.attempts.count(1)} good at the first attempt; discarded attempts: {discarded}{self._disturbances}"
+        notes, modes, rows = self.notes, self.each("mode"), self.each("rows")
+        discarded = ", ".join(f"{count} {reason}" for reason, count in notes["discarded_attempts"].items() if count)
+        counts = ", ".join(str(modes.count(mode)) for mode in range(self.task.num_modes))
+        said = (
+            f"{len(modes)} demonstrations of {self.task.name} in {len(set(modes))} modes ({counts}), {min(rows)} to"
+            f" {max(rows)} rows, {self.seconds:.1f} s; {notes['attempts'].count(1)} good at the first attempt;"
+            f" discarded attempts: {discarded or 'none'}"
         )
-
-    @property
-    def _disturbances(self) -> str:
-        if not self.disturbance:
-            return ""
-        told = self.notes["disturbance"]
-        kept = ", ".join(f"{count} {kind}" for kind, count in told["kept"].items())
-        return (
-            f"; {told['disturbed_demonstrations']} disturbed ({kept}), of which the operator recovered in"
-            f" {told['disturbed_demonstrations']} of {told['attempts_under_disturbance']} attempts"
-        )
+        if self.disturbance:
+            told = notes["disturbance"]
+            kept, disturbed = (
+                ", ".join(f"{n} {kind}" for kind, n in told["kept"].items()),
+                told["disturbed_demonstrations"],
+            )
+            said += f"; {disturbed} disturbed ({kept}), of which the operator recovered in"
+            said += f" {disturbed} of {told['attempts_under_disturbance']} attempts"
+        return said
 
 
 def record_demonstrations(
@@ -149,28 +125,21 @@ def record_demonstrations(
     disturbance: float | None = None,
     **options: Any,
 ) -> tuple[TensorDict, RecordingReport]:
-    """Records demonstrations of a scripted expert as flat TED data, every action labelled.
+    """Records demonstrations of a scripted expert as flat TED data ``[N]``, every action labelled, with a report.
 
-    Args:
-        task (Task or str): and all arguments but ``dtype``, see :func:`iterate_takes`.
-        dtype (torch.dtype): floating type of the entries; everything is computed in float64.
-
-    Returns:
-        tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the :class:`RecordingReport`.
-
-    Raises:
-        ValueError: as there, like ``RecordingError``.
+    Everything is computed in float64; ``dtype`` is the floating type of the entries. Other arguments, and errors, are
+    those of :func:`iterate_takes`.
 
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import record_demonstrations
         >>> data, report = record_demonstrations("avoiding", episodes=3, seed=1)
-        >>> data["action"].shape[1], data["has_action"].all().item(), len(report.modes)
+        >>> data["action"].shape[1], data["has_action"].all().item(), len(report.each("mode"))
         (2, True, 3)
     """
     task, start = get_task(task), time.perf_counter()
     takes = list(iterate_takes(task, episodes, seed, disturbance=disturbance, **options))
     seconds, share = time.perf_counter() - start, share_disturbed(task, disturbance)
-    report = RecordingReport(get_task(task.source), seed, [take.account for take in takes], seconds, share)
+    report = RecordingReport(get_task(task.source), seed, [take.log for take in takes], seconds, share)
     frames = [torch.from_numpy(take.frames) for take in takes]
     return flatten_trajectories(frames, [torch.from_numpy(take.actions) for take in takes], dtype=dtype), report
 
@@ -196,7 +165,7 @@ def iterate_takes(
         episodes (int): number of demonstrations.
         seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
         num_threads (int): threads that advance the physics.
-        progress (callable, optional): called with the number of demonstrations recorded and wanted.
+        progress (callable, optional): is told the numbers of demonstrations recorded and wanted.
         batch_size (int): episodes played at once. The demonstrations do not depend on it.
         disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
             the task.
@@ -211,7 +180,7 @@ def iterate_takes(
 
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import iterate_takes
-        >>> [take.index for take in iterate_takes("avoiding", 4, done=[0, 2])]
+        >>> [take.number for take in iterate_takes("avoiding", 4, done=[0, 2])]
         [1, 3]
     """
     task = get_task(task)
@@ -226,7 +195,8 @@ def iterate_takes(
     disturbed = choose_disturbed(episodes, disturbance, seed)
     if disturbance:
         disturbed_columns(task)
-    return _play_batches(task, episodes, seed, num_threads, progress, batch_size, disturbed, frozenset(done))
+    modes = balanced_modes(episodes, task.num_modes, seed)
+    return _play_batches(task, modes, seed, num_threads, progress, batch_size, disturbed, frozenset(done))
 
 
 def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
@@ -238,7 +208,7 @@ def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
 
 def _play_batches(
     task: Task,
-    episodes: int,
+    modes: Sequence[int],
     seed: int,
     num_threads: int,
     progress: Callable[[int, int], None] | None,
@@ -246,7 +216,7 @@ def _play_batches(
     disturbed: np.ndarray,
     done: frozenset[int],
 ) -> Iterator[Take]:
-    modes, left = balanced_modes(episodes, task.num_modes, seed), [i for i in range(episodes) if i not in done]
+    left = [index for index in range(len(modes)) if index not in done]
     if not left:
         return
     size, shown = min(batch_size, len(left)), 0
@@ -256,25 +226,24 @@ def _play_batches(
         nonlocal shown
         shown = max(shown, found + over)
         if progress is not None:
-            progress(shown, episodes)
+            progress(shown, len(modes))
 
     @functools.cache
     def contexts_of(attempt: int) -> np.ndarray | None:
         """Drawn for all episodes, so that none depends on how many are played at once."""
         if not task.bodies:
             return None
-        return draw_contexts(task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
+        return draw_contexts(task, len(modes), np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
 
     try:
         for begin in range(0, len(left), size):
-            batch = np.array(left[begin : begin + size])
-            already = len(done) + begin
+            batch = left[begin : begin + size]
             takes: dict[int, Take] = {}
-            failures = {row: dict.fromkeys(FAULTS, 0) for row in batch}
+            failures: dict[int, Counter[str]] = {row: Counter() for row in batch}
             for attempt in range(MAX_ATTEMPTS):
-                rows, kept = np.array([row for row in batch if row not in takes]), already + len(takes)
+                rows, kept = [row for row in batch if row not in takes], len(done) + begin + len(takes)
                 contexts = contexts_of(attempt - attempt % _PER_CONTEXT)
-                seeds = [(seed, int(row), attempt) for row in rows]
+                seeds = [(seed, row, attempt) for row in rows]
                 hand = Disturbances(task, seeds, disturbed[rows]) if disturbed[rows].any() else None
                 results = play(
                     env,
@@ -285,26 +254,18 @@ def _play_batches(
                     functools.partial(show, kept),
                     disturbances=hand,
                 )
-                for index, (row, found) in enumerate(zip(rows, results, strict=True)):
+                for row, found, spells in zip(rows, results, hand.spells if hand else [[]] * len(rows), strict=True):
                     if found.fault:
                         failures[row][found.fault] += 1
-                        last = int(row), found.fault
+                        last = row, found.fault
                         continue
-                    takes[row] = Take(
-                        int(row),
-                        found.frames,
-                        found.actions,
-                        modes[row],
-                        found.steps,
-                        attempt + 1,
-                        {name: count for name, count in failures[row].items() if count},
-                        bool(disturbed[row]),
-                        () if hand is None else _within(hand.spells[index], found),
-                    )
+                    log: dict[str, Any] = {"mode": modes[row], "rows": found.steps, "attempts": attempt + 1}
+                    log |= {"failures": dict(failures[row]), "disturbed": bool(disturbed[row])}
+                    takes[row] = Take(row, found.frames, found.actions, log | {"spells": _within(spells, found)})
                 if len(takes) == len(batch):
                     break
             else:
-                missing = [int(row) for row in batch if row not in takes]
+                missing = [row for row in batch if row not in takes]
                 counts = {name: sum(failures[row][name] for row in batch) for name in FAULTS}
                 raise RecordingError(
                     f"{task.expert} never succeeded: no good attempt out of {MAX_ATTEMPTS} for episodes {missing} of"

@@ -15,7 +15,6 @@ All draws come from the seed of the attempt, so an episode does not depend on th
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -53,12 +52,8 @@ class Disturbances:
     """Disturbs the actions of a batch of operators, by amounts that follow from the operator's own steps so far.
 
     Entries that are no change of a command (the gripper) are left alone. The height of a tool that is pushed about only
-    drifts: where demonstrations never lift it, nothing tells a controller how that is done.
-
-    Args:
-        task (Task): tells which actions are changes of commands.
-        seeds (sequence): per episode a tuple of integers.
-        disturbed (array): bool per episode; the others are left as they are.
+    drifts: where demonstrations never lift it, nothing tells a controller how that is done. Every episode has a seed, a
+    tuple of integers, and is ``disturbed`` or left as it is.
     """
 
     def __init__(self, task: Task, seeds: Sequence, disturbed: Sequence[bool]):
@@ -95,12 +90,6 @@ def height_column(task: Task) -> int | None:
     """Returns the action column that changes the height of a tool on the table, None where none does."""
     lengths = [index for index, unit in enumerate(task.action_units) if unit == "m"]
     return lengths[2] if len(lengths) == 3 and list(disturbed_columns(task)) == lengths[:2] else None
-
-
-def count_spells(spells: Sequence[Sequence[tuple[int, int, str]]]) -> dict[str, int]:
-    """Counts the disturbances of all episodes (:attr:`Disturbances.spells`) by kind."""
-    counts = Counter(kind for episode in spells for _, _, kind in episode)
-    return {kind: counts[kind] for kind in KINDS}
 
 
 def _spell(now: int, draw: np.random.Generator, kinds: Sequence[str]) -> tuple[int, int, str]:
@@ -143,8 +132,8 @@ class _Hand:
             self._held = self._last.copy()
             self.spells.append(self._spell)
         if self._time >= start:
-            kinds = {"impulse": self._impulse, "slip": self._slip, "late_turn": self._late_turn}
-            done[self._columns] = kinds[kind](wanted)
+            pushed = wanted + self._pace * self._push
+            done[self._columns] = {"impulse": pushed, "slip": self._slip(wanted), "late_turn": self._held}[kind]
         if self._height is not None and self._time >= drift_start:
             done[self._height] = self._pace * self._rate
             if self._time == drift_start:
@@ -157,14 +146,8 @@ class _Hand:
             self._plan_drift()
         return done
 
-    def _impulse(self, wanted: np.ndarray) -> np.ndarray:
-        return wanted + self._pace * self._push
-
     def _slip(self, wanted: np.ndarray) -> np.ndarray:
         if self._width != 2:  # no one side to run off to: a push that grows with the speed
             return wanted + 0.5 * np.linalg.norm(wanted) * self._share
         c, s = np.cos(self._turn), np.sin(self._turn)
         return np.array([c * wanted[0] - s * wanted[1], s * wanted[0] + c * wanted[1]])
-
-    def _late_turn(self, wanted: np.ndarray) -> np.ndarray:
-        return self._held

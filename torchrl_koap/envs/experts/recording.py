@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.envs.registry import mode_index_of
 from torchrl_koap.lookup import resolve
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Task, get_task
 
 FAULTS = {  # why an attempt is discarded; of several the first one is told
     "collision": "something forbidden was touched",
@@ -41,24 +40,6 @@ class Attempt(NamedTuple):
     fault: str = ""  # what went wrong, one of FAULTS; empty if nothing did
 
 
-@dataclass(frozen=True)
-class RecordingRules:
-    """Which recordings of an expert are discarded, besides those without success or in another mode than asked for.
-
-    Args:
-        most_rows (int, optional): recordings of more control steps are discarded. Default: none is.
-        touching (callable, optional): from the environment to where something forbidden is touched, bool ``[n]``.
-        clearance (callable, optional): from the frames ``[T, obs]`` of a recording to its least distance to what must
-            not be touched (m).
-        least_clearance (float): nearer recordings are discarded (m).
-    """
-
-    most_rows: int | None = None
-    touching: Callable[[Any], np.ndarray] | None = None
-    clearance: Callable[[np.ndarray], float] | None = None
-    least_clearance: float = 0.0
-
-
 class Expert(abc.ABC):
     """Plays a batch of ``n`` episodes of a task; a subclass is named by ``Task.expert``.
 
@@ -67,12 +48,14 @@ class Expert(abc.ABC):
         contexts (np.ndarray, optional): context ``[n, bodies, 3]``: x, y (m), yaw (rad); None in a task without bodies.
         seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
 
+    Raises:
+        ValueError: if a mode does not exist, or the numbers of modes, seeds and contexts differ.
+
     Examples:
         >>> import numpy as np
         >>> from torchrl_koap.envs.experts.recording import Expert
         >>> class Still(Expert):
-        ...     def __init__(self, modes, contexts, seeds):
-        ...         self.finished = np.ones(len(modes), dtype=bool)
+        ...     TASK = "avoiding"
         ...
         ...     def act(self, observation):
         ...         return np.zeros((len(observation), 2))
@@ -80,12 +63,24 @@ class Expert(abc.ABC):
         (2, 2)
     """
 
-    rules = RecordingRules()
+    TASK: str  # name of the task
     embodiments: tuple[str, ...] = ()  # of demonstrations before a camera
-    finished: np.ndarray  # which episodes are over for the expert, bool [n]
+    # which recordings are discarded besides those without success or in another mode than asked for
+    most_rows: int | None = None  # those of more control steps
+    least_clearance = 0.0  # those that come nearer to what must not be touched (m)
 
-    @abc.abstractmethod
-    def __init__(self, modes: Sequence[int], contexts: np.ndarray | None, seeds: Sequence): ...
+    def __init__(self, modes: Sequence[int], contexts: np.ndarray | None, seeds: Sequence):
+        self.task, shape = get_task(self.TASK), np.shape(contexts)
+        self.finished = np.zeros(len(modes), dtype=bool)  # which episodes are over for the expert
+        wanted = (len(modes), len(self.task.objects), 3) if self.task.objects else ()
+        if not len(modes) or len(modes) != len(seeds) or shape != wanted:
+            raise ValueError(
+                f"as many seeds as modes are needed, at least one, and contexts {list(wanted)}, got {len(modes)} modes,"
+                f" {len(seeds)} seeds and contexts {list(shape)}"
+            )
+        wrong = [mode for mode in modes if mode not in range(self.task.num_modes)]
+        if wrong:
+            raise ValueError(f"modes of task {self.task.name!r} are 0 to {self.task.num_modes - 1}, got {wrong[0]}")
 
     @abc.abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -95,39 +90,30 @@ class Expert(abc.ABC):
             ValueError: if the observations have another shape.
         """
 
-    def _checked(self, observation: np.ndarray, columns: int) -> np.ndarray:
-        """The observations in float64; refused if they are not ``[n, columns]``."""
+    def touching(self, env: Any) -> np.ndarray:
+        """Where something forbidden is touched in an environment, bool ``[n]``."""
+        return np.zeros(env.batch_size[0], dtype=bool)
+
+    @staticmethod
+    def clearance(frames: np.ndarray) -> float:
+        """Least distance of a recording ``[T, obs]`` to what must not be touched (m)."""
+        return np.inf
+
+    def _checked(self, observation: np.ndarray) -> np.ndarray:
+        """The observations in float64; refused if they are not ``[n, obs]``."""
         observation = np.asarray(observation, dtype=np.float64)
-        wanted = (len(self.finished), columns)
+        wanted = (len(self.finished), self.task.observation_dim)
         if observation.shape != wanted:
             raise ValueError(f"observation must have shape {list(wanted)}, got {list(observation.shape)}")
         return observation
 
 
-def check_episodes(modes: Sequence, seeds: Sequence, contexts: Any = None, objects: int = 0) -> None:
-    """Checks that every episode has a mode, a seed and, with objects, a context.
-
-    Raises:
-        ValueError: if there is no mode, or the numbers of modes, seeds and, with objects, contexts differ.
-    """
-    asked, got = "seeds", f"{len(modes)} modes and {len(seeds)} seeds"
-    if objects:
-        asked = f"contexts [n, {objects}, 3] and seeds"
-        got = f"{len(modes)} modes, {len(seeds)} seeds and contexts of shape {list(np.shape(contexts))}"
-    if not len(modes) or len(modes) != len(seeds) or (objects and np.shape(contexts) != (len(modes), objects, 3)):
-        raise ValueError(f"as many {asked} as modes are needed, at least one, got {got}")
-
-
 def ar1_noise(
     generator: np.random.Generator, memory: float, deviation: float, size: int | tuple[int, ...]
 ) -> np.ndarray:
-    """Draws noise ``[*size]`` of an autoregressive process of order one in its steady state: a drifting hand.
+    """Draws a drifting hand: noise ``[*size]``, steps first, of an autoregressive process of order one.
 
-    Args:
-        generator (np.random.Generator): where the draws come from.
-        memory (float): steps after which a share 1/e remains.
-        deviation (float): standard deviation.
-        size (int or tuple of int): number of steps, or a shape that begins with it.
+    Its standard deviation is ``deviation`` from the first step on; after ``memory`` steps a share 1/e remains.
     """
     keep = np.exp(-1 / memory)
     values = generator.normal(0, deviation, size)
@@ -160,39 +146,32 @@ def play(
 ) -> list[Attempt]:
     """Plays one attempt at as many episodes as there are modes, in the first environments of a batch; the others idle.
 
-    Args:
-        env (EnvBase): the batch.
-        task (Task): the task.
-        modes (sequence of int): mode asked for in each episode.
-        contexts (np.ndarray, optional): contexts of all environments.
-        seeds (sequence): seed of each episode.
-        progress (callable): called with the number of episodes that are over.
-        disturbances (Disturbances, optional): what changes the actions.
+    ``contexts`` are those of all environments; ``progress`` is called with the number of episodes that are over.
     """
     count, playing = env.batch_size[0], len(modes)
     placed = None if contexts is None else contexts[:playing]
     expert = expert_of(task)(modes=modes, contexts=placed, seeds=seeds)
-    rules = expert.rules
     converter = CONVERTERS.get(task.source) if isinstance(env, ManipulationEnv) else None
-    recorder = _PlainRecorder() if converter is None else _RawRecorder(converter)
     active = np.arange(count) < playing
     data = env.reset() if contexts is None else env.reset(contexts=contexts)
+    frames, actions, logs = [data[keys.OBSERVATION].numpy().copy()], [], []
     index_of, touched, lengths = mode_index_of(task), np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
     success, reached = np.zeros(count, dtype=bool), np.full(count, -1)
     for _ in range(env.max_steps):
-        observation = data[keys.OBSERVATION].numpy()
         action = np.zeros((count, task.action_dim))
-        wanted = expert.act(observation[:playing])
+        wanted = expert.act(frames[-1][:playing])
         action[:playing] = wanted if disturbances is None else disturbances.disturb(wanted)
         # an environment may leave alone those that are over; what it does with them is not looked at
         step = data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
         data = env.step(step)["next"].clone()
-        recorder.add(env, observation, action, data[keys.OBSERVATION].numpy())
+        frames.append(data[keys.OBSERVATION].numpy().copy())
+        actions.append(action)
+        if converter is not None:
+            logs.append((env.raw_log(), env.raw_objects()))
         lengths += active
         success = np.where(active, data[keys.SUCCESS].squeeze(-1).numpy(), success)
         reached = np.where(active, index_of(data[keys.MODE]).numpy(), reached)
-        if rules.touching is not None:
-            touched |= active & rules.touching(env)
+        touched |= active & expert.touching(env)
         active[:playing] &= ~expert.finished
         active &= ~touched
         progress(int(playing - active.sum() - touched.sum()))
@@ -200,51 +179,28 @@ def play(
             break
     results = []
     for row in range(playing):
-        frames, actions = recorder.episode(row, lengths[row])
+        length = int(lengths[row])
+        if converter is None:
+            seen, done = np.stack(frames)[: length + 1, row], np.stack(actions)[:length, row]
+        else:
+            seen, done = _converted(converter, logs[:length], row)
         faults = {
             "collision": touched[row],
             "unfinished": active[row] or not success[row],
             "mode": reached[row] != modes[row],
-            "close": rules.clearance is not None and rules.clearance(frames) < rules.least_clearance,
-            "slow": rules.most_rows is not None and lengths[row] > rules.most_rows,
+            "close": expert.clearance(seen) < expert.least_clearance,
+            "slow": expert.most_rows is not None and length > expert.most_rows,
         }
         fault = next((name for name in FAULTS if faults[name]), "")
-        results.append(Attempt(frames, actions, int(lengths[row]), fault))
+        results.append(Attempt(seen, done, length, fault))
     return results
 
 
-class _PlainRecorder:
-    """Keeps what was observed and done."""
-
-    def __init__(self):
-        self._frames: list[np.ndarray] = []
-        self._actions: list[np.ndarray] = []
-
-    def add(self, env: Any, observation: np.ndarray, action: np.ndarray, following: np.ndarray) -> None:
-        self._frames = self._frames or [observation.copy()]
-        self._frames.append(following.copy())
-        self._actions.append(action)
-
-    def episode(self, row: int, length: int) -> tuple[np.ndarray, np.ndarray]:
-        frames = np.stack([frame[row] for frame in self._frames[: length + 1]])
-        return frames, np.stack([action[row] for action in self._actions[:length]])
-
-
-class _RawRecorder:
-    """Keeps what D3IL's recorder logs, and converts it as its files are converted."""
-
-    def __init__(self, converter: Converter):
-        self._converter = converter
-        self._logs: list[tuple[dict, dict]] = []
-
-    def add(self, env: Any, observation: np.ndarray, action: np.ndarray, following: np.ndarray) -> None:
-        self._logs.append((env.raw_log(), env.raw_objects()))
-
-    def episode(self, row: int, length: int) -> tuple[np.ndarray, np.ndarray]:
-        logs = self._logs[:length]
-        robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in self._converter.robot}
-        objects = {}
-        for name, own in zip(self._converter.objects, logs[0][1], strict=True):
-            poses = np.stack([poses[own][row] for _, poses in logs])
-            objects[name] = {"pos": poses[:, :3], "quat": poses[:, 3:]}
-        return self._converter.convert(RawEpisode(robot=robot, objects=objects))
+def _converted(converter: Converter, logs: Sequence[tuple[dict, dict]], row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frames and actions of an episode from what D3IL's recorder logs, as its files are converted."""
+    robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in converter.robot}
+    objects = {}
+    for name, own in zip(converter.objects, logs[0][1], strict=True):
+        poses = np.stack([poses[own][row] for _, poses in logs])
+        objects[name] = {"pos": poses[:, :3], "quat": poses[:, 3:]}
+    return converter.convert(RawEpisode(robot=robot, objects=objects))

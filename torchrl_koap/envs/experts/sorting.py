@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
+from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 from torchrl_koap.envs.experts.sorting_decision import decide, pushing_cost
-from torchrl_koap.envs.sorting import box_colours, mode_colours
-from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X
+from torchrl_koap.envs.sorting import box_colours
+from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X, arrival_orders, sorting_task
 
 ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
 _HORIZON = 700  # control steps for which the hand's noise is drawn
@@ -39,23 +39,19 @@ _LATENCY = 2.0  # control steps from what is seen to when an action begins to sh
 
 
 class SortingExpert(Expert):
-    """Scripted expert of Sorting for a batch of episodes, one mode and one seed each.
+    """Scripted expert of Sorting; modes are orders of colours, see :func:`~torchrl_koap.envs.sorting.mode_index`.
 
-    Args:
-        modes (sequence of int): orders of colours, see :func:`~torchrl_koap.envs.sorting.mode_index`; contexts and
-            seeds as :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
-
-    Raises:
-        ValueError: if a mode does not exist or the numbers of modes, contexts and seeds differ.
+    It has finished when it has had nothing left to do for a few control steps.
     """
 
-    rules = RecordingRules(most_rows=699)
+    most_rows = 699
 
-    def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
-        num_boxes = np.shape(contexts)[1] if np.ndim(contexts) == 3 else 2
-        check_episodes(modes, seeds, contexts, num_boxes)
+    def __init__(self, modes: Sequence[int], contexts: np.ndarray, seeds: Sequence):
+        num_boxes = np.shape(contexts)[1]
+        self.TASK = sorting_task(num_boxes).name
+        super().__init__(modes, contexts, seeds)
         self._colours = box_colours(num_boxes)
-        self._orders = np.array([mode_colours(mode, num_boxes) for mode in modes])
+        self._orders = np.array(arrival_orders(num_boxes))[list(modes)]
         drawn = [_draw(np.random.default_rng(seed), num_boxes) for seed in seeds]
         self._habits = SimpleNamespace(**{name: np.stack([each[name] for each in drawn]) for name in drawn[0]})
         count = len(modes)
@@ -70,14 +66,9 @@ class SortingExpert(Expert):
         self._speed = np.zeros((count, 2))  # that it has
         self._seen = None
 
-    @property
-    def finished(self) -> np.ndarray:
-        """Which players have had nothing left to do for a few control steps, bool [n]."""
-        return self._rest > _LINGER
-
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Decides changes of the commanded xy [n, 2] (m) under observations [n, 4 + 3 num_boxes], which hold no NaN."""
-        observation = self._checked(observation, 4 + 3 * len(self._colours))
+        observation = self._checked(observation)
         if np.isnan(observation).any():
             raise ValueError(f"observation must not hold NaN, row {int(np.isnan(observation).any(1).argmax())} does")
         boxes = observation[:, 4:].reshape(len(observation), -1, 3)
@@ -103,6 +94,7 @@ class SortingExpert(Expert):
         self._lost |= beside & ~self._arrived
         done = self._arrived.all(1) | self._lost.any(1)
         self._rest = np.where(done, self._rest + 1, 0)
+        self.finished = self._rest > _LINGER
 
     def _play(self, row: int, observation: np.ndarray, boxes: np.ndarray) -> tuple[float, float]:
         present = ~self._arrived[row] & ~self._lost[row]

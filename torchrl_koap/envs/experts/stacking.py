@@ -17,16 +17,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from torchrl_koap.envs.experts.recording import Expert, RecordingRules, ar1_noise, check_episodes
+from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
-from torchrl_koap.tasks import get_task
+from torchrl_koap.envs.stacking import ORDERS
 from torchrl_koap.tasks.stacking import BOXES, TARGET
 
-ORDERS = tuple(itertools.permutations(range(3)))
 GRIPPER_OPEN, GRIPPER_CLOSED = 0.08, 0.06  # gripper commands: the distances of the fingers that will result (m)
 HALF_SIZES = np.array([size[:2] for _, size in BOXES])
 BOX_HEIGHT = 0.06
@@ -41,41 +40,26 @@ _FINGER_AT, _FINGER_HALF = 0.051, (0.015, 0.011)  # an open finger: distance fro
 _CLEAR = 0.003  # room that a finger needs beside it (m)
 _PUSHED = 0.012  # m between the command and what this person commanded, more than inverse kinematics leave
 _HORIZON = 1500  # control steps for which the wobble of the hand is drawn
-_REACH, _GRASP, _CARRY, _RELEASE, _RETREAT = range(5)
 
 
 class StackingExpert(Expert):
-    """Scripted expert of Stacking for a batch of episodes, one order and one seed each.
+    """Scripted expert of Stacking; modes are orders of the boxes, see :func:`~torchrl_koap.envs.stacking.mode_index`.
 
-    Args:
-        modes (sequence of int): orders of the boxes, 0 to 5, see :func:`~torchrl_koap.envs.stacking.mode_index`;
-            contexts and seeds as :class:`~torchrl_koap.envs.experts.recording.Expert` has them.
-
-    Raises:
-        ValueError: if a mode does not exist or the numbers of modes, contexts and seeds differ.
+    It has finished when it has let go of the third box and drawn back.
     """
 
-    rules = RecordingRules(most_rows=999)
+    TASK, most_rows = "stacking", 999
 
-    def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
-        check_episodes(modes, seeds, contexts, 3)
-        for mode in modes:
-            if mode not in range(6):
-                raise ValueError(f"mode must be 0 to 5, got {mode}")
+    def __init__(self, modes: Sequence[int], contexts: np.ndarray, seeds: Sequence):
+        super().__init__(modes, contexts, seeds)
         self._people = [
             _Person(ORDERS[mode], np.random.default_rng(seed)) for mode, seed in zip(modes, seeds, strict=True)
         ]
-        self._parts = get_task("stacking").observation
-
-    @property
-    def finished(self) -> np.ndarray:
-        """Who has let go of the third box and drawn back, bool [n]."""
-        return np.array([person.finished for person in self._people])
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step: change of the commanded joints (rad) and gripper command (m) [n, 8]."""
-        observation = self._checked(observation, 31)
-        seen = {name: observation[:, columns] for name, columns in self._parts.items()}
+        """Decides changes of the commanded joints (rad) and gripper commands (m) [n, 8] under observations [n, 31]."""
+        observation = self._checked(observation)
+        seen = {name: observation[:, columns] for name, columns in self.task.observation.items()}
         commanded = seen["desired_joints_and_gripper"][:, :7]
         _, turned = tcp_pose(seen["measured_joints"])
         start, _ = tcp_pose(commanded)
@@ -93,6 +77,7 @@ class StackingExpert(Expert):
             gripper[i] = person.decide(tcp, math.remainder(yaw, 2 * math.pi), width, boxes[i])
             half = person.yaw / 2
             poses[i] = (*person.position, 0.0, math.cos(half), math.sin(half), 0.0)
+        self.finished[:] = [person.finished for person in self._people]
         return np.concatenate([follow_pose(commanded, poses) - commanded, gripper], axis=1)
 
 
@@ -111,17 +96,16 @@ class _Person:
         self._velocity, self._spin = np.zeros(3), 0.0
         self._time, self._placed, self._grip_width = 0, 0, 0.0
         self._speed, self._seen = 0.0, np.zeros(3)
-        self._enter(_REACH)
+        self._enter(self._reach)
 
     def decide(self, tcp: np.ndarray, yaw: float, width: float, boxes: np.ndarray) -> float:
         """Moves the command by one control step, given what is seen; returns the gripper command."""
         self._time += 1
         self._since += 1
         self._speed, self._seen = np.linalg.norm(tcp - self._seen), tcp.copy()
-        stage = (self._reach, self._close, self._carry, self._open, self._retreat)[self._stage]
-        return stage(tcp, yaw, width, boxes)
+        return self._stage(tcp, yaw, width, boxes)
 
-    def _enter(self, stage: int) -> None:
+    def _enter(self, stage: Callable[..., float]) -> None:
         self._stage, self._since, self._down = stage, 0, False
 
     def _reach(self, tcp, yaw, width, boxes) -> float:
@@ -142,7 +126,7 @@ class _Person:
         self._move(goal, max(height, self._above_stack(tcp)), turn, tcp)
         there = error < 0.007 and tilt < 0.05 and abs(tcp[2] - low) < 0.008
         if (there and width > 0.07 and self._since > 8) or (tcp[2] - low < 0.03 and self._since > 250):
-            self._enter(_GRASP)
+            self._enter(self._close)
         return GRIPPER_OPEN
 
     def _close(self, tcp, yaw, width, boxes) -> float:
@@ -151,9 +135,9 @@ class _Person:
         if self._since > wait and (abs(width - self._grip_width) < 0.0005 or self._since > 25):
             if width < 0.05:
                 self._grasp = None
-                self._enter(_REACH)
+                self._enter(self._reach)
             else:
-                self._enter(_CARRY)
+                self._enter(self._carry)
         self._grip_width = width
         return GRIPPER_CLOSED
 
@@ -163,7 +147,7 @@ class _Person:
         offset = tcp - box[:3]
         if np.linalg.norm(offset) > 0.05 or width < 0.05:  # lost
             self._grasp = None
-            self._enter(_REACH)
+            self._enter(self._reach)
             return GRIPPER_OPEN
         goal, height = self._place(boxes)
         error, tilt = np.linalg.norm(goal - box[:2]), abs(yaw)
@@ -173,7 +157,7 @@ class _Person:
         self._move(goal + offset[:2], near if error < 0.06 else far, 0.0, tcp)
         down = box[2] < height + 0.003 and abs(self.position[2] - low) < 0.004
         if down and error < 0.009 and tilt < 0.06 and self._speed < 0.001:
-            self._enter(_RELEASE)
+            self._enter(self._open)
         return GRIPPER_CLOSED
 
     def _open(self, tcp, yaw, width, boxes) -> float:
@@ -182,7 +166,7 @@ class _Person:
         if self._since > wait and width > 0.077:
             self._placed += 1
             self._grasp = None
-            self._enter(_RETREAT if self._placed == 3 else _REACH)
+            self._enter(self._retreat if self._placed == 3 else self._reach)
         return GRIPPER_OPEN
 
     def _retreat(self, tcp, yaw, width, boxes) -> float:
