@@ -83,11 +83,10 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
 
 
 def check_contexts(task: Task, contexts) -> np.ndarray:
-    """Returns contexts as a float64 array, or an error that names what is wrong with them.
+    """Returns contexts ``[C, objects, 3]`` in float64.
 
     Raises:
-        ValueError: if the task has none, the shape is not ``[C, objects, 3]``, or an object lies where the task never
-            puts it.
+        ValueError: if the task has none, the shape is another, or an object lies where the task never puts it.
     """
     scene, contexts = _scene(task), np.asarray(contexts, dtype=np.float64)
     if contexts.ndim != 3 or contexts.shape[1:] != (len(task.objects), 3) or not len(contexts):

@@ -49,13 +49,8 @@ class EpisodeState(abc.ABC):
     def set_physics(self, index: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
         """Starts a fresh episode of one environment from a given physics state; its context stays.
 
-        Args:
-            index (int): which environment.
-            qpos (array): positions [nq] (m, rad).
-            qvel (array, optional): velocities [nv]; zero if not given.
-            qacc_warmstart (array, optional): warm start of the solver [nv].
-            ctrl (array, optional): motor commands of the substep before [nu].
-            time (float): clock (s).
+        Positions [nq] (m, rad), velocities [nv] (default: zero), the solver's warm start [nv], motor commands of the
+        substep before [nu], and the clock (s).
 
         Raises:
             ValueError: if a size is wrong.

@@ -38,8 +38,7 @@ class ManipulationGymEnv(gymnasium.Env):
         task (str): name of the task.
         render_mode (str, optional): ``"rgb_array"`` or None.
         max_steps (int, optional): control steps after which an episode is truncated. Default: that of the task.
-        width (int): width of pictures in pixels.
-        height (int): height of pictures in pixels.
+        width (int): and ``height``, of pictures in pixels.
         camera (str): camera of pictures, see :meth:`~torchrl_koap.envs.base.ManipulationEnv.render`.
 
     Raises:
@@ -131,13 +130,7 @@ class ManipulationGymEnv(gymnasium.Env):
 
 
 def register(env_id: str, task: str) -> None:
-    """Registers a task with Gymnasium, unless the id is taken.
-
-    Args:
-        env_id (str): name with Gymnasium, such as ``"torchrl_koap/Avoiding-v0"``; the prefix
-            ``"torchrl_koap.envs:"`` has this package imported first.
-        task (str): name of the task.
-    """
+    """Registers a task with Gymnasium, as ``"torchrl_koap/Avoiding-v0"`` is, unless the id is taken."""
     if env_id not in gymnasium.registry:
         entry_point = f"{ManipulationGymEnv.__module__}:{ManipulationGymEnv.__name__}"
         gymnasium.register(env_id, entry_point=entry_point, kwargs={"task": task})

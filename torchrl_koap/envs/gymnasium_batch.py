@@ -27,16 +27,11 @@ from torchrl_koap.vision.observer import STATE, Observer
 
 @dataclass
 class EpisodeRecord:
-    """What happened in the episodes of all batches that were given it.
+    """What happened in the episodes of all batches that were given it."""
 
-    Args:
-        actions (int): steps that were played.
-        clipped (int): those whose action lay outside the environment's box and was clipped to it.
-        errors (list of dict): ``seed``, ``step`` and ``error`` of every episode in which the environment raised one.
-    """
-
-    actions: int = 0
-    clipped: int = 0
+    actions: int = 0  # steps that were played
+    clipped: int = 0  # those whose action lay outside the environment's box and was clipped to it
+    # ``seed``, ``step`` and ``error`` of every episode in which the environment raised one
     errors: list[dict[str, Any]] = field(default_factory=list)
 
     def faults(self) -> list[str]:

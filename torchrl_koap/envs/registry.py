@@ -62,9 +62,7 @@ def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
 def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
     """Returns a function from a number of parallel episodes to the task's environment as policies meet it.
 
-    Args:
-        task (Task): the task; with ``Task.noise`` the measured end effector is disturbed.
-        num_threads (int): threads that advance the physics.
+    With ``Task.noise`` the measured end effector is disturbed; ``num_threads`` advance the physics.
 
     Raises:
         ValueError: if the task has no environment.

@@ -51,19 +51,13 @@ class Action:
 
 @dataclass(frozen=True)
 class ActionRule:
-    """Turns decoded actions into those that the robot takes.
+    """Turns decoded actions into those that the robot takes."""
 
-    Args:
-        gripper (tuple of int, optional): action column and state column of a gripper whose command is read off the
-            widths (:func:`gripper_command`).
-        targets (sequence of int): for absolute actions the state column that each is the target of: the controller has
-            decoded the distance to it.
-        constants (mapping): what action columns always are, by number.
-    """
-
+    # action column and state column of a gripper whose command is read off the widths (:func:`gripper_command`)
     gripper: tuple[int, int] | None = None
+    # state columns that absolute actions are the targets of: the controller has decoded the distance to them
     targets: Sequence[int] = ()
-    constants: Mapping[int, float] = field(default_factory=dict)
+    constants: Mapping[int, float] = field(default_factory=dict)  # what action columns always are, by number
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
         """Returns the actions ``[*B, T, act]`` in states ``[*B, T, d]``."""
@@ -80,15 +74,7 @@ class ActionRule:
 
 
 def gripper_command(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:
-    """Computes gripper commands from a sequence of widths.
-
-    Args:
-        width (Tensor): ``[*B, T]`` (m).
-        open_above (float): widths above it count as open (m).
-
-    Returns:
-        Tensor: ``[*B, T - 1]`` (m), for all steps but the last: above 0.075 opens, anything else closes.
-    """
+    """Computes gripper commands ``[*B, T - 1]`` (m; above 0.075 opens) from widths ``[*B, T]`` (m), open above one."""
     now, following = width[..., :-1], width[..., 1:]
     padded = torch.cat([following, width[..., -1:].expand(*width.shape[:-1], OPENING - 1)], -1)
     soon = padded.unfold(-1, OPENING, 1).amax(-1)

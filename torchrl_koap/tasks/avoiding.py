@@ -35,11 +35,7 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def mode_of_path(path: np.ndarray) -> int:
-    """Returns the mode of a recorded path: on which side of its cylinders it passes each row.
-
-    Args:
-        path (np.ndarray): positions ``[T, 2]`` of the tool (m).
-    """
+    """Returns the mode of recorded positions ``[T, 2]`` of the tool (m): on which side it passes the cylinders."""
     mode = 0
     for y in ROW_Y:
         cylinders = [x for _, x, row, *_ in OBSTACLES if row == y]

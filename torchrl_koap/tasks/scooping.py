@@ -43,12 +43,7 @@ def start_of(context: np.ndarray) -> int:
 def scores(result: dict[str, Any], episodes: Sequence[TensorDictBase], *_: Any) -> dict[str, Any]:
     """Returns how often the spoon came over the bowl, and how often it left with a piece from each start position.
 
-    Args:
-        result (dict): the scores so far.
-        episodes (sequence of TensorDictBase): one trajectory ``[T_i]`` each.
-
-    Returns:
-        dict: ``rates``, by name a bool per rollout; a start position that no episode had is left out.
+    ``rates`` has by name a bool per rollout (a trajectory ``[T_i]`` each); starts that no episode had are left out.
     """
     last = [episode[-1]["next"] for episode in episodes]
     rates = {"spoon over the bowl": [bool(end["mode"][0]) for end in last]}

@@ -196,9 +196,7 @@ class Task(Columns):
     def moved_columns(self, *, or_robot: bool = False) -> tuple[int, ...]:
         """Returns the state column that each action moves; empty where one of them names none.
 
-        Args:
-            or_robot (bool): take the first columns of the robot instead, one for each change of a command, where the
-                actions name none.
+        With ``or_robot`` these are then the first columns of the robot, one for each change of a command.
         """
         columns = [action.column for action in self.actions.values() if action.column is not None]
         if len(columns) == self.action_dim and not self.targets:
@@ -251,11 +249,7 @@ class Task(Columns):
         return next(iter(self.state_parts.items())) == (self.position, "plain")
 
     def controller_columns(self, part: str) -> tuple[int, ...]:
-        """Returns the state columns that a controller reads.
-
-        Args:
-            part (str): ``"robot"``: the robot's own, whose motion the actions command; ``"all"``: the whole state, as
-                KOAP's configurations have it.
+        """Returns the state columns that a controller reads: ``"all"`` or the ``"robot"``'s, which actions command.
 
         Raises:
             ValueError: for another part.

@@ -90,10 +90,9 @@ def _residuals(pose, target, contact, plan, out):
 
 @njit(cache=True)
 def improve(pose, target, contact, plan, iterations):
-    """Betters a plan in place by so many damped Gauss-Newton steps.
+    """Betters a plan in place by so many damped Gauss-Newton steps, and returns its cost.
 
-    Returns:
-        float: cost of the plan: squared errors at its end (4 mm and 3 deg cost 1 each), slants, bends and length.
+    That is squared errors at its end (4 mm and 3 deg cost 1 each), slants, bends and length.
     """
     base, other = np.empty(_RESIDUALS), np.empty(_RESIDUALS)
     jacobian = np.empty((_RESIDUALS, PLAN_SIZE))
@@ -157,13 +156,8 @@ def search(pose, target, contact, plan):
 def two_pushes(pose, target, contacts, bounds, aim):
     """Looks for a first push after which a second one, from another contact, leads straight to the target.
 
-    Args:
-        contacts (np.ndarray): contacts to choose from [C, 8].
-        bounds (np.ndarray): least and greatest x, least and greatest y of the tray in between [4] (m).
-        aim (np.ndarray): the pose between the pushes is written here [3].
-
-    Returns:
-        tuple: least cost of both pushes, and the index of the first contact.
+    The pose between the pushes, within ``bounds`` [4] (least and greatest x, y; m), is written into ``aim`` [3].
+    Returned are the least cost of both pushes, and the index of the first of ``contacts`` [C, 8].
     """
     least, best = 1e300, 0
     plan = np.empty(PLAN_SIZE)

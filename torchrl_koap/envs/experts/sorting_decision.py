@@ -41,16 +41,13 @@ def square_distance(x, y, square, half):
 
 
 @njit(cache=True)
-def solve_eikonal(slowness, cost, sweeps=2):
-    """Solves for the cheapest cost to the sources, everywhere on the grid.
+def solve_eikonal(slowness, cost):
+    """Solves for the cheapest cost to the sources, everywhere on the grid [X, Y], in eight passes.
 
-    Args:
-        slowness (np.ndarray): cost per metre [X, Y], positive.
-        cost (np.ndarray): [X, Y]: cost at the sources, :data:`FAR` elsewhere; overwritten and returned.
-        sweeps (int): rounds of four passes.
+    ``cost`` holds that of the sources, :data:`FAR` elsewhere, and is overwritten and returned.
     """
     width, height = cost.shape
-    for sweep in range(4 * sweeps):
+    for sweep in range(8):
         for i_ in range(width):
             i = i_ if sweep % 2 == 0 else width - 1 - i_
             for j_ in range(height):
@@ -82,18 +79,13 @@ def value_at(field, x, y):
 
 
 @njit(cache=True)
-def descent(field, x, y, reach=0.016, softness=0.002):
-    """Finds the direction, a unit vector [2], in which a field is least at a distance from a point.
+def descent(field, x, y):
+    """Finds the direction, a unit vector [2], in which a field [X, Y] is least 16 mm from a point.
 
-    Values within about ``softness`` of the least one count too, which smooths the direction; a mere gradient would
-    shiver between the walls of narrow passages.
-
-    Args:
-        field (np.ndarray): values on the grid [X, Y].
-        x, y (float): the point (m).
-        reach (float): the distance (m).
-        softness (float): how much above the least one a value still counts, in the unit of the field.
+    Values within about 0.002 of the least one count too, which smooths the direction; a mere gradient would shiver
+    between the walls of narrow passages.
     """
+    reach, softness = 0.016, 0.002
     values = np.empty(32)
     for k in range(32):
         angle = 2 * np.pi * k / 32
@@ -224,37 +216,34 @@ def _choose_direction(box, yaw, to_go, way, slowness):
 
 
 @njit(cache=True)
+def _best_push(boxes, yaws, present, target, lane, rod):
+    """Costs of the rest of the box's way and of the rod's, its slowness; angle along which to push, and its cost."""
+    others = present.copy()
+    others[target] = False
+    to_go = _box_field(boxes, yaws, others, lane)
+    slowness = _rod_slowness(boxes, yaws, present, target)
+    way = _cost_from(slowness, rod[0], rod[1])
+    angle, cost = _choose_direction(boxes[target], yaws[target], to_go, way, slowness)
+    return to_go, way, slowness, angle, cost
+
+
+@njit(cache=True)
 def _wrapped(angle):
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 @njit(cache=True)
 def decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
-    """Decides on the step of the rod.
+    """Decides on the step of the rod in x and y (m), whether it pushes, and the direction (rad) in which.
 
-    Args:
-        boxes (np.ndarray): positions [B, 2] (m).
-        yaws (np.ndarray): their yaws [B] (rad).
-        present (np.ndarray): boxes that are on the platform, bool [B].
-        target (int): the box that is led to its bin.
-        lane (float): x (m) of the middle of that bin.
-        rod (np.ndarray): position of the rod [2] (m).
-        ahead (np.ndarray): where it will be when an action begins to show [2] (m).
-        pushing (bool): whether it pushed in the last control step.
-        held (float): direction (rad) in which it did, or NaN.
-
-    Returns:
-        tuple: step in x and y (m), whether it pushes, and the direction (rad) in which.
+    ``boxes`` [B, 2] are positions (m), ``yaws`` [B] theirs (rad); ``present`` [B] are on the platform, and ``target``
+    is led to its bin, whose middle lies at x = ``lane`` (m). The rod is at ``rod`` [2] (m), and ``ahead`` when an
+    action begins to show; whether it was ``pushing``, and the direction ``held`` (rad) or NaN, are the last step's.
     """
     boxes = boxes.copy()
     boxes[target] = _carried(boxes[target], yaws[target], rod, ahead)
     box, yaw = boxes[target], yaws[target]
-    others = present.copy()
-    others[target] = False
-    to_go = _box_field(boxes, yaws, others, lane)
-    slowness = _rod_slowness(boxes, yaws, present, target)
-    way = _cost_from(slowness, ahead[0], ahead[1])
-    angle, cost = _choose_direction(box, yaw, to_go, way, slowness)
+    to_go, way, slowness, angle, cost = _best_push(boxes, yaws, present, target, lane, ahead)
     change = 0.0 if np.isnan(held) else _wrapped(angle - held)
     if 0.0 < abs(change) <= 0.5:
         angle = held + 0.4 * change
@@ -286,14 +275,5 @@ def decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
 
 @njit(cache=True)
 def pushing_cost(boxes, yaws, present, target, lane, rod):
-    """Computes the cost (m of way) of leading a box to its bin, the rod's own way to it included.
-
-    Args:
-        boxes (np.ndarray): and the other arguments, see :func:`decide`.
-    """
-    others = present.copy()
-    others[target] = False
-    to_go = _box_field(boxes, yaws, others, lane)
-    slowness = _rod_slowness(boxes, yaws, present, target)
-    way = _cost_from(slowness, rod[0], rod[1])
-    return _choose_direction(boxes[target], yaws[target], to_go, way, slowness)[1]
+    """Computes the cost (m of way) of leading a box to its bin, the rod's own way to it included; as :func:`decide`."""
+    return _best_push(boxes, yaws, present, target, lane, rod)[4]

@@ -122,20 +122,11 @@ def _write_log(row, pointers, qpos, qvel, q_des, v_des, a_des, tcp, quat):
 def track_pose(step, model, data, pointers, rows, commands, widths, grasping, substeps, targets, speeds, started, log):
     """Tracks Cartesian commands for ``substeps`` physics steps in each of the simulations ``rows``.
 
-    Args:
-        step (int): address of ``mj_step``.
-        model (int): address of the shared mjModel.
-        data (np.ndarray): addresses of the mjData [n], int64.
-        pointers (np.ndarray): addresses of their arrays [n, 9], int64.
-        rows (np.ndarray): indices of the simulations to advance, int64.
-        commands (np.ndarray): TCP position (m) and quaternion [n, 7], float64.
-        widths (np.ndarray): finger targets [n] (m).
-        grasping (np.ndarray): whether the fingers press [n], bool.
-        substeps (int): physics steps per control step.
-        targets (np.ndarray): joint targets [n, 7], kept between calls.
-        speeds (np.ndarray): joint target velocities [n, 7], kept between calls.
-        started (np.ndarray): False where the controller has not run since the reset [n], bool.
-        log (np.ndarray): receives one row per simulation after the first substep [n, LOG_WIDTH + 7 free bodies].
+    ``step`` is the address of ``mj_step``, ``model`` that of the shared mjModel, ``data`` [n] are those of the mjData
+    and ``pointers`` [n, 9] those of their arrays. ``commands`` [n, 7] are TCP positions (m) and quaternions, ``widths``
+    [n] finger targets (m), ``grasping`` [n] says whether the fingers press. Kept between calls: joint ``targets`` and
+    their ``speeds`` [n, 7], and ``started`` [n], False where the controller has not run since the reset. The first
+    substep is written into ``log`` [n, LOG_WIDTH + 7 free bodies].
     """
     target, q, v, a = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
     for row in rows:
@@ -172,12 +163,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
 
 @njit(nogil=True, cache=True)
 def track_joints(step, model, data, pointers, rows, commands, widths, grasping, substeps, log):
-    """Holds joint targets for ``substeps`` physics steps in each of the simulations ``rows``.
-
-    Args:
-        step (int): and the other arguments, see :func:`track_pose`.
-        commands (np.ndarray): joint angles [n, 7] (rad), float64.
-    """
+    """Holds joints at ``commands`` [n, 7] (rad) for ``substeps`` physics steps; as :func:`track_pose` else."""
     zero = np.zeros(7)
     for row in rows:
         qpos, qvel = _array(pointers[row, QPOS], 9), _array(pointers[row, QVEL], 9)

@@ -51,15 +51,10 @@ def _rotate(axes, index, angle):
 
 @njit(cache=True)
 def forward_kinematics(q, axes, origins, tcp, quat):
-    """Computes the frames of the arm's joints and the pose of the TCP, in the frame of its base.
+    """Computes the frames of the arm's joints ``q`` [7] (rad) and the pose of the TCP, in the frame of its base.
 
-    Args:
-        q (np.ndarray): joint angles [7] (rad).
-        axes (np.ndarray): receives the axes x, y, z of the joints' frames in rows 1-7 [8, 3, 3]; row 0 ends as the
-            hand's.
-        origins (np.ndarray): receives their origins [8, 3] (m).
-        tcp (np.ndarray): receives the position of the TCP [3] (m).
-        quat (np.ndarray): receives its quaternion [4] (w, x, y, z).
+    Written are the axes x, y, z of the joints' frames into rows 1-7 of ``axes`` [8, 3, 3] (row 0 ends as the hand's),
+    their ``origins`` [8, 3] (m), the TCP's position ``tcp`` [3] (m) and its quaternion ``quat`` [4] (w, x, y, z).
     """
     for i in range(3):
         for k in range(3):
@@ -195,12 +190,7 @@ def solve_clipped(matrix, rhs):
 
 @njit(cache=True)
 def inverse_kinematics(target, q):
-    """Moves joint angles in place, by three damped steps, towards a pose of the TCP.
-
-    Args:
-        target (np.ndarray): position (m) and unit quaternion (w, x, y, z) [7].
-        q (np.ndarray): joint angles [7] (rad), overwritten.
-    """
+    """Moves joint angles ``q`` [7] (rad) in place, by three damped steps, towards a TCP pose [7] (m, quaternion)."""
     axes, origins, tcp, quat = np.empty((8, 3, 3)), np.empty((8, 3)), np.empty(3), np.empty(4)
     jacobian, matrix, task, null = np.empty((6, 7)), np.empty((6, 6)), np.empty(6), np.empty(7)
     for _ in range(IK_ITERATIONS):
@@ -260,7 +250,7 @@ def _follow(joints, poses, iterations):
 
 def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Computes positions [n, 3] (m) and quaternions [n, 4] (w, x, y, z) of the TCP for joint angles [n, 7] (rad)."""
-    joints = _rows(joints, "joints")
+    joints = np.ascontiguousarray(joints, dtype=np.float64)
     positions, quaternions = np.empty((len(joints), 3)), np.empty((len(joints), 4))
     _poses(joints, positions, quaternions)
     return positions, quaternions
@@ -270,25 +260,9 @@ def follow_pose(joints: np.ndarray, poses: np.ndarray, substeps: int = 30) -> np
     """Computes the joint targets [n, 7] that the controller reaches when it tracks poses for one control step.
 
     D3IL's Stacking data were recorded so: a person commanded poses, policies learn the joint targets that followed.
-
-    Args:
-        joints (np.ndarray): present joint targets [n, 7] (rad).
-        poses (np.ndarray): wanted TCP position (m) and unit quaternion [n, 7]. In 30 ms positions some centimetres
-            away are reached, and turns for about three quarters.
-        substeps (int): milliseconds of tracking.
-
-    Raises:
-        ValueError: if a shape is wrong.
+    ``joints`` are the present targets [n, 7] (rad), ``poses`` TCP positions (m) and unit quaternions [n, 7]. In
+    ``substeps`` of 30 ms positions some centimetres away are reached, and turns for about three quarters.
     """
-    joints, poses = _rows(joints, "joints").copy(), _rows(poses, "poses")
-    if len(joints) != len(poses):
-        raise ValueError(f"as many poses as rows of joints are needed, got {len(poses)} and {len(joints)}")
-    _follow(joints, poses, substeps)
+    joints = np.array(joints, dtype=np.float64)
+    _follow(joints, np.ascontiguousarray(poses, dtype=np.float64), substeps)
     return joints
-
-
-def _rows(array, name: str) -> np.ndarray:
-    array = np.ascontiguousarray(array, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 7:
-        raise ValueError(f"{name} must be [n, 7], got shape {list(array.shape)}")
-    return array

@@ -30,7 +30,6 @@ else:
 TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
 FLANGE_OFFSET = 0.107  # link8 along the z axis of link7
 HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z
-REST_POSTURE = (0.0, 0.17453, 0.0, -0.87266, 0.0, 1.22173, 0.78540)
 
 _TURN = 0.5**0.5
 _TURNS = ((1.0, 0.0, 0.0, 0.0), (_TURN, _TURN, 0.0, 0.0), (_TURN, -_TURN, 0.0, 0.0))  # about x: none, +90, -90 deg
@@ -92,11 +91,8 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
     ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ... ``link8``, ``hand``, ``tcp``,
     geom ``rod``, camera ``wrist``.
 
-    Args:
-        rod (bool): the hand holds a rod (Avoiding, Aligning, Sorting) or nothing (Stacking).
-        link_collisions (bool): the convex hulls of links 0-7 collide with objects and table too. The original lets
-            them collide with each other as well, which joint limits and tasks keep them from; testing takes time.
-        alpha (float): opacity of the arm when drawn.
+    With ``link_collisions`` the convex hulls of links 0-7 collide with objects and table too. The original lets them
+    collide with each other as well, which joint limits and tasks keep them from; testing takes time.
 
     Raises:
         ImportError: if ``gymnasium-robotics``, which holds the meshes, is not installed.

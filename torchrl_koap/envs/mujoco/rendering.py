@@ -72,11 +72,7 @@ def open_context(names: Sequence[str], model: mujoco.MjModel, width: int, height
 
 
 def try_backends() -> dict[str, str]:
-    """Draws with every back end of this system in a process of its own, which a driver may end.
-
-    Returns:
-        dict: by name what went wrong, nothing where it can be used.
-    """
+    """Draws with every back end of this system in a process of its own; by name what went wrong, "" where nothing."""
     known = {"darwin": ("cgl", "glfw"), "linux": ("egl", "osmesa", "glfw")}.get(sys.platform, ("glfw",))
     return {name: _try(name) for name in known}
 
@@ -94,13 +90,7 @@ def _try(name: str) -> str:
 
 
 class Renderer:
-    """Draws simulations of one model into arrays.
-
-    Args:
-        model (mujoco.MjModel): the scene.
-        width (int): width of the pictures in pixels.
-        height (int): height of the pictures in pixels.
-        shadows (bool): draw shadows; without them software rendering takes half the time.
+    """Draws simulations of one model into arrays [height, width, 3]; without ``shadows`` software takes half the time.
 
     Raises:
         RuntimeError: if no OpenGL library can be used; the message says what to install.
@@ -122,11 +112,7 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
 
     def render(self, data: mujoco.MjData, camera: str = "cage") -> np.ndarray:
-        """Draws one simulation, uint8 [height, width, 3].
-
-        Args:
-            data (mujoco.MjData): its state.
-            camera (str): name of a camera of the scene; the prefix of the arm may be left out.
+        """Draws one simulation, uint8 [height, width, 3], by a camera of the scene; the arm's prefix may be left out.
 
         Raises:
             ValueError: if the scene has no such camera.

@@ -28,17 +28,9 @@ def scene(
 ):
     """Builds the common scene with the arm attached at the origin; tasks add what stands still to the result.
 
-    World: x forward, y left, z up, robot base at the origin; the table top lies at z = -0.019 m.
-
-    Args:
-        rod (bool): the hand holds a rod.
-        arm_alpha (float): opacity of the arm when drawn.
-        link_collisions (bool): links 0-7 collide too, see :func:`~torchrl_koap.envs.mujoco.panda.panda`.
-        add_objects (callable, optional): adds the free bodies of the task; called before the arm is attached, so that
-            they come first in the state vector.
-
-    Returns:
-        mjcf.RootElement: the scene.
+    World: x forward, y left, z up, robot base at the origin; the table top lies at z = -0.019 m. ``add_objects`` adds
+    the free bodies of the task, before the arm is attached, so that they come first in the state vector. The rest is
+    the arm's, see :func:`~torchrl_koap.envs.mujoco.panda.panda`.
     """
     root = mjcf.RootElement(model="d3il")
     root.compiler.angle = "radian"

@@ -19,14 +19,9 @@ _PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class Simulations:
-    """Simulations that share a model and are advanced together, in one or several threads.
+    """Simulations that share a model and are advanced together, in one or several threads (one: the caller's).
 
     The result for one simulation depends neither on the others nor on the number of threads.
-
-    Args:
-        model (mujoco.MjModel): the compiled scene.
-        num_sims (int): number of simulations.
-        num_threads (int): number of threads that advance them; 1 stays in the caller's thread.
     """
 
     _episode: dict[str, np.ndarray]  # what decides the future beside the physics, a row per simulation
@@ -85,12 +80,7 @@ class Simulations:
 
 
 class SimulationBatch(Simulations):
-    """Simulations of D3IL's arm under its controller.
-
-    Args:
-        model (mujoco.MjModel): a scene that holds the arm, see :func:`~torchrl_koap.envs.mujoco.scene.scene`.
-        num_sims (int): and ``num_threads``, see :class:`Simulations`.
-    """
+    """Simulations of D3IL's arm under its controller, in a :func:`~torchrl_koap.envs.mujoco.scene.scene`."""
 
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
         super().__init__(model, num_sims, num_threads)
@@ -154,11 +144,8 @@ class SimulationBatch(Simulations):
     ) -> None:
         """Puts simulations into their start state (docs/appendix/d3il.md, Reset), one substep included.
 
-        Args:
-            rows (np.ndarray): indices of the simulations.
-            start_joints (np.ndarray): arm joints [7] (rad).
-            object_poses (np.ndarray, optional): poses of the free bodies [len(rows), objects, 7].
-            width (float): finger target (m) during that substep.
+        The arm gets ``start_joints`` [7] (rad), the free bodies ``object_poses`` [len(rows), objects, 7], the fingers
+        the target ``width`` (m) during that substep.
         """
         commands = np.zeros((len(self), 7))
         for index, row in enumerate(rows):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,8 +49,8 @@ class ScoopingEnv(ManipulationEnv):
 
     Keyword Args:
         task (str): ``"scooping"``, or ``"scooping_moving_bowl"``, whose bowl stands somewhere else in every episode.
-        encoder (FrozenImageEncoder, str or Path, optional): what embeds the frames, or the file of its projection.
-            Default: EfficientNet-Lite0 and the projection of the task that comes with the package.
+        encoder (FrozenImageEncoder, optional): what embeds the frames. Default: EfficientNet-Lite0 and the projection
+            of the task that comes with the package.
         embed (bool): embed the frames. Without, the embedding is zero and neither OpenGL nor weights are needed.
         pixels (bool): hand the frames out too.
 
@@ -73,17 +72,14 @@ class ScoopingEnv(ManipulationEnv):
         self,
         *args: Any,
         task: str = "scooping",
-        encoder: FrozenImageEncoder | str | Path | None = None,
+        encoder: FrozenImageEncoder | None = None,
         embed: bool = True,
         pixels: bool = False,
         **options: Any,
     ):
         self._arm = SpoonKinematics()
-        chosen = None
-        if embed:
-            chosen = (
-                encoder if isinstance(encoder, FrozenImageEncoder) else load_encoder(encoder or projection_of(task))
-            )
+        chosen = (encoder or load_encoder(projection_of(task))) if embed else None
+        if chosen is not None:
             dim = 0 if chosen.projection is None else chosen.projection.dim
             if dim != EMBEDDING_DIM:
                 raise ValueError(f"the encoder's projection must have {EMBEDDING_DIM} components, got {dim}")
@@ -106,14 +102,10 @@ class ScoopingEnv(ManipulationEnv):
     def _simulations(self, num_envs: int, num_threads: int) -> ScoopingSimulations:
         return ScoopingSimulations("robot", num_envs, num_threads)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
-        rows = self._rows(tensordict, "_reset")
-        self._draw_contexts(rows, contexts)
+    def _start(self, rows: np.ndarray) -> None:
         joints = np.stack([start_joints(context, "robot", self._arm) for context in self._contexts[rows]])
         bowls = self._contexts[rows, 1, :2] if self._bowl_moves else None
         self.sims.reset(rows, joints, self._contexts[rows, 0, 2], bowls)
-        self._begin_episode(rows)
-        return self._leaves()
 
     def _begin(self, rows: np.ndarray) -> None:
         self._commands[rows] = self.sims.commands[rows]

@@ -78,13 +78,9 @@ class SpoonKinematics:
     def solve(
         self, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray | None = None, iterations: int = 40
     ) -> np.ndarray:
-        """Finds joints ``[7]`` (rad) at which the spoon has a pose.
+        """Finds joints ``[7]`` (rad) at which the spoon has a position ``[3]`` (m) and its axes a rotation ``[3, 3]``.
 
-        Args:
-            position (np.ndarray): of the spoon ``[3]`` (m).
-            rotation (np.ndarray): its axes in columns ``[3, 3]``.
-            joints (np.ndarray, optional): where to begin ``[7]``. Default: the rest pose.
-            iterations (int): steps at most.
+        It begins with ``joints``, by default the rest pose, and takes so many steps at most.
         """
         joints = (REST if joints is None else joints).copy()
         for _ in range(iterations):
@@ -103,14 +99,7 @@ class SpoonKinematics:
 
 
 class ScoopingExpert:
-    """The scooper of one episode.
-
-    Args:
-        sims (ScoopingSimulations): where it acts; it sees the pieces and its spoon there.
-        row (int): which simulation.
-        start (int): number of the start position.
-        seed (int or sequence): of its variation.
-    """
+    """The scooper of one episode; it acts, and sees the pieces and its spoon, in simulation ``row`` of a batch."""
 
     embodiments = tuple(HABITS)
 

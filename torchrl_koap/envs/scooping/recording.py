@@ -49,10 +49,8 @@ class VideoReport:
 def _play_episodes(embodiment: str, episodes: int, seed: int, task: str) -> Iterator[tuple[FilmedEpisode, int, int]]:
     """Plays demonstrations in their order; one that does not succeed is played again, from another place.
 
-    They begin at the start positions in turn, so that the first few of them have seen them all.
-
-    Yields:
-        tuple: the demonstration, how often it was played, and how often the spoon went into the bowl.
+    They begin at the start positions in turn, so that the first few of them have seen them all. Also told: how often
+    each was played, and how often the spoon went into the bowl.
     """
     sims, arm = ScoopingSimulations(embodiment, 1), SpoonKinematics()
     renderer = Renderer(sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)
@@ -117,15 +115,9 @@ def record_videos(
     *,
     task: Task | str = "scooping",
 ) -> VideoReport:
-    """Records demonstrations as a LeRobot data set with pictures.
+    """Records demonstrations of a ``"robot"``, or of a ``"hand"`` without actions, as a LeRobot data set with pictures.
 
-    Args:
-        folder (str or Path): folder to write.
-        embodiment (str): ``"robot"`` (with the joint targets as actions) or ``"hand"`` (frames alone).
-        episodes (int): number of demonstrations.
-        seed (int): of starts and players; the two embodiments never share a start.
-        progress (callable, optional): called with the number of demonstrations recorded and wanted.
-        task (Task or str): ``"scooping"`` or ``"scooping_moving_bowl"``.
+    The two never share a start. ``progress`` is called with the number of demonstrations recorded and wanted.
 
     Raises:
         FileExistsError: if the folder is not empty.

@@ -13,7 +13,7 @@ import mujoco
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks.panda_kinematics import LINKS
-from torchrl_koap.tasks.scooping import BOWL, BOWL_RADIUS, EMBODIMENTS, NUM_PIECES, PIECE_RADIUS, RIM_HEIGHT, RIM_RADIUS
+from torchrl_koap.tasks.scooping import BOWL, BOWL_RADIUS, NUM_PIECES, PIECE_RADIUS, RIM_HEIGHT, RIM_RADIUS
 
 TIMESTEP = 1 / 180
 SPOON_HALF = (0.025, 0.023)  # half its length and width inside (m)
@@ -24,24 +24,14 @@ _SKIN, _SLEEVE, _STEEL = "0.85 0.6 0.48 1", "0.2 0.35 0.6 1", "0.2 0.55 0.85 1"
 
 
 def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.MjModel:
-    """Compiles the scene.
+    """Compiles the scene of a ``"robot"``, a Panda of seven actuated joints, or a ``"hand"``, which moves freely.
 
-    Args:
-        embodiment (str): ``"robot"``, a Panda of seven actuated joints, or ``"hand"``, which moves freely.
-
-    Keyword Args:
-        pieces (bool): put pieces into the bowl.
-
-    Returns:
-        mujoco.MjModel: the pieces' free joints come first, then the joints of what holds the spoon; the bowl is its
-        only mocap body.
+    The pieces' free joints come first, then those of what holds the spoon; the bowl is the only mocap body.
 
     Raises:
         ValueError: for another embodiment.
     """
-    holder, actuators = lookup({"robot": (_arm, 7), "hand": (_hand, 6)}, embodiment, "embodiment")
-    assert embodiment in EMBODIMENTS
-    kinds = _ARM_SERVO if actuators == 7 else _HAND_SERVO
+    holder, kinds = lookup({"robot": (_arm, _ARM_SERVO), "hand": (_hand, _HAND_SERVO)}, embodiment, "embodiment")
     motors = "".join(f'<position name="a{i}" joint="j{i}" kp="{kp}" kv="{kv}"/>' for i, (kp, kv) in enumerate(kinds, 1))
     xml = f"""
 <mujoco model="scooping">
@@ -91,7 +81,8 @@ def _view(eye, target) -> str:
     return " ".join(f"{v:.6f}" for v in (*x, *y))
 
 
-def _bowl(sides: int = 16) -> str:
+def _bowl() -> str:
+    sides = 16
     rise, run = RIM_HEIGHT, RIM_RADIUS - BOWL_RADIUS
     slope, half = math.atan2(run, rise), math.hypot(rise, run) / 2
     middle, width = (RIM_RADIUS + BOWL_RADIUS) / 2 + 0.002, RIM_RADIUS * math.tan(math.pi / sides) + 0.001

@@ -22,12 +22,7 @@ _LAYOUTS, _SIDES = 6, 16  # settled layouts of the pieces; turns by which they c
 
 
 class ScoopingSimulations(Simulations):
-    """Simulations of one embodiment.
-
-    Args:
-        embodiment (str): ``"robot"`` or ``"hand"``.
-        num_sims (int): and ``num_threads``, see :class:`~torchrl_koap.envs.mujoco.simulation.Simulations`.
-    """
+    """Simulations of one embodiment, ``"robot"`` or ``"hand"``."""
 
     def __init__(self, embodiment: str, num_sims: int, num_threads: int = 1):
         super().__init__(scooping_model(embodiment), num_sims, num_threads)
@@ -69,13 +64,10 @@ class ScoopingSimulations(Simulations):
         return int((inside & (local[:, 2] > 0) & (local[:, 2] < 4 * PIECE_RADIUS)).sum())
 
     def reset(self, rows: np.ndarray, joints: np.ndarray, turns, bowls: np.ndarray | None = None) -> None:
-        """Starts episodes.
+        """Starts episodes with ``joints [len(rows), nu]`` (rad; the hand's first three in m).
 
-        Args:
-            rows (np.ndarray): indices of the simulations.
-            joints (np.ndarray): joints ``[len(rows), nu]`` (rad; the hand's first three in m).
-            turns (sequence of float): number in -pi to pi for each of them that decides where the pieces lie.
-            bowls (np.ndarray, optional): where the bowls stand ``[len(rows), 2]`` (m). Default: all in the same place.
+        ``turns``, a number in -pi to pi each, decide where the pieces lie. ``bowls [len(rows), 2]`` say where the bowls
+        stand (m), by default all in the same place.
         """
         bank = settled_layouts()
         places = np.tile(BOWL, (len(rows), 1)) if bowls is None else bowls
