@@ -19,7 +19,7 @@ from env_test_base import (
 )
 
 from torchrl_koap.envs import AligningEnv
-from torchrl_koap.envs.aligning import INSIDE_REACH, WALLS, mode_index
+from torchrl_koap.envs.aligning import INSIDE_REACH, mode_index
 from torchrl_koap.envs.contexts import yaw_quaternions
 
 SENSITIVE = 1  # the recorded episode in which a start error of 1e-8 rad grows to millimetres
@@ -98,24 +98,6 @@ def test_tray_comes_to_rest_on_the_table():
     np.testing.assert_allclose(tray.inertia, [0.00168003, 0.00088542, 0.00088542], rtol=1e-5)
 
 
-def test_rod_pushes_the_tray_from_inside():
-    env = AligningEnv(1, dtype=torch.float64)
-    env.reset(contexts=np.array([[(0.525, -0.15, 0.0), (0.525, 0.3, 0.0)]]))
-    ways = ((0.0, 0.199), (0.0, 0.0, -0.1), (0.0, 0.15))  # over the tray, down into it, against its far wall
-    for way in ways:
-        way = torch.tensor([*way, 0.0][:3], dtype=torch.float64)
-        steps = max(1, round(float(way.abs().max()) / 0.008))
-        for _ in range(steps):
-            out = act(env, way / steps)
-        for _ in range(6):
-            out = act(env, torch.zeros(3))
-    assert mode_index(out["mode"]).tolist() == [0]
-    tray = out["observation"][0, 6:9].numpy()
-    # the wall's inner side is 45 mm from the centre, the rod's radius is 10 mm
-    assert tray[1] == pytest.approx(float(out["observation"][0, 4]) - 0.035, abs=0.004)
-    assert tray[1] > -0.06 and abs(tray[0] - 0.525) < 0.01
-
-
 @pytest.mark.parametrize(
     ("shift", "turn", "wanted"),
     [
@@ -180,12 +162,3 @@ def test_target_is_drawn_at_its_place_from_the_first_picture_on():
                 np.testing.assert_allclose(position, [x, y, 0.0], atol=1e-12, err_msg=moment)
                 np.testing.assert_allclose(axis, [math.cos(yaw), math.sin(yaw)], atol=1e-12, err_msg=moment)
             act(env, DOWN)
-
-
-def test_target_cannot_be_touched():
-    model = AligningEnv(1).sims.model
-    assert model.body("target").geomnum[0] == 0 and model.body("target").mocapid[0] == 0
-    for name, (x, y), _ in WALLS:
-        np.testing.assert_allclose(model.geom(name).pos, [0.05 * x, 0.05 * y, 0.0485])
-        np.testing.assert_array_equal(model.site(f"target_{name}").pos, model.geom(name).pos)
-        np.testing.assert_array_equal(model.site(f"target_{name}").size, model.geom(name).size)

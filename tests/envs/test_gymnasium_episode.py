@@ -36,30 +36,11 @@ def test_rounding_of_float32_is_no_clipping():
     assert float(PUSH[0]) > 0.1 and not env.step(PUSH)[-1]["clipped"]
 
 
-def test_an_episode_that_is_over_waits():
-    env = GymnasiumEpisode(Reach(), 1, max_steps=2)
-    told = [step[-1] for step in played(env, 3)]
-    assert [each["over"] for each in told] == [False, True, True]
-    assert [each["truncated"] for each in told] == [False, True, True]
-    assert [each["played"] for each in told] == [True, True, False]
-    last = env.step(PUSH)[0]
-    assert env.reset(options={"begin": [True, False]})[0] is last and not env.step(PUSH)[-1]["played"]
-    assert env.reset(options={"begin": [False, True]}) and env.step(PUSH)[-1]["played"]
-
-
 def test_an_error_in_a_step_ends_the_episode():
     told = [step[-1] for step in played(GymnasiumEpisode(Breaks(at=2), 0, max_steps=9), 3)]
     assert [each["error"] for each in told] == ["", "ZeroDivisionError: division by zero", ""]
     assert [each["over"] for each in told] == [False, True, True] and not told[-1]["success"]
     assert told[1]["truncated"] and not told[1]["terminated"]
-
-
-def test_an_error_at_the_reset_ends_the_episode_with_its_first_step():
-    env = GymnasiumEpisode(Breaks(), 0, max_steps=9)
-    assert env.reset(seed=1)[0].tolist() == [0.0] * 4
-    told = env.step(PUSH)[-1]
-    assert told["error"] == "RuntimeError: no place" and told["over"] and told["truncated"]
-    assert not played(env, 1, seed=2)[0][-1]["error"]
 
 
 @pytest.mark.parametrize(("said", "wanted"), [("False", False), ("true", True), (np.array([True]), True), (0, False)])

@@ -22,28 +22,7 @@ def test_columns_of_every_task(name):
         covered = [column for part in slices.values() for column in range(part.start, part.stop)]
         assert covered == list(range(width))  # no gap, no overlap, in order
     assert len(task.observation_names) == task.observation_dim and len(task.state_names) == task.state_dim
-    command = slice(0, 0) if task.command is None else task.observation[task.command]
-    assert not {*range(command.start, command.stop)} & {*task.state_columns}
     assert set(task.hidden) < set(task.observation)
-
-
-@pytest.mark.parametrize(
-    ("name", "observed", "state"),
-    [
-        ("avoiding", 4, 2),
-        ("aligning", 20, 11),
-        ("sorting", 16, 18),
-        ("sorting_2", 10, 10),
-        ("sorting_6", 22, 26),
-        ("po_sorting", 16, 10),
-        ("stacking", 31, 26),
-        ("stacking_1", 31, 26),
-        ("stacking_unobserved_joints", 31, 19),
-    ],
-)
-def test_sizes(name, observed, state):
-    task = get_task(name)
-    assert (task.observation_dim, task.state_dim) == (observed, state)
 
 
 @pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.command is not None])

@@ -6,14 +6,11 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from shared_data import SHARED
 
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.mujoco import controller, kinematics
 from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
-
-RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
 
 
 @pytest.fixture(scope="module")
@@ -126,38 +123,6 @@ def test_finger_forces(positions, velocities, width, grasping, wanted):
     np.testing.assert_allclose(ctrl[7:], wanted, atol=1e-12)
 
 
-def drive(model, num_sims, num_threads, steps=6):
-    sims = SimulationBatch(model, num_sims, num_threads)
-    sims.reset(np.arange(num_sims), np.array(AvoidingEnv.START_JOINTS))
-    commands = np.zeros((num_sims, 7))
-    commands[:, :3], commands[:, 4] = sims.tcp_position, 1.0
-    for _ in range(steps):
-        commands[:, 0] += 0.001 * np.arange(num_sims)
-        sims.track_pose(np.arange(num_sims), commands, 35)
-    state = np.stack([np.concatenate([data.qpos, data.qvel, data.qacc_warmstart]) for data in sims.data])
-    sims.close()
-    return state
-
-
-def test_threads_and_batch_size_change_nothing(model):
-    alone = drive(model, 7, 1)
-    np.testing.assert_array_equal(alone, drive(model, 7, 2))
-    np.testing.assert_array_equal(alone, drive(model, 7, 5))
-    np.testing.assert_array_equal(alone[:3], drive(model, 3, 1))
-
-
-def test_state_round_trip_continues_bit_for_bit(model):
-    sims = SimulationBatch(model, 2)
-    sims.reset(np.array([0]), np.array(AvoidingEnv.START_JOINTS))
-    command = np.tile([0.55, -0.2, 0.12, 0, 1, 0, 0], (2, 1))
-    sims.track_pose(np.array([0]), command, 20)
-    sims.set_state(1, sims.get_state(0))
-    np.testing.assert_array_equal(sims.tcp_position[0], sims.tcp_position[1])
-    sims.track_pose(np.array([0, 1]), command, 20)
-    np.testing.assert_array_equal(sims.data[0].qpos, sims.data[1].qpos)
-    np.testing.assert_array_equal(sims.data[0].qacc_warmstart, sims.data[1].qacc_warmstart)
-
-
 def test_logged_velocity_is_jacobian_times_joint_velocity(model):
     sims = SimulationBatch(model, 1)
     sims.reset(np.array([0]), np.array(AvoidingEnv.START_JOINTS))
@@ -176,25 +141,3 @@ def test_physics_state_of_a_wrong_size_is_refused(model):
         sims.set_physics(0, np.zeros(8))
     with pytest.raises(ValueError, match="'qvel' must be 9 finite numbers"):
         sims.set_physics(0, np.zeros(9), np.full(9, np.nan))
-
-
-@pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings of the original simulator at {RECORDINGS}")
-def test_every_substep_of_the_recorded_trace(model):
-    recorded = np.load(RECORDINGS)
-    sims = SimulationBatch(model, 1)
-    sims.reset(np.array([0]), recorded["ep0_robot_init_qpos"])
-    np.testing.assert_allclose(sims.data[0].qpos, recorded["ep0_init_qpos"], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(sims.data[0].ctrl, recorded["ep0_init_ctrl"], rtol=0, atol=1e-10)
-    sims.widths[:] = controller.FINGER_OPEN
-    for substep in range(len(recorded["ep0_trace_qpos"])):
-        sims.track_pose(np.array([0]), recorded["ep0_action"][[substep // 35]], 1)
-        data = sims.data[0]
-        for got, name, tolerance in (
-            (data.qpos, "qpos", 1e-10),
-            (data.qvel, "qvel", 1e-8),
-            (data.ctrl, "ctrl", 1e-5),
-            (sims.joint_targets[0], "des_j_pos", 1e-10),
-            (sims.joint_speeds[0], "des_j_vel", 1e-6),
-            (sims.tcp_position[0], "c_pos", 1e-10),
-        ):
-            np.testing.assert_allclose(got, recorded[f"ep0_trace_{name}"][substep], rtol=0, atol=tolerance)

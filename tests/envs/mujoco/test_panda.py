@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from torchrl_koap.envs.mujoco import panda as panda_module
+from torchrl_koap.envs.mujoco.kinematics import Q_REST
 from torchrl_koap.envs.mujoco.panda import panda
 from torchrl_koap.envs.mujoco.scene import TABLE_TOP, compile_scene, scene
 
@@ -53,7 +53,7 @@ def test_what_collides(link_collisions):
 def test_consecutive_links_never_collide_although_their_hulls_overlap():
     model = compiled(rod=True, link_collisions=True)
     data = mujoco.MjData(model)
-    data.qpos[:7] = panda_module.REST_POSTURE
+    data.qpos[:7] = Q_REST
     data.qpos[7:] = 0.02
     mujoco.mj_forward(model, data)
     assert data.ncon == 0

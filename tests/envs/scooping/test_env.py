@@ -127,11 +127,8 @@ def test_scores_tell_the_starts_apart():
 
 
 @pytest.mark.parametrize("embodiment", ["robot", "hand"])
-def test_the_camera_sees_the_embodiments_differ(embodiment):
-    try:
-        renderer = Renderer(ScoopingSimulations(embodiment, 1).model, 96, 96, shadows=False)
-    except RuntimeError as error:
-        pytest.skip(f"no OpenGL library: {error}")
+def test_the_camera_sees_the_embodiments_differ(embodiment, graphics):
+    renderer = Renderer(ScoopingSimulations(embodiment, 1).model, 96, 96, shadows=False)
     sims = ScoopingSimulations(embodiment, 1)
     sims.reset(np.arange(1), start_joints(NEAR, embodiment)[None], [0.0])
     picture = renderer.render(sims.data[0], "third_person").astype(int)
@@ -158,16 +155,13 @@ def test_no_graphics_is_one_clear_error(tmp_path, monkeypatch):
     assert not (tmp_path / "a").exists()
 
 
-def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path):
+def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path, graphics):
     record, seen = functools.partial(record_videos, embodiment="robot", episodes=1), []
 
     def interrupt(number, total):
         raise KeyboardInterrupt
 
-    try:
-        report = record(tmp_path / "whole", progress=lambda number, total: seen.append(number))
-    except RuntimeError as error:
-        pytest.skip(f"no OpenGL library: {error}")
+    report = record(tmp_path / "whole", progress=lambda number, total: seen.append(number))
     assert seen == [1] and report.episodes == 1 and report.attempts >= 1
     assert str(report).startswith(f"1 demonstrations by a robot, {report.frames} frames; ")
     with pytest.raises(KeyboardInterrupt):
@@ -236,11 +230,8 @@ def test_a_saved_state_knows_where_the_bowl_stands():
     assert torch.equal(*ends)
 
 
-def test_recordings_hold_the_bowl_s_place(tmp_path):
-    try:
-        record_videos(tmp_path / "set", "hand", 2, task=MOVING)
-    except RuntimeError as error:
-        pytest.skip(f"no OpenGL library: {error}")
+def test_recordings_hold_the_bowl_s_place(tmp_path, graphics):
+    record_videos(tmp_path / "set", "hand", 2, task=MOVING)
     recordings = read_recordings(tmp_path / "set", action_dim=MOVING.action_dim)
     places, clips = [states[:, 3:] for states in recordings.states], recordings.cameras["third_person"]
     assert [place.shape for place in places] == [(len(list(clip.read())), 2) for clip in clips]
