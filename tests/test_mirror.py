@@ -35,7 +35,6 @@ COVERED_BY = {
     "modules/inverse_dynamics.py": "modules/koopman/test_inverse_dynamics.py",
     "modules/planning/sampler.py": "modules/planning/test_planner.py",
     "objectives/base.py": "objectives/test_koap.py",
-    "objectives/latents.py": "modules/baselines/test_latents.py",
     "reports/html.py": "reports/test_run_report.py",
     "reports/run_facts.py": "reports/test_run_report.py",
     "reports/style.py": "reports/test_run_report.py",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 import torch
@@ -118,7 +119,7 @@ def test_bad_arguments(change, message):
 def test_suggest_from_the_shell(copied_run, capsys):
     assert koap("suggest", copied_run, "--count", "3") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["rank", "episode", "steps", "score"] and len(lines) == 5
+    assert len(lines) == 4
     written = json.loads((copied_run / "suggestions.json").read_text())
     rows = written["suggestions"]
     labels = json.loads((copied_run / "summary.json").read_text())["labels"]
@@ -127,14 +128,15 @@ def test_suggest_from_the_shell(copied_run, capsys):
     assert written["labelled_steps"] == labels["labelled_transitions"]
     # demonstration i has 30 + i rows and one step less
     assert all(row["steps"] == 29 + row["episode"] for row in rows)
-    assert [line.split()[1] for line in lines[1:4]] == [str(row["episode"]) for row in rows]
+    for line, row in zip(lines, rows, strict=False):
+        assert re.fullmatch(rf"episode {row['episode']} +steps {row['steps']}, score [\d.e-]+", line)
     # what to call next keeps the labels that are there
-    assert lines[4].split("--labels.episodes ")[1].removesuffix(" --out NEW").split() == [
+    assert lines[3].split("--labels.episodes ")[1].removesuffix(" --out NEW").split() == [
         str(episode) for episode in [*written["labelled_episodes"], *(row["episode"] for row in rows)]
     ]
     assert len(written["labelled_episodes"]) == labels["trajectories_touched"]
     dataset = json.loads((copied_run / "config.json").read_text())["dataset"]
-    assert f"koap train --task avoiding --dataset {dataset} --labels.episodes" in lines[4]
+    assert f"koap train --task avoiding --dataset {dataset} --labels.episodes" in lines[3]
     assert koap("suggest", copied_run, "--count", "7") == 1  # 2 of 8 are labelled
     assert "count must be in 1..6" in capsys.readouterr().err
 
@@ -145,12 +147,12 @@ def test_demonstrations_that_were_moved_are_found_again(copied_run, demonstratio
     assert "say where it is with --dataset" in fails(capsys, "suggest", copied_run)
     assert koap("suggest", copied_run, "--dataset", demonstrations) == 0
     out = capsys.readouterr().out
-    assert f"--dataset {demonstrations} --labels.episodes" in out and len(out.splitlines()) == 7
+    assert f"--dataset {demonstrations} --labels.episodes" in out and len(out.splitlines()) == 6
 
 
 def test_unasked_no_more_are_suggested_than_are_left(copied_run, monkeypatch):
     monkeypatch.setattr(active_labelling, "_FEW", 10)
-    assert len(suggest(copied_run).suggestions) == 6
+    assert len(suggest(copied_run)["suggestions"]) == 6
 
 
 def test_no_hidden_label_has_a_say(copied_run, monkeypatch):

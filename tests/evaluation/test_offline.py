@@ -84,7 +84,7 @@ def test_latent_space_and_suggestions(run):
     found = inspect(run, InspectConfig(latent_only=True, threads=1))["findings"]
     assert "mrad" in found and " mm" not in found
     assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in found
-    assert {row["episode"] for row in suggest(run, SuggestConfig(count=7)).suggestions} == set(range(3, 10))
+    assert {row["episode"] for row in suggest(run, SuggestConfig(count=7))["suggestions"]} == set(range(3, 10))
     with pytest.raises(
         ValueError, match="task 'arm' has no environment to make experiments in: name one with --env, or --latent-only"
     ):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from torchrl_koap.evaluation import (
     EvalConfig,
     InspectConfig,
     SuggestConfig,
-    SuggestedLabels,
     evaluate,
     inspect,
     load_policy,
@@ -137,11 +136,13 @@ class Suggest(Command):
     run: tyro.conf.Positional[Path]
     config: Options[SuggestConfig]
 
-    def __call__(self) -> SuggestedLabels:
+    def __call__(self) -> dict[str, Any]:
         """Ranks the unlabelled demonstrations and writes ``suggestions.json``."""
         found = suggest(self.run, self.config)
-        RunDirectory(self.run).write_json("suggestions.json", asdict(found))
-        return found
+        RunDirectory(self.run).write_json("suggestions.json", found)
+        shown = ("steps", "score")
+        rows = {f"episode {row['episode']}": {name: row[name] for name in shown} for row in found["suggestions"]}
+        return rows | {"next": found["next"]}
 
 
 @dataclass(kw_only=True)

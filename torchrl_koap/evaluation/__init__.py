@@ -8,7 +8,6 @@ _MODULES = {
     "EvalConfig": "torchrl_koap.evaluation.config",
     "InspectConfig": "torchrl_koap.evaluation.inspection",
     "SuggestConfig": "torchrl_koap.evaluation.active_labelling",
-    "SuggestedLabels": "torchrl_koap.evaluation.active_labelling",
     "evaluate": "torchrl_koap.evaluation.closed_loop",
     "inspect": "torchrl_koap.evaluation.inspection",
     "load_policy": "torchrl_koap.evaluation.rollouts",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -164,37 +164,7 @@ class SuggestConfig:
     plugins: Plugins = ()
 
 
-@dataclass(frozen=True)
-class SuggestedLabels:
-    """What ``suggestions.json`` holds; printed as a table.
-
-    The ridge of the run's decoder; steps and trajectories with a label in the run; ``suggestions`` with ``rank``,
-    ``episode``, ``steps`` to label and ``score``, best first; options of ``koap train`` that name task and data set.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels
-        >>> row = {"rank": 1, "episode": 57, "steps": 120, "score": 0.31}
-        >>> print(str(SuggestedLabels(0.1, 80, [3], [row])).splitlines()[-1])
-        with these labelled: koap train --labels.episodes 3 57 --out NEW
-    """
-
-    penalty: float
-    labelled_steps: int
-    labelled_episodes: list[int]
-    suggestions: list[dict[str, Any]]
-    data: list[str] = field(default_factory=list)
-
-    def __str__(self) -> str:
-        lines = [f"{'rank':>4}  {'episode':>7}  {'steps':>5}  {'score':>10}"]
-        for row in self.suggestions:
-            lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {row['score']:>10.4g}")
-        every = [*self.labelled_episodes, *(row["episode"] for row in self.suggestions)]
-        words = ["koap", "train", *self.data, "--labels.episodes", *map(str, every)]
-        lines.append(f"with these labelled: {shlex.join(words)} --out NEW")
-        return "\n".join(lines)
-
-
-def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLabels:
+def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, Any]:
     """Ranks the unlabelled demonstrations of a run.
 
     Args:
@@ -202,7 +172,9 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         config (SuggestConfig, optional): how many.
 
     Returns:
-        SuggestedLabels: the trajectories to label next, in order.
+        dict: what ``suggestions.json`` holds: ``penalty`` of the run's decoder, ``labelled_steps`` and
+        ``labelled_episodes`` that the choice builds on, ``suggestions`` with ``rank``, ``episode``, ``steps`` to label
+        and ``score``, best first, and ``next``, a command line that trains with them.
 
     Raises:
         ValueError: for a count out of range, or a run without latent actions or a decoder in closed form.
@@ -210,7 +182,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
 
     Examples:
         >>> from torchrl_koap.evaluation import SuggestConfig, suggest
-        >>> print(suggest("runs/koap", SuggestConfig(count=3)))  # doctest: +SKIP
+        >>> suggest("runs/koap", SuggestConfig(count=3))["suggestions"]  # doctest: +SKIP
     """
     config = SuggestConfig() if config is None else config
     set_up_torch(config.threads, "cpu")
@@ -246,5 +218,12 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
-    again = ["--task", task.name, "--dataset", config.dataset or trained.config.dataset]
-    return SuggestedLabels(penalty, report.labelled_transitions, labelled, rows, again)
+    again = ["koap", "train", "--task", task.name, "--dataset", config.dataset or trained.config.dataset]
+    every = [*labelled, *(choice.episode for choice in choices)]
+    return {
+        "penalty": penalty,
+        "labelled_steps": report.labelled_transitions,
+        "labelled_episodes": labelled,
+        "suggestions": rows,
+        "next": f"{shlex.join([*again, '--labels.episodes', *map(str, every)])} --out NEW",
+    }

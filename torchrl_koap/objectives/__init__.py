@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Loss modules."""
 
-from torchrl_koap.objectives.action import ActionLoss
+from torchrl_koap.objectives.baselines import ActionLoss, QuantizedDynamicsLoss, VariationalLoss
 from torchrl_koap.objectives.denoising import DiffusionPolicyLoss, PlannerLoss
 from torchrl_koap.objectives.koap import (
     KOAPLoss,
@@ -9,7 +9,6 @@ from torchrl_koap.objectives.koap import (
     KoopmanReconstructionLoss,
     LatentActionLoss,
 )
-from torchrl_koap.objectives.latents import QuantizedDynamicsLoss, VariationalLoss
 
 __all__ = [
     "ActionLoss",
