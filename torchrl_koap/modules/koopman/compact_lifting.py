@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from torchrl_koap.keys import LIFTED_STATE, STATE, read_entry
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.koopman.smoothing import noise_covariance
 
 MOST_WINDOWS = 2000  # for the covariance of the noise; neighbouring windows hold nearly the same frames
 MIN_NOISE = 0.5  # no sum of columns is believed to have less than so much of the noise that independent columns give it
@@ -28,6 +27,27 @@ BATCH = 2048  # windows that are lifted at once
 GAIN = 0.7  # twice the coordinates are read if they leave less than this share of the reconstruction error
 
 
+def noise_covariance(windows: Tensor) -> Tensor:
+    r"""Computes the covariance of white measurement noise from the autocovariances of steps at lags 1, 2 and 3.
+
+    With steps :math:`v_t = x_{t+1} - x_t` of a smooth motion plus noise of covariance ``R``, noise adds ``2 R`` at lag
+    0 and ``-R`` at lag 1. A parabola in the lag through lags 2 and 3 says what the motion alone has at lag 1. Windows
+    are ``[N, T, d]`` with ``T >= 5``; the result ``[d, d]`` is symmetric and positive semidefinite, float64.
+    """
+    if windows.ndim != 3 or windows.shape[-2] < 5:
+        raise ValueError(f"noise_covariance needs windows [N, T >= 5, d], got {list(windows.shape)}")
+    steps = windows.diff(dim=-2).double()
+    lagged = []
+    for lag in (1, 2, 3):
+        early, late = steps[:, :-lag].flatten(0, 1), steps[:, lag:].flatten(0, 1)
+        product = early.mT @ late / len(early)
+        lagged.append((product + product.mT) / 2)
+    curve = (lagged[1] - lagged[2]) / 5  # of a - b l^2
+    noise = lagged[1] + 3 * curve - lagged[0]
+    values, vectors = torch.linalg.eigh(noise)
+    return vectors * values.clamp_min(0) @ vectors.mT
+
+
 class NoiseAdjustedComponents(nn.Module):
     r"""Computes linear components of the state, ordered by how far they stand out of the measurement noise.
 
@@ -35,7 +55,7 @@ class NoiseAdjustedComponents(nn.Module):
         y = \Lambda^{-1/2} U^T W^T x, \qquad W^T R W = I, \quad W^T C W = U \Lambda U^T
 
     with the covariance ``C`` of the states and ``R`` of the white noise in them
-    (:func:`~torchrl_koap.modules.koopman.smoothing.noise_covariance`): the minimum noise fraction transform (Green et
+    (:func:`noise_covariance`): the minimum noise fraction transform (Green et
     al. 1988), at unit spread. Where columns differ in their noise, principal components follow the noisiest; these
     follow the best measured. No column counts as measured to more than 1 % of its spread, and components that stand out
     by less than a factor of two are 0, but for the first. There are at most as many as columns, 1 to ``d``.

@@ -9,14 +9,57 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchrl_koap.modules.koopman.compact_lifting import BATCH, CompactLifting
+from torchrl_koap.modules.koopman.compact_lifting import BATCH, CompactLifting, noise_covariance
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.koopman.smoothing import WienerSmoother
 from torchrl_koap.modules.windows import WindowReader
 
 LIFTED, RAW = "lifted", "raw"
 RAW_PAST, RAW_LOOK_AHEAD = 4, (2, 3, 4, 5)  # frames that the raw block reads
+
+
+class WienerSmoother(nn.Module):
+    r"""Estimates the noise-free frames of a window from all of its frames (a Wiener smoother in closed form).
+
+    .. math::
+        \hat w = S (S + N)^{-1} w, \qquad S = \operatorname{cov}(w) - N, \qquad N = (I - \tfrac{1}{F} 1 1^T) \otimes R
+
+    with the ``F`` frames ``[F, dim]`` of a window, their mean subtracted, in ``w``, and the covariance ``R`` of white
+    measurement noise. Noise that is independent from frame to frame makes neighbouring steps undo each other: where the
+    motion's own autocovariance is smooth in the lag, ``R`` is how far the one of lag 1 lies below the curve through
+    those of lags 2 and 3 (:func:`noise_covariance`). Without noise ``R`` is 0 and the window stays as it is.
+    """
+
+    gain: Tensor
+
+    def __init__(self, num_frames: int, dim: int):
+        super().__init__()
+        self.num_frames, self.dim = num_frames, dim
+        self.register_buffer("gain", torch.eye(num_frames * dim))
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Smooths windows ``[*B, F, dim]``."""
+        mean = windows.mean(-2, keepdim=True)
+        return ((windows - mean).flatten(-2) @ self.gain.mT).unflatten(-1, (self.num_frames, self.dim)) + mean
+
+    @torch.no_grad()
+    def fit(self, windows: Tensor, consecutive: Tensor) -> None:
+        """Fits the gain to windows ``[N, F, dim]`` of the frames that are smoothed together; no label is read.
+
+        The noise is that of ``consecutive`` frames one control step apart, ``[N, T, dim]`` with ``T >= 5``.
+        """
+        if windows.shape[-2:] != (self.num_frames, self.dim):
+            raise ValueError(f"windows must be [N, {self.num_frames}, {self.dim}], got {list(windows.shape)}")
+        centred = (windows - windows.mean(-2, keepdim=True)).flatten(-2).double()
+        total = centred.mT @ centred / len(centred)
+        frames = torch.eye(self.num_frames, dtype=torch.float64, device=windows.device) - 1 / self.num_frames
+        noise = torch.kron(frames, noise_covariance(consecutive).to(total))
+        values, vectors = torch.linalg.eigh(total - noise)
+        signal = vectors * values.clamp_min(0) @ vectors.mT
+        values, vectors = torch.linalg.eigh(signal + noise)
+        kept = values > 1e-9 * values[-1].clamp_min(1e-30)
+        inverse = vectors * torch.where(kept, 1 / values.clamp_min(1e-30), 0.0) @ vectors.mT
+        self.gain.copy_(signal @ inverse)
 
 
 class LatentActionSmoothed(LatentActionModule):
