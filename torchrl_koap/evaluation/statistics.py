@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.special import entr
-from scipy.stats import binomtest
+from scipy.stats import binom, binomtest
 
 OUTCOMES = ("timeout", "success", "collision", "error")  # of an episode, by number
 _RESAMPLES, _TAIL = 500, (1 - 0.95) / 2  # of a bootstrap; share outside its interval at either end
@@ -50,12 +50,9 @@ def expected_entropy(episodes: int, num_modes: int) -> float:
     """
     if episodes < 1 or num_modes < 2:
         return 0.0
-    total = 0.0
-    for count in range(1, episodes + 1):
-        log_chance = math.lgamma(episodes + 1) - math.lgamma(count + 1) - math.lgamma(episodes - count + 1)
-        log_chance += count * math.log(1 / num_modes) + (episodes - count) * math.log(1 - 1 / num_modes)
-        total -= math.exp(log_chance) * count / episodes * math.log(count / episodes)
-    return num_modes * total / math.log(num_modes)
+    counts = np.arange(episodes + 1)  # of one mode
+    chances = binom.pmf(counts, episodes, 1 / num_modes)
+    return float(num_modes * (chances * entr(counts / episodes)).sum() / math.log(num_modes))
 
 
 def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsolved: str = "skip") -> float | None:
