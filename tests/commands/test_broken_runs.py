@@ -79,7 +79,7 @@ def test_a_run_that_cannot_be_evaluated_is_named(kind, copied_run, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--strategy", "open_lop"), "unknown strategy 'open_lop'; did you mean 'open_loop'?"),
+        (("--strategy", "oracel"), "unknown strategy 'oracel'; did you mean 'oracle'?"),
         (("--replan-interval", "15"), "replan_interval must be in 1..14"),
         (("--episodes", "0"), "episodes must be >= 1, got 0"),
         (("--batch-size", "0"), "batch_size must be >= 1, got 0"),

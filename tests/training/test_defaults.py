@@ -128,6 +128,8 @@ class TestExecution:
     def test_of_plans_is_refused_where_there_are_none(self):
         with pytest.raises(ValueError, match="execution.strategy 'feedback' was asked of method 'dp', which samples"):
             resolved(method="dp", execution=ExecutionConfig(strategy="feedback"))
+        with pytest.raises(ValueError, match="'oracle' reads a simulation: it is for `koap eval`"):
+            resolved(execution=ExecutionConfig(strategy="oracle"))
 
 
 def test_a_method_declares_columns_and_labels_stay_as_asked():

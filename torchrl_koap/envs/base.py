@@ -297,6 +297,11 @@ class ManipulationEnv(EpisodeState, EnvBase):
         """Present commands in float64: TCP position (m) and quaternion [n, 7]; Stacking: joints and gripper [n, 8]."""
         return self._commands.copy()
 
+    @property
+    def over(self) -> np.ndarray:
+        """Which episodes are decided or have used up their steps, bool [n]."""
+        return self._success | self._collision | (self._steps >= self.max_steps)
+
     def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = "cage") -> np.ndarray:
         """Draws one environment, uint8 [height, width, 3]; cameras: ``"front"``, ``"cage"`` (D3IL's) and ``"wrist"``.
 

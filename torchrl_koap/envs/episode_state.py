@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The state of an episode in progress: saved, and restored."""
+"""The state of an episode in progress: saved, restored, and advanced by trial actions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_koap.tasks import Task
 
 
 class EpisodeState(abc.ABC):
-    """Saves and restores episodes; base of :class:`~torchrl_koap.envs.base.ManipulationEnv`."""
+    """Saves, restores and tries out episodes; base of :class:`~torchrl_koap.envs.base.ManipulationEnv`."""
 
     sims: Any
     task: Task
@@ -58,3 +58,40 @@ class EpisodeState(abc.ABC):
         self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
         self.sims.widths[index] = controller.FINGER_OPEN
         self._begin_episode(np.array([index]))
+
+    def simulate_actions(self, actions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Simulates action sequences from the present state and restores it.
+
+        Entry ``k`` is the state that the actions 0 to ``k`` lead to; :meth:`step` observes it one control step later.
+
+        Args:
+            actions (np.ndarray): sequences to try ``[m, len(rows), k, act]``.
+            rows (np.ndarray, optional): which environments. Default: all.
+
+        Returns:
+            np.ndarray: observations ``[m, len(rows), k, obs]``.
+
+        Raises:
+            ValueError: if the shape is wrong.
+        """
+        rows = np.arange(self.batch_size[0]) if rows is None else np.asarray(rows, dtype=np.int64)
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.ndim != 4 or actions.shape[1] != len(rows) or actions.shape[3] != self.task.action_dim:
+            raise ValueError(
+                f"actions must be [m, {len(rows)}, k, {self.task.action_dim}] [sequences, environments, control steps,"
+                f" action], got shape {list(actions.shape)}"
+            )
+        present = [self.get_state(row) for row in rows]
+        observations = np.empty((*actions.shape[:3], self.task.observation_dim))
+        try:
+            for sequence, observed in zip(actions, observations, strict=True):
+                for row, state in zip(rows, present, strict=True):
+                    self.set_state(row, state)
+                for step in range(actions.shape[2]):
+                    self._command(rows, sequence[:, step])
+                    self._advance(rows)
+                    observed[:, step] = self._observe(rows)
+        finally:
+            for row, state in zip(rows, present, strict=True):
+                self.set_state(row, state)
+        return observations

@@ -10,7 +10,7 @@ _MODULES = {
     "SuggestConfig": "torchrl_koap.evaluation.active_labelling",
     "evaluate": "torchrl_koap.evaluation.closed_loop",
     "inspect": "torchrl_koap.evaluation.inspection",
-    "load_policy": "torchrl_koap.evaluation.rollouts",
+    "load_policy": "torchrl_koap.evaluation.policies",
     "rank_trajectories": "torchrl_koap.evaluation.active_labelling",
     "suggest": "torchrl_koap.evaluation.active_labelling",
 }

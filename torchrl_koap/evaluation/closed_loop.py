@@ -16,8 +16,10 @@ from torchrl_koap.evaluation.config import EvalConfig, RolloutConfig, check_opti
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.loop_on_labels import limited_commands
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
+from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
+from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import load_plugins
@@ -72,7 +74,9 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     directory, task = RunDirectory(trained.folder), trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)
-    policy = trained.policy(config.execution.on(trained.execution))
+    if config.execution.strategy == "oracle" and config.env is not None:
+        raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
+    policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
     chosen = config.rollouts_per_context, config.contexts_file
     where = find_environment(task, config, Observer.of(task, trained.cameras), *chosen)
@@ -99,7 +103,9 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.env is None:
         result = task_scores(task, result, episodes, where.numbers)
     rows = result.pop("episode")
-    result |= measure_latency(policy, task.observation_dim)
+    learned = config.execution if policy.execution.strategy != "oracle" else ExecutionConfig()
+    timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
+    result |= measure_latency(timed, task.observation_dim)
     result |= errors | limited_commands(policy) | {"execution": to_json(policy.execution), "episode": rows}
     result |= where.facts
     if where.record is not None:
@@ -127,7 +133,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
 def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
-    policy = trained.policy(config.execution.on(trained.execution))
+    policy = trained_policy(trained, config.execution)
     result, actions = evaluate_offline(trained, config)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
     result |= {"seed": config.seed, "execution": to_json(policy.execution)}

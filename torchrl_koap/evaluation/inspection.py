@@ -23,6 +23,7 @@ from torchrl_koap.evaluation.diagnosis import (
 )
 from torchrl_koap.evaluation.findings import NEAR, describe_inspection
 from torchrl_koap.evaluation.latent_space import analyse_latent
+from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
@@ -111,7 +112,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
 def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:
     task = trained.task
     planner = trained.planner.to(config.device)
-    policy = trained.policy(config.execution.on(trained.execution)).to(config.device)
+    policy = trained_policy(trained, config.execution).to(config.device)
     interval = policy.execution.replan_interval
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = find_environment(task, config, Observer.of(task, trained.cameras))

@@ -1,11 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A trained policy, and its rollouts: one episode per environment, a seed per episode, the same in any batch."""
+"""Closed-loop evaluation: one episode per environment, a seed per episode, results independent of the batch size."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -17,48 +16,10 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION, PLAN
-from torchrl_koap.modules import ExecutionConfig, PlanningPolicy, policy_transforms
+from torchrl_koap.modules import PlanningPolicy, policy_transforms
 from torchrl_koap.modules.execution.policy_env import NOISE, NoiseStreams
-from torchrl_koap.training.trained import Trained
 
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
-
-
-def load_policy(
-    where: str | Path | Trained, *, device: str = "cpu", plugins: Sequence[str] = (), **asked: Any
-) -> PlanningPolicy:
-    """Makes a policy of a run, or of a file of :meth:`Trained.save`: observations in, an action per step out.
-
-    A :class:`~torchrl_koap.modules.PolicyEnv` hands it what it reads; an :class:`~torchrl_koap.modules.Agent` keeps
-    that itself.
-
-    Args:
-        where (str, Path or Trained): a run directory, ``"pretrained:NAME"``, a file, or what :func:`~torchrl_koap.fit`
-            returned.
-
-    Keyword Args:
-        device (str): ``"cpu"`` or ``"cuda"``.
-        plugins (sequence of str): modules that register task or method of a file, which cannot have them imported.
-        **asked: fields of :class:`~torchrl_koap.modules.Execution`. What is not asked for is as it was trained for.
-
-    Returns:
-        PlanningPolicy: in evaluation mode, on the device asked for.
-
-    Raises:
-        ValueError: for an unknown strategy, or a number out of range.
-        RunDirectoryError, CheckpointError, PluginError: as :meth:`Trained.load`.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap import Agent, load_policy
-        >>> agent = Agent(load_policy("pretrained:avoiding"), seed=0)
-        >>> agent.reset()
-        >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded and measured xy to a change of xy (m)
-        (2,)
-    """
-    wanted = ExecutionConfig(**asked)
-    trained = where if isinstance(where, Trained) else Trained.load(where, plugins=plugins)
-    return trained.policy(wanted.on(trained.execution)).to(device)
 
 
 @torch.no_grad()
@@ -105,6 +66,7 @@ def roll_out(
         else:
             streams = NoiseStreams(part, policy.noise_shape, block=policy.max_steps)
             noise = TensorDictModule(streams.draw, in_keys=[], out_keys=[noise_key])
+        policy.attach(env)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(

@@ -124,6 +124,8 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
 
 def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionConfig:
     own = ({"temperature": OWN_TEMPERATURE} if task.env is None else {}) | dict(task.defaults.execution)
+    if asked.strategy == "oracle":
+        raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
     if not method.plans:
         if asked.strategy not in (None, "open_loop"):
             raise ValueError(

@@ -17,6 +17,7 @@ from torchrl_koap.data import LabelReport
 from torchrl_koap.data.formats import find_format
 from torchrl_koap.files import some
 from torchrl_koap.modules import CommandDecoder, Execution, PlanningPolicy, StatePlanner, make_policy
+from torchrl_koap.modules.execution.followers import Follower
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
 from torchrl_koap.runs.plugins import load_plugins
@@ -174,11 +175,14 @@ class Trained:
         """How its plans become actions unless asked otherwise."""
         return self.config.execution.on(Execution())
 
-    def policy(self, execution: Execution | None = None) -> PlanningPolicy:
+    def policy(self, execution: Execution | None = None, *, follower: Follower | None = None) -> PlanningPolicy:
         """Makes a policy of the networks: observations in, an action per control step out.
 
         Args:
             execution (Execution, optional): how plans become actions. Default: as it was trained for.
+
+        Keyword Args:
+            follower (Follower, optional): follows plans in place of the controller.
 
         Returns:
             PlanningPolicy: in evaluation mode. A :class:`~torchrl_koap.modules.PolicyEnv` hands it what it reads; an
@@ -211,8 +215,8 @@ class Trained:
         facts = policy_facts(self.task, columns=self.columns, gripper=gripper, ranges=ranges)
         facts["observe"] = Observer.of(self.task, self.cameras)
         if self.method.plans:
-            return make_policy(self.planner, self.controller, **facts, execution=execution)
-        if execution.strategy != "open_loop":
+            return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
+        if execution.strategy != "open_loop" or follower is not None:
             raise ValueError(
                 f"strategy {execution.strategy!r} was asked of method {self.method.name!r}, which samples actions and"
                 " executes chunks of them: there is no plan to follow"

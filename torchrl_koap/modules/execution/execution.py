@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl_koap.lookup import lookup
 
-STRATEGIES = ("feedback", "open_loop")
+STRATEGIES = ("feedback", "open_loop", "oracle")
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,8 @@ class ExecutionConfig:
     """What is asked of an :class:`Execution`; what is not asked for is the method's, the task's or the library's.
 
     Attributes:
-        strategy: "feedback" (decode at every step) or "open_loop" (decode once per plan).
+        strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (the simulator's own
+            inverse map, which takes the tool where the plan says: what fails then is the planner's).
         replan_interval: control steps per plan.
         blend: share of the distance between robot and plan that remains after each step; 0: plans as they are.
         lead: farthest that the command may be ahead of the robot along each axis, in the units of the actions; 0: any

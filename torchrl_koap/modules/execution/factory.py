@@ -32,6 +32,7 @@ def make_policy(
     control_hz: float | None = None,
     observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
     origins: tuple[Sequence[float], Sequence[float]] | None = None,
+    follower: Follower | None = None,
 ) -> PlanningPolicy:
     """Makes a policy of planner and controller: observations in, an action per control step out.
 
@@ -54,6 +55,7 @@ def make_policy(
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
+        follower (Follower, optional): follows plans in place of the controller.
 
     Returns:
         PlanningPolicy: the policy.
@@ -71,7 +73,8 @@ def make_policy(
         (5, 'feedback')
     """
     execution = Execution() if execution is None else execution
-    follower = None if controller is None else _follow(planner, controller, execution, columns, action_rule)
+    if follower is None and controller is not None:
+        follower = _follow(planner, controller, execution, columns, action_rule)
     limits, margin = None, execution.limits
     ranges = None if ranges is None or margin == math.inf else [_widened(r, margin) for r in ranges]
     if execution.gain != 1 or execution.lead or ranges is not None:

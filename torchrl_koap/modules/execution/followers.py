@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
@@ -57,6 +58,9 @@ class Follower(nn.Module):
             Tensor: ``[*B, steps, act]``, raw units.
         """
         raise NotImplementedError
+
+    def attach(self, env: EnvBase) -> None:
+        """Is told the batch of environments whose episodes are about to begin; needs none by default."""
 
 
 class InverseDynamicsFollower(Follower):

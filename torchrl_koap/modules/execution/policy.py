@@ -11,6 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION, PLAN
@@ -201,6 +202,11 @@ class PlanningPolicy(TensorDictModuleBase):
         if self.limits is None:
             return actions, torch.zeros_like(actions[..., 0], dtype=torch.bool)
         return self.limits(observations.unsqueeze(-3), actions)
+
+    def attach(self, env: EnvBase) -> None:
+        """Tells the follower the batch of environments whose episodes are about to begin."""
+        if self.follower is not None:
+            self.follower.attach(env)
 
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compiles the denoiser, which takes most of the time; arguments as for :func:`torch.compile`."""

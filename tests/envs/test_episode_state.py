@@ -1,0 +1,60 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Simulated actions come true, and the present is left as it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.envs import AligningEnv, AvoidingEnv, StackingEnv
+from torchrl_koap.envs.contexts import evaluation_contexts
+
+
+def started(make, task, steps, **options):
+    contexts = None if task == "avoiding" else evaluation_contexts(task, 2)
+    env = make(2, dtype=torch.float64, **options)
+    data = env.reset() if contexts is None else env.reset(contexts=contexts)
+    torch.manual_seed(0)
+    for _ in range(steps):
+        data = env.step(data.set("action", 0.3 * env.action_spec.rand()))["next"]
+    return env, data
+
+
+@pytest.mark.parametrize(
+    ("make", "task"), [(AvoidingEnv, "avoiding"), (AligningEnv, "aligning"), (StackingEnv, "stacking")]
+)
+def test_simulated_actions_come_true(make, task):
+    env, data = started(make, task, 4)
+    actions = 0.3 * torch.stack([env.action_spec.rand() for _ in range(3)], 1)  # [2, 3, act]
+    before = [env.get_state(row) for row in range(2)]
+    simulated = env.simulate_actions(np.stack([np.zeros(actions.shape), actions.numpy()]))[1]
+    for row, state in enumerate(before):
+        after = env.get_state(row)
+        assert all(np.array_equal(state["simulation"][name], after["simulation"][name]) for name in state["simulation"])
+        assert all(np.array_equal(state[name], after[name]) for name in state if name != "simulation")
+    seen = []
+    for step in range(4):
+        data = env.step(data.set("action", actions[:, min(step, 2)]))["next"]
+        seen.append(data["observation"].numpy())
+    hidden = env.task.command_columns.stop if env.task.command else 0  # the command is not a step late
+    assert np.allclose(simulated[..., hidden:], np.stack(seen[1:], 1)[..., hidden:], atol=1e-12)
+
+
+def test_some_environments_alone():
+    env, _ = started(AvoidingEnv, "avoiding", 2)
+    both = env.simulate_actions(np.full((1, 2, 2, 2), 0.01))
+    assert np.array_equal(env.simulate_actions(np.full((1, 1, 2, 2), 0.01), np.array([1]))[:, 0], both[:, 1])
+
+
+def test_a_wrong_shape():
+    env, _ = started(AvoidingEnv, "avoiding", 0)
+    with pytest.raises(ValueError, match=r"actions must be \[m, 2, k, 2\].*got shape \[1, 3, 2, 2\]"):
+        env.simulate_actions(np.zeros((1, 3, 2, 2)))
+
+
+def test_episodes_that_are_over():
+    env, data = started(AvoidingEnv, "avoiding", 0, max_steps=1)
+    assert env.over.tolist() == [False, False]
+    env.step(data.set("action", torch.zeros(2, 2, dtype=torch.float64)))
+    assert env.over.tolist() == [True, True]

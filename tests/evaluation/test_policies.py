@@ -1,0 +1,95 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The oracle controller: the tool goes where the plan says, whatever the batch, and only in a simulation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from command_calls import fails
+from tiny_runs import TINY, koap
+
+from torchrl_koap.envs import AvoidingEnv
+from torchrl_koap.evaluation.diagnosis import RecordedPlanner, hand_on
+from torchrl_koap.evaluation.policies import OracleFollower
+from torchrl_koap.evaluation.rollouts import roll_out
+from torchrl_koap.modules import Execution, MLPDenoiser, StatePlanner, make_policy
+from torchrl_koap.tasks import get_task
+
+TASK = get_task("avoiding")
+STEPS = 30
+
+
+def futures_of(start, speed, horizon=14):
+    """States on a line that leaves ``start`` with ``speed`` m per control step, as plans of every step."""
+    ramp = torch.cat([torch.linspace(0, 1, 6), torch.ones(STEPS + horizon)]).cumsum(0)
+    path = start + ramp[:, None] * torch.tensor(speed)
+    return torch.stack([path[step + 1 : step + 1 + horizon] for step in range(STEPS)])
+
+
+def policy_of(planner=None):
+    planner = planner or StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
+    follower = OracleFollower(TASK, blend=0.0)
+    return make_policy(planner, state_of=TASK.state_of, follower=follower, execution=Execution(replan_interval=1))
+
+
+def follow(speeds):
+    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2))
+    policy = policy_of(planner)
+    start = AvoidingEnv(1).reset()["observation"][0, 2:]
+    futures = torch.stack([futures_of(start, speed) for speed in speeds])
+    seeds, given = list(range(len(speeds))), lambda part: hand_on(futures[part])
+    episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=STEPS, given=given)
+    return futures, episodes
+
+
+def test_the_tool_goes_where_the_plan_says():
+    futures, (episode,) = follow([(0.002, 0.006)])
+    seen = episode["next", "observation"][:, 2:]
+    planned = futures[0, :, 0]  # the next state, of every step
+    error = (seen - planned).norm(dim=-1)
+    assert error[8:].max() < 1e-3  # it covers 19 cm
+    assert (planned[-1] - planned[0]).norm() > 0.15
+
+
+def test_episodes_do_not_depend_on_the_batch():
+    _, both = follow([(0.0, 0.005), (0.003, 0.004)])
+    _, (one,) = follow([(0.003, 0.004)])
+    assert torch.allclose(both[1]["action"], one["action"], atol=1e-7)
+
+
+@torch.no_grad()
+def test_wrong_uses():
+    observed, plan = torch.zeros(1, 2, 4), torch.zeros(1, 14, 2)
+    with pytest.raises(RuntimeError, match=r"call policy.attach\(env\)"):
+        policy_of().act(observed, plan, 0)
+    attached = policy_of()
+    attached.attach(AvoidingEnv(1))
+    with pytest.raises(RuntimeError, match="decodes nothing ahead"):
+        attached.follower(observed, observed[..., 2:], plan, 2)
+    with pytest.raises(ValueError, match="task 'avoiding' has no environment"):
+        OracleFollower(replace(TASK, env=None), blend=0.0)
+    policy = policy_of()
+    with pytest.raises(ValueError, match="needs an environment that simulates actions, object does not"):
+        policy.attach(object())
+
+
+def test_the_command(copied_run, tmp_path):
+    options = ("--episodes", 1, "--threads", 1, "--no-report", "--strategy", "oracle", "--out", tmp_path / "out")
+    assert koap("eval", copied_run, *options) == 0
+    result = json.loads((tmp_path / "out" / "eval.json").read_text())
+    execution = result["execution"]
+    assert execution["strategy"] == "oracle" and execution["blend"] == 0.8 and result["plan_ms"] > 0
+
+
+def test_where_there_is_nothing_to_follow(demonstrations, copied_run, tmp_path, capsys):
+    dp = ("--out", tmp_path / "dp", "--dataset", demonstrations, "--method", "dp", *TINY)
+    assert koap("train", *dp) == 0
+    for run, option, message in (
+        (tmp_path / "dp", (), "strategy 'oracle' was asked of method 'dp', which samples actions"),
+        (copied_run, ("--env", "CartPole-v1"), "reads the task's own simulation; it cannot be combined with env"),
+    ):
+        assert message in fails(capsys, "eval", run, "--strategy", "oracle", *option)
+        assert not (run / "eval.json").exists()
