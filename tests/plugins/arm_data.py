@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A robot with data and no simulator: seven joints, commanded by changes of their angles."""
 
-from __future__ import annotations
-
 from torchrl_koap import Task, register_task
 from torchrl_koap.tasks import Action
 

@@ -5,8 +5,6 @@ Training learns how much every column of a window counts, so that the neighbours
 (``loss_neighbours``); the closed form then remembers all labelled windows.
 """
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 from torch import nn

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """LeRobot's own functions load the folder, roll it out and ask it for actions; in an environment that has LeRobot."""
 
-from __future__ import annotations
-
 import json
 
 import gymnasium
