@@ -1,14 +1,20 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The validator accepts the layout and names every departure from it, all at once."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.keys import REQUIRED, LayoutError, validate
-from torchrl_koap.modules import KoopmanLifting, KoopmanOperator, LatentActionMLP, LinearActionDecoder
+from torchrl_koap.modules import (
+    KoopmanLifting,
+    KoopmanOperator,
+    LatentActionFourier,
+    LatentActionLSTM,
+    LatentActionMLP,
+    LinearActionDecoder,
+)
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 
 
@@ -141,3 +147,19 @@ def test_every_part_names_the_entry_that_it_lacks(part, entry):
         KeyError, match=rf"{type(part).__name__} reads '{entry}'; there are .*'robot', 'window'.*in_key"
     ):
         part(TensorDict({"robot": {"window": torch.zeros(3, 16, 2)}}, [3]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "sizes"),
+    [
+        (KoopmanLifting, (2, 4)),
+        (CompactLifting, (24, 2)),
+        *((kind, (2, 6)) for kind in (LatentActionMLP, LatentActionLSTM, LatentActionFourier)),
+        (LinearActionDecoder, (6, 2)),
+    ],
+)
+def test_every_part_reads_and_writes_the_entries_that_it_is_told(kind, sizes):
+    part = kind(*sizes, in_key=("agent", "x"), out_key=("agent", "z"))
+    written = TensorDictSequential(part)(TensorDict({"agent": {"x": torch.randn(3, 16, sizes[0])}}, [3]))
+    assert written["agent", "z"].shape[:2] == (3, 16)
+    assert part.in_keys == [("agent", "x")] and part.out_keys == [("agent", "z")]

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Actions of another kind than declared are told of, and those of the declared kind are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from shared_data import SHARED

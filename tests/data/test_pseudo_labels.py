@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Relabelling: which window an action is read from, what stays, and that no hidden action is read."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

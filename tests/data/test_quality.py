@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations that are right in form and unlikely: each warning names its trajectory."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -10,14 +8,7 @@ import pytest
 import torch
 
 from torchrl_koap.data import DataError, flatten_trajectories, make_recordings
-from torchrl_koap.data.quality import (
-    constant_columns,
-    drop_short,
-    find_warnings,
-    plan_coverage,
-    still_ends,
-    trim_still,
-)
+from torchrl_koap.data.quality import constant_columns, drop_short, find_warnings, plan_coverage, still_ends, trim_still
 from torchrl_koap.tasks import Action, Task
 
 PATH = torch.arange(40.0).reshape(20, 2)

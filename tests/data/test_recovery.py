@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Recovery in closed form: of the robot, of a gripper that closed on nothing, and along differences of windows."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations as a TorchRL data set."""
 
-from __future__ import annotations
-
 import pytest
 from torchrl.data.datasets import load_dataset
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One way in for every folder of demonstrations: right numbers, right task, noise of its own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scenes are moved and turned as a whole, and alike objects exchanged."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from counted_windows import moving_windows

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Data sets on disk: what is saved is loaded, with its task; damage and code are refused."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

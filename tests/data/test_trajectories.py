@@ -1,15 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Trajectories with and without actions become one flat tensordict that says which steps have a label."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.data import extrapolate_ends, flatten_trajectories, mark_labels
+from torchrl_koap.data import extrapolate_ends, flatten_trajectories, mark_labels, select_state
 from torchrl_koap.keys import validate
 
 
@@ -53,6 +51,16 @@ def test_wrong_shapes_and_numbers_are_named():
         steps[2, 1] = value
         with pytest.raises(ValueError, match="trajectory 1: 1 actions are infinite or NaN in some .*, first at step 2"):
             flatten_trajectories(frames, [None, steps])
+
+
+def test_columns_of_the_state_are_chosen_by_number():
+    data = flatten_trajectories([torch.rand(4, 4)], None, action_dim=1)
+    assert (
+        torch.equal(select_state(data, (3, 2))["state"], data["observation"][:, [3, 2]]) and "state" not in data.keys()
+    )
+    for wrong in ((), (4,), (-1,)):
+        with pytest.raises(ValueError, match=r"0\.\.3"):
+            select_state(data, wrong)
 
 
 def test_labels_are_marked_where_actions_are():

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Windows are equally likely, hold the promised labels, and a draw is the generator's alone."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from counted_windows import demonstrations, seen
@@ -81,20 +79,13 @@ def test_a_run_goes_on_where_it_stopped(how, share, tmp_path):
     assert [seen(resumed.sample()) for _ in range(9)] == expected
 
 
-def test_an_own_generator():
+@pytest.mark.parametrize("own", [True, False])
+def test_sampling_uses_an_own_generator_or_the_global_one(own):
     draws = []
-    for _ in range(2):
-        torch.manual_seed(len(draws))
+    for number in range(2):
+        torch.manual_seed(number if own else 0)
         buffer = make(0.5)
-        buffer.set_rng(torch.Generator().manual_seed(0))
-        draws.append(seen(buffer.sample()))
-    assert draws[0] == draws[1]
-
-
-def test_sampling_uses_the_global_generator():
-    buffer = make(0.5)
-    torch.manual_seed(0)
-    first = seen(buffer.sample())
-    torch.manual_seed(0)
-    assert seen(buffer.sample()) == first
-    assert seen(buffer.sample()) != first
+        if own:
+            buffer.set_rng(torch.Generator().manual_seed(0))
+        draws.append([seen(buffer.sample()) for _ in range(2)])
+    assert draws[0] == draws[1] and draws[0][0] != draws[0][1]

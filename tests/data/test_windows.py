@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Windows stay inside their trajectory, are padded by its ends, and are stored rows."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from counted_windows import LENGTHS, demonstrations, seen
@@ -81,14 +79,6 @@ def test_padded_frames_are_told():
         expected = [steps[0] == steps[1] == 0]
         expected += [steps[frame] == steps[frame - 1] and steps[frame] > 0 for frame in range(1, 4)]
         assert padded.tolist() == expected
-
-
-def test_the_rollout_start_is_a_window():
-    """A rollout begins with its first observation twice: with history 2 that is one padded frame before."""
-    table = WindowTable.build(demonstrations((20,)), 16, pad_before=1)
-    assert table.starts.tolist() == [-1, 0, 1, 2, 3, 4]
-    frames, padded = table.frames(torch.tensor([0]))
-    assert frames.tolist() == [[0, *range(15)]] and padded.tolist() == [[True] + [False] * 15]
 
 
 @settings(max_examples=40, deadline=None)

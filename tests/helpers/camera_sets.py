@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Small LeRobot data sets that a camera saw."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from torchrl_koap.data.formats.writers import LeRobotWriter

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What the tests of commands share: what a folder holds, and the one line of a command that cannot be done."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tiny_runs import koap

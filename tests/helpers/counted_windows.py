@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Trajectories whose observations say which trajectory and step they are, and windows whose actions move the state."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What the losses of planner and Diffusion Policy must do alike, as a base class, and the formula of the noise."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from loss_test_base import LossTestBase

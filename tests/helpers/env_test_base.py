@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What every environment of D3IL's tasks has to do; a test file per task subclasses it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -6,8 +6,6 @@ with 2 and the option named. A call that comes to the work itself (training, rol
 there, so that hundreds of faults take seconds.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -110,12 +108,7 @@ def meet(fault: Fault, place: Place) -> Outcome:
     if fault.damage is not None:
         fault.damage(place)
     said = io.StringIO()
-    with (
-        contextlib.redirect_stderr(said),
-        contextlib.redirect_stdout(io.StringIO()),
-        stopped_at_work(),
-        _in_time(),
-    ):
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()), stopped_at_work(), _in_time():
         try:
             status = koap(*words)
         except AcceptedError:

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Recordings of a robot of one's own, whose cameras see a square where it is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@
 Commands are changes of the commanded xy per control step (mm).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from torchrl_koap.envs.experts.avoiding import AvoidingExpert

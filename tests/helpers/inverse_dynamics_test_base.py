@@ -4,8 +4,6 @@
 A subclass says how to build its network, which frames an action may read and which frames count.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What another process does a little later than it says."""
 
-from __future__ import annotations
-
 import time
 
 

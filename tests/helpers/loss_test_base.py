@@ -5,8 +5,6 @@ A subclass says how to build its loss and a batch, and what the defaults are. Ba
 (noise, times), so that a loss is a function of its input.
 """
 
-from __future__ import annotations
-
 import copy
 import inspect
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A toy robot without an environment: joints that follow delta commands with a lag, few of them labelled."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations as D3IL's recorder writes them, for what reads them."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 

@@ -1,14 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The same recordings in every format that is read."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Dict
 
 Columns = dict[str, np.ndarray]
 Episodes = list[tuple[Columns, Columns]]  # states with their time stamps, and actions
@@ -77,34 +76,37 @@ def write_hdf5(folder: Path, episodes: Episodes) -> str:
     return str(folder / "all.hdf5")
 
 
-def write_minari(folder: Path, episodes: Episodes) -> str:
-    """Writes where MINARI_DATASETS_PATH has to point to."""
+def store_minari(root: Path, name: str, space, action_space, episodes: list[tuple]) -> str:
+    """Written through Minari's own storage: its collector needs packages that only recording needs."""
     pytest.importorskip("minari")
-    from gymnasium.spaces import Box, Dict
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 
-    data = folder / "arm" / "all-v0" / "data"
-    data.mkdir(parents=True)
+    (root / name / "data").mkdir(parents=True)
+    storage = MinariStorage.new(root / name / "data", space, action_space)
+    for number, (observations, actions) in enumerate(episodes):
+        steps = len(actions)
+        rest = {"rewards": [0.0] * steps, "truncations": [False] * steps, "infos": {}}
+        ends = [False] * (steps - 1) + [True]
+        storage.update_episodes(
+            [EpisodeBuffer(id=number, observations=observations, actions=actions, terminations=ends, **rest)]
+        )
+    storage.update_metadata({"dataset_id": name, "minari_version": "0.5.4"})
+    return f"minari:{name}"
+
+
+def write_minari(folder: Path, episodes: Episodes) -> str:
+    """Writes where MINARI_DATASETS_PATH has to point to."""
     states, actions = episodes[0]
-    spaces = Dict({name: Box(0, 1, (1,), values.dtype) for name, values in states.items()})
-    storage = MinariStorage.new(data, spaces, Box(-np.inf, np.inf, (len(actions),)))
-    storage.update_episodes(
-        [
-            EpisodeBuffer(
-                id=number,
-                observations={name: list(values[:, None]) for name, values in states.items()},
-                actions=list(np.stack(list(actions.values()), 1)[:-1]),
-                rewards=[0.0] * (len(states["q0"]) - 1),
-                terminations=[False] * (len(states["q0"]) - 2) + [True],
-                truncations=[False] * (len(states["q0"]) - 1),
-                infos={},
-            )
-            for number, (states, actions) in enumerate(episodes)
-        ]
-    )
-    storage.update_metadata({"dataset_id": "arm/all-v0", "minari_version": "0.5.4"})
-    return "minari:arm/all-v0"
+    space = Dict({name: Box(0, 1, (1,), values.dtype) for name, values in states.items()})
+    stored = [
+        (
+            {name: list(values[:, None]) for name, values in states.items()},
+            list(np.stack(list(actions.values()), 1)[:-1]),
+        )
+        for states, actions in episodes
+    ]
+    return store_minari(folder, "arm/all-v0", space, Box(-np.inf, np.inf, (len(actions),)), stored)
 
 
 WRITERS = {

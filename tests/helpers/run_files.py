@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Small run directories for the tests of pictures and report."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Where recordings and human demonstrations lie that the package never ships; tests that need them skip without."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

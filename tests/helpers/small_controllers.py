@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Controllers of the task Avoiding, or of one about which nothing is known but its columns."""
 
-from __future__ import annotations
-
 from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.tasks import Action, Task, get_task
 from torchrl_koap.training.methods import get_method

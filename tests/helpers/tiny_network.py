@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Networks of one's own for `koap embed --network`."""
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 

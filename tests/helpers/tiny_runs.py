@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations and options with which `koap` is through in a second."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Made-up episodes, as rollouts return them."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A robot of two joints in Gymnasium, that reports success in different ways, and demonstrations of it."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedEnv

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Planners, controllers and environments whose outputs say where they are from."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase

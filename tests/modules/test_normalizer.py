@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Statistics against closed forms; constant columns, masks, state dicts, and missing statistics."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Ridge regression in closed form: against numpy, and its held-out errors against brute-force refits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Time alignment: which frames are read, which count, replayed on a known linear system."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -112,9 +110,6 @@ def test_wrong_windows_and_offsets_are_named():
         reader(torch.zeros(10, 3))
     with pytest.raises(ValueError, match="must be >= 1, got"):
         WindowReader(2, look_ahead=0, min_offset=1)
-
-
-# what is really read: the gradient's sparsity
 
 
 # replay: x_{t+1} = A x_t + B a_t with a state that holds the last k actions, so that x_{t+k} tells a_t apart

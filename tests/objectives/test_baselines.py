@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The loss of predicted actions: a plain loop, padding, and the shared base."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from inverse_dynamics_test_base import KEYS, T, normalizers, partly_labelled
@@ -27,11 +25,8 @@ class TestActionLoss(LossTestBase):
     in_names, out_keys = ("state", "action", "has_action"), ("loss_action",)
     learning_rate = 1e-2
 
-    def make_loss(self, seed=0, **options):
-        return make_loss(seed, **options)
-
-    def make_batch(self, *batch):
-        return windows(*batch)
+    make_loss = staticmethod(make_loss)
+    make_batch = staticmethod(windows)
 
     def counted(self, batch, key, elements):
         return int(batch["has_action"][..., 1:-1, :].sum())

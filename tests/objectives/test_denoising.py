@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The planner's loss, and all that is a denoising loss's: closed forms, keys, reductions, averages, compilation."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from denoising_test_base import DenoisingLossTestBase, noised
@@ -44,11 +42,8 @@ class TestPlannerLoss(DenoisingLossTestBase):
     in_names, out_keys = ("state",), ("loss_planner",)
     decrease = 0.5
 
-    def make_loss(self, seed=0, **options):
-        return make_loss(seed=seed, **options)
-
-    def make_batch(self, *batch):
-        return batch_of(*batch)
+    make_loss = staticmethod(make_loss)
+    make_batch = staticmethod(batch_of)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

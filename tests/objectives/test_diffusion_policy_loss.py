@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The Diffusion Policy's loss: closed forms, alignment in time, labels and padding, and what it learns."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from denoising_test_base import DenoisingLossTestBase, noised
@@ -16,14 +14,7 @@ HORIZON, ACT = 6, 3
 
 def make_policy(history=2, **options):
     denoiser = MLPDenoiser(ACT, 2 * history, horizon=HORIZON, width=32)
-    policy = DiffusionPolicy(
-        denoiser,
-        state_dim=2,
-        action_dim=ACT,
-        history=history,
-        horizon=HORIZON,
-        **options,
-    )
+    policy = DiffusionPolicy(denoiser, state_dim=2, action_dim=ACT, history=history, horizon=HORIZON, **options)
     data = batch_of(64, history=history)
     policy.fit_normalizers(data["state"], data["action"][data["has_action"].squeeze(-1)])
     return policy
@@ -62,11 +53,8 @@ class TestDiffusionPolicyLoss(DenoisingLossTestBase):
     }
     in_names, out_keys = ("state", "action", "has_action"), ("loss_policy",)
 
-    def make_loss(self, seed=0, **options):
-        return make_loss(seed=seed, **options)
-
-    def make_batch(self, *batch):
-        return batch_of(*batch)
+    make_loss = staticmethod(make_loss)
+    make_batch = staticmethod(batch_of)
 
     def counted(self, batch, key, elements):
         return int(batch["has_action"][..., 1:-1, :].sum()) * ACT

@@ -1,17 +1,51 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The Koopman losses: closed forms in plain loops, masks, labels that must not leak, and the shared base."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-from inverse_dynamics_test_base import KEYS, recorded
+from inverse_dynamics_test_base import KEYS, T, normalizers, partly_labelled, recorded
 from loss_test_base import LossTestBase
-from small_koopman import HISTORY, LOSSES, NETWORKS, K, T, make_batch, make_network
 from tensordict import TensorDict
 
-from torchrl_koap.modules import LatentActionLSTM, LatentActionMLP
-from torchrl_koap.objectives import KOAPLoss, LatentActionLoss
+from torchrl_koap.modules import (
+    KoopmanInverseDynamics,
+    KoopmanLifting,
+    KoopmanOperator,
+    LatentActionFourier,
+    LatentActionLSTM,
+    LatentActionMLP,
+    LinearActionDecoder,
+)
+from torchrl_koap.objectives import KOAPLoss, KoopmanDynamicsLoss, KoopmanReconstructionLoss, LatentActionLoss
+
+K, HISTORY = 3, 1
+LOSSES = (KoopmanReconstructionLoss, KoopmanDynamicsLoss, LatentActionLoss, KOAPLoss)
+NETWORKS = ("mlp", "lstm", "fourier")
+
+
+def make_network(kind="mlp", *, clamped=False, seed=0):
+    torch.manual_seed(seed)
+    frames = {"num_past": HISTORY, "look_ahead": K, "clamped": clamped}
+    if kind == "mlp":
+        latent_action = LatentActionMLP(3, 4, hidden_dims=(16,), **frames)
+    elif kind == "lstm":
+        latent_action = LatentActionLSTM(3, 4, hidden_dim=8, **frames)
+    else:
+        latent_action = LatentActionFourier(3, 16, **frames)
+    operator = KoopmanOperator(4, input_dim=latent_action.latent_dim if kind == "fourier" else None)
+    if kind == "fourier":
+        torch.nn.init.normal_(operator.input, std=0.1)
+    return KoopmanInverseDynamics(
+        latent_action,
+        LinearActionDecoder(latent_action.latent_dim, 2),
+        lifting=KoopmanLifting(3, 4, hidden_dims=(16,), include_state=kind == "fourier"),
+        operator=operator,
+        **normalizers(),
+    )
+
+
+def make_batch(*batch, share=0.5):
+    return partly_labelled(*batch, share=share).exclude("padded")
 
 
 def span(clamped):
@@ -28,11 +62,7 @@ class TestKOAP(LossTestBase):
     def make_loss(self, seed=0, **options):
         return KOAPLoss(make_network("fourier", seed=seed), **options)
 
-    def make_batch(self, *batch):
-        data = make_batch(*batch)
-        padded = torch.zeros(*batch, T, dtype=torch.bool)
-        padded[..., :2] = torch.rand(*batch, 1, generator=torch.Generator().manual_seed(1)) < 0.4
-        return data.set("padded", padded)
+    make_batch = staticmethod(partly_labelled)
 
     def counted(self, batch, key, elements):
         if key == "loss_reconstruction":
@@ -145,9 +175,6 @@ def test_a_labelled_action_that_is_nan_is_loud():
     batch = make_batch(4, share=1.0)
     batch["action"][0, 2] = torch.nan
     assert LatentActionLoss(make_network())(batch)["loss_action"].isnan()
-
-
-# padding
 
 
 # the network

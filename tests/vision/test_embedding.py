@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Camera frames as columns of a data set: which ones, fitted to what, resumed, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Frozen encoders: what is kept, what is refused."""
 
-from __future__ import annotations
-
 import importlib.util
 import warnings
 

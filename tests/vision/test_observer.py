@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a robot gives, with frames, as the observation that a policy reads: columns in order, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -58,9 +56,6 @@ def test_numbers_that_no_policy_sees_may_be_left_out():
         ({"wrst": FRAME}, "has an unknown 'wrst': wanted state, top, wrist"),
         ({"state": np.zeros(3)}, r"'state' must be \[4\] beside these frames, got \[3\]"),
         ({"top": FRAME[..., :1]}, "the frame of camera 'top' is greyscale"),
-        ({"top": FRAME / 255}, "the frame of camera 'top' is float64, wanted uint8"),
-        ({"wrist": np.dstack([FRAME, FRAME[..., :1]])}, "the frame of camera 'wrist' is RGBA"),
-        ({"top": FRAME.transpose(2, 0, 1)}, "put the colours last"),
     ],
 )
 def test_other_entries_are_refused(change, says):

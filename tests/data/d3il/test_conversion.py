@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Raw episodes become the columns of docs/appendix/d3il.md; D3IL's folders and lists; files of another task."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os
@@ -15,14 +13,7 @@ import torch
 from raw_episodes import made_up, pose, turned, write_folder, write_raw_episode
 
 from torchrl_koap.data import open_dataset
-from torchrl_koap.data.d3il.conversion import (
-    CONVERTERS,
-    ROBOT_COLUMNS,
-    RawEpisode,
-    find_raw_files,
-    read_raw,
-    read_raw_episode,
-)
+from torchrl_koap.data.d3il.conversion import CONVERTERS, RawEpisode, find_raw_files, read_raw
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
@@ -307,11 +298,3 @@ def test_what_is_missing_or_broken_is_named(tmp_path, change, problems):
 def test_other_contents(tmp_path, content):
     (tmp_path / "other.pkl").write_bytes(pickle.dumps(content))
     assert "missing key 'robot'" in faults("avoiding", tmp_path)[0]
-
-
-def test_what_is_there_is_read(tmp_path):
-    episode = made_up("stacking", extra=["target-box"])
-    path = write_raw_episode(tmp_path / "a.pkl", episode.robot, episode.objects, context=[(0.1, np.zeros(2))])
-    read = read_raw_episode(path, robot=list(ROBOT_COLUMNS), objects=["red-box"])
-    np.testing.assert_equal(read.robot, episode.robot)
-    np.testing.assert_equal(read.objects, episode.objects)

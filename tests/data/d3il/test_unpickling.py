@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Hostile and damaged pickles are refused by name; arrays of every kind and protocol survive."""
 
-from __future__ import annotations
-
 import collections
 import copyreg
 import os
@@ -136,34 +134,6 @@ def test_hostile_files_are_refused_by_name_and_not_run(case, protocol, tmp_path,
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_other_containers_are_refused(protocol):
-    with pytest.raises(UnsafePickleError, match="(?i)set"):
-        loads_pickle(pickle.dumps({1, 2}, protocol))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (pickle.dumps(np.array([None, "x"], dtype=object)), "element type 'O8'"),
-        (b"\x80\x02cnumpy.f2py.diagnose\nrun\n)R.", r"numpy\.f2py\.diagnose\.run"),  # not even imported
-        (b"\x80\x04\x8c\x05numpy\x8c\x10ndarray.__init__\x93.", r"numpy\.ndarray\.__init__"),
-        (b"\x80\x04\x8c\x02os\x94\x8c\x06system\x940h\x00h\x01\x93.", r"instruction POP \(after os system\)"),
-        (b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94\x86h\x00h\x01\x93.", r"os\.system"),  # remembered names
-        (b"Pid\n.", "PERSID"),
-        (b"\x80\x04\x8c\x02id\x51.", "PERSID"),
-    ],
-)
-def test_what_asks_for_more_is_refused_by_name(content, message):
-    with pytest.raises(UnsafePickleError, match=message):
-        loads_pickle(content)
-
-
-def test_a_name_that_is_no_text_is_refused():
-    with pytest.raises(DataError, match="STACK_GLOBAL requires str"):
-        loads_pickle(b"\x80\x04]\x8c\x06system\x93.")
-
-
 def test_extension_codes_are_refused():
     copyreg.add_extension("builtins", "print", 0x7F)
     try:
@@ -175,51 +145,53 @@ def test_extension_codes_are_refused():
         copyreg.remove_extension("builtins", "print", 0x7F)
 
 
+def array_of(shape: bytes, state: bytes = b"U\x08\x00\x00\x00\x00\x00\x00\x00\x00") -> bytes:
+    return (
+        b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
+        b"(K\x01" + shape + b"cnumpy\ndtype\nU\x02f8\x89\x88\x87R\x89" + state + b"tb."
+    )
+
+
 @pytest.mark.parametrize(
-    "content",
+    ("content", "message"),
     [
-        b"\x80\x02cnumpy\nndarray\n}U\x01xK\x01sb.",  # attributes of the class through BUILD
-        b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n}U\x08__code__K\x01sb.",  # ... of a function
-        b"\x80\x02ccollections\nOrderedDict\n(N}U\x01xK\x01stb.",  # ... through slots
-        b"\x80\x02cnumpy\nndarray\n.",  # a class as a value
-        b"\x80\x02cnumpy\nndarray\nK\x05\x85R.",  # a class called
-        b"(S'x'\ni__builtin__\neval\n.",  # an instance of an old class
-        b"\x80\x02cnumpy\nndarray\n)\x81.",  # NEWOBJ
-        b"\x80\x04\x8c\x05numpy\x8c\x07ndarray\x93)}\x92.",  # NEWOBJ_EX
-        b"\x80\x05\x97.",  # out-of-band buffer
-        b"\x80\x02c_codecs\nencode\nX\x01\x00\x00\x00aX\x03\x00\x00\x00zip\x86R.",
+        *((pickle.dumps({1, 2}, protocol), "(?i)set") for protocol in PROTOCOLS),
+        (pickle.dumps(np.array([None, "x"], dtype=object)), "element type 'O8'"),
+        (array_of(b"K\x01\x85", b"]K\x01a"), "objects"),  # a permitted element type, and a list of objects
+        (b"\x80\x02cnumpy.f2py.diagnose\nrun\n)R.", r"numpy\.f2py\.diagnose\.run"),  # not even imported
+        (b"\x80\x04\x8c\x05numpy\x8c\x10ndarray.__init__\x93.", r"numpy\.ndarray\.__init__"),
+        (b"\x80\x04\x8c\x02os\x94\x8c\x06system\x940h\x00h\x01\x93.", r"instruction POP \(after os system\)"),
+        (b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94\x86h\x00h\x01\x93.", r"os\.system"),  # remembered names
+        (b"\x80\x04]\x8c\x06system\x93.", "STACK_GLOBAL requires str"),
+        (b"Pid\n.", "PERSID"),
+        (b"\x80\x04\x8c\x02id\x51.", "PERSID"),
+        # tricks with permitted names
+        (b"\x80\x02cnumpy\nndarray\n}U\x01xK\x01sb.", ""),  # attributes of the class through BUILD
+        (b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n}U\x08__code__K\x01sb.", ""),  # ... of a function
+        (b"\x80\x02ccollections\nOrderedDict\n(N}U\x01xK\x01stb.", ""),  # ... through slots
+        (b"\x80\x02cnumpy\nndarray\n.", ""),  # a class as a value
+        (b"\x80\x02cnumpy\nndarray\nK\x05\x85R.", ""),  # a class called
+        (b"(S'x'\ni__builtin__\neval\n.", ""),  # an instance of an old class
+        (b"\x80\x02cnumpy\nndarray\n)\x81.", ""),  # NEWOBJ
+        (b"\x80\x04\x8c\x05numpy\x8c\x07ndarray\x93)}\x92.", ""),  # NEWOBJ_EX
+        (b"\x80\x05\x97.", ""),  # out-of-band buffer
+        (b"\x80\x02c_codecs\nencode\nX\x01\x00\x00\x00aX\x03\x00\x00\x00zip\x86R.", ""),
     ],
 )
-def test_tricks_with_permitted_names_are_refused(content):
+def test_what_asks_for_more_is_refused(content, message):
     before = dict(vars(np.ndarray))
-    with pytest.raises(UnsafePickleError):
+    with pytest.raises(DataError, match=message) as refused:
         loads_pickle(content)
+    assert isinstance(refused.value, UnsafePickleError) or message.startswith("STACK_GLOBAL")
     assert dict(vars(np.ndarray)) == before
 
 
-def test_array_state_of_objects_is_refused():
-    # a permitted element type, but the state carries a list of objects
-    content = (
-        b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
-        b"(K\x01K\x01\x85cnumpy\ndtype\nU\x02f8\x89\x88\x87R\x89]K\x01atb."
-    )
-    with pytest.raises(UnsafePickleError, match="objects"):
-        loads_pickle(content)
-
-
-def array_with_shape(shape: bytes) -> bytes:
-    return (
-        b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
-        b"(K\x01" + shape + b"cnumpy\ndtype\nU\x02f8\x89\x88\x87R\x89U\x08\x00\x00\x00\x00\x00\x00\x00\x00tb."
-    )
-
-
 def test_declared_sizes_never_allocate():
-    np.testing.assert_array_equal(loads_pickle(array_with_shape(b"K\x01\x85")), [0.0])
+    np.testing.assert_array_equal(loads_pickle(array_of(b"K\x01\x85")), [0.0])
     with pytest.raises(DataError, match="the file holds 8"):
-        loads_pickle(array_with_shape(b"\x8a\x05\x00\x00\x00\x00\x20\x85"))  # 2^37 elements
+        loads_pickle(array_of(b"\x8a\x05\x00\x00\x00\x00\x20\x85"))  # 2^37 elements
     with pytest.raises(DataError):
-        loads_pickle(array_with_shape(b"J\xff\xff\xff\xff\x85"))  # a negative size
+        loads_pickle(array_of(b"J\xff\xff\xff\xff\x85"))  # a negative size
     with pytest.raises(DataError):  # 2^60 bytes of text announced
         loads_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 2**60) + b"abc.")
     with pytest.raises(UnsafePickleError, match="memory"):

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Columns of parquet files become arrays of numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

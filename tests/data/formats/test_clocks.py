@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Time stamps: the rate that they say, and columns that are clocks by what they do."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

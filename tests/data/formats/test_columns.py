@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Named columns as recordings: what is no state, where episodes end, and the rate by the time stamps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -79,20 +77,6 @@ def test_columns_are_chosen_by_name():
     assert (found.state_names, found.action_names, found.skipped) == (("time", "x"), ("v",), ("y", "w"))
     with pytest.raises(DataError, match=r"unknown column in drop_columns \(--drop-columns\): 'yy'; did you mean 'y'"):
         assemble(pieces, "data", control_hz=5, drop_columns=["yy"])
-
-
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
-        ({"time": np.arange(6) * 33.0}, "0.0303 frames per second if it is in seconds: name it time_ms"),
-        ({"time": np.zeros(6)}, "time stamps do not increase"),
-        ({"time": [0, 0.1, 0.2, 3.2, 3.3, 3.4]}, r"run: frames are 0.1 to 3 s apart \(frame 2\)"),
-    ],
-)
-def test_time_stamps_that_cannot_be(columns, message):
-    with pytest.raises(DataError, match=message):
-        read(control_hz=None, **columns)
-    assert read(**columns).control_hz == 20  # what is asked for counts
 
 
 def test_the_rate_is_read_in_its_unit_and_compared():
@@ -204,11 +188,6 @@ def test_episodes_of_one_frame_are_left_out_and_listed():
     assert [len(frames) for frames in found.states] == [3, 2] and found.skipped[0] == "run[0] (fewer than two frames)"
     with pytest.raises(DataError, match="none of its 6 trajectories has two frames"):
         read(episode=np.arange(6))
-
-
-def test_time_stamps_that_are_not_looked_at_are_told():
-    assert read(control_hz=50, time=np.arange(6) / 20).skipped == ("time (it says 20 frames per second)",)
-    assert read(control_hz=20, time=np.arange(6) / 20).skipped == ("time",)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Camera frames stay where they are: what a reference reads is what was recorded, and what is missing is named."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

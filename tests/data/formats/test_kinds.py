@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a column is: by its name, and by what it holds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,20 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Minari data sets on this machine."""
 
-from __future__ import annotations
-
-import importlib.util
-
 import gymnasium
 import numpy as np
 import pytest
+from recording_writers import store_minari
 
 from torchrl_koap.data.formats.minari import read_minari
 from torchrl_koap.files import DataError
-
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("minari") is None, reason="Minari is not installed (extra 'minari')"
-)
 
 
 class Slider:
@@ -37,33 +30,12 @@ def dataset(tmp_path, monkeypatch):
 
 
 def write(root, space, observations):
-    """Written through Minari's own storage: its collector needs packages that only recording needs."""
-    from minari.data_collector import EpisodeBuffer
-    from minari.dataset.minari_storage import MinariStorage
-
-    folder = root / "slider" / "test-v0" / "data"
-    folder.mkdir(parents=True)
-    storage = MinariStorage.new(folder, space, Slider.action_space)
-    episodes = [
-        EpisodeBuffer(
-            id=number,
-            seed=0,
-            observations=observations,
-            actions=[np.full(1, 0.5, np.float32)] * 6,
-            rewards=[0.0] * 6,
-            terminations=[False] * 5 + [True],
-            truncations=[False] * 6,
-            infos={},
-        )
-        for number in range(2)
-    ]
-    storage.update_episodes(episodes)
-    storage.update_metadata({"dataset_id": "slider/test-v0", "minari_version": "0.5.4"})
-    return "slider/test-v0"
+    episode = observations, [np.full(1, 0.5, np.float32)] * 6
+    return store_minari(root, "slider/test-v0", space, Slider.action_space, [episode] * 2)
 
 
 def test_a_data_set_as_arrays(dataset):
-    recordings = read_minari(f"minari:{dataset}", control_hz=25)
+    recordings = read_minari(dataset, control_hz=25)
     assert recordings.state_names == ("place",) and recordings.skipped == ("camera",)
     assert [frames.shape for frames in recordings.states] == [(7, 1), (7, 1)]
     assert recordings.num_labels == 12
@@ -74,7 +46,7 @@ def test_an_unknown_data_set_and_rate(dataset):
     with pytest.raises(FileNotFoundError, match="'slider/other-v0' is not on this machine"):
         read_minari("minari:slider/other-v0")
     with pytest.raises(DataError, match="pass control_hz"):
-        read_minari(f"minari:{dataset}")
+        read_minari(dataset)
 
 
 @pytest.mark.parametrize("width", [1, 2])
@@ -82,6 +54,6 @@ def test_observations_that_are_a_tuple(width, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     spaces = [gymnasium.spaces.Box(-9, 9, (size,)) for size in (1, width)]
     name = write(tmp_path, gymnasium.spaces.Tuple(spaces), (PLACES, [np.repeat(place, width) for place in PLACES]))
-    found = read_minari(f"minari:{name}", control_hz=25)
+    found = read_minari(name, control_hz=25)
     assert found.state_names == (("0", "1") if width == 1 else ("0", "1_0", "1_1"))
     np.testing.assert_array_equal(found.states[0], np.repeat(PLACES, 1 + width, 1))

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Arrays as recordings: what is a label, and one clear message per fault."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -36,11 +34,6 @@ def test_no_labels_at_all_needs_their_width():
         make_recordings([FRAMES])
 
 
-def test_tensors_are_arrays_too():
-    recordings = make_recordings([torch.from_numpy(FRAMES).float().requires_grad_()], [torch.ones(4, 1)])
-    assert recordings.states[0].dtype == np.float64 and recordings.num_labels == 4
-
-
 def test_what_is_masked_or_none_is_unknown():
     """A mask that is not looked at would make labels of what its owner has ruled out."""
     hidden = np.ma.masked_array(np.ones((4, 2)), mask=np.arange(4)[:, None] == [1, 1])
@@ -55,8 +48,10 @@ def test_what_is_masked_or_none_is_unknown():
 def test_arrays_of_any_type_of_numbers():
     kept = [FRAMES.astype(kind) for kind in ("f2", ">f4", ">i8", "u1")] + [np.asfortranarray(FRAMES), FRAMES[::-1]]
     kept += [torch.from_numpy(FRAMES).bfloat16(), (torch.from_numpy(FRAMES) * 1j).conj().imag.neg()]
-    recordings = make_recordings((frames for frames in kept), action_dim=1)
-    assert [frames.sum() for frames in recordings.states] == [105.0] * 8
+    kept += [torch.from_numpy(FRAMES).float().requires_grad_()]
+    recordings = make_recordings((frames for frames in kept), [torch.ones(4, 1)] * 9)
+    assert [frames.sum() for frames in recordings.states] == [105.0] * 9 and recordings.num_labels == 36
+    assert {frames.dtype for frames in recordings.states} == {np.dtype(np.float64)}
 
 
 def with_nan(array):

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Recordings at another rate: states between frames, and what becomes of actions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Folders of NumPy archives, CSV and parquet files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -78,14 +76,6 @@ def test_what_is_not_read_is_named(tmp_path):
     assert recordings.skipped == ("obs", "reward") and recordings.states[0].shape == FRAMES.shape
 
 
-def test_columns_of_text_are_named(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    parquet.write_table(pyarrow.table(columns_of(action=[0.1] * 6, phase=["reach"] * 6)), tmp_path / "run.parquet")
-    recordings = read_tables(tmp_path)
-    assert recordings.skipped == ("phase (no numbers)", "timestamp") and recordings.state_names == ("x", "y")
-
-
 def test_faults_of_all_files_are_named(tmp_path):
     np.savez(tmp_path / "a.npz", pictures=FRAMES)
     (tmp_path / "b.csv").write_text("x,y\n1,2\n3\n")
@@ -116,22 +106,8 @@ def test_tables_without_a_rate_or_states(columns, message, tmp_path):
 def test_a_rate_that_is_given_needs_no_time_stamps(tmp_path):
     write_csv(tmp_path / "run.csv", {"x": [0.0, 1.0], "action": [0.0, 1.0]})
     assert read_tables(tmp_path, control_hz=30).control_hz == 30
-    with pytest.raises(
-        DataError, match=r"unknown column in action_columns \(--action-columns\): 'akcion'; did you mean 'action'"
-    ):
+    with pytest.raises(DataError, match=r"unknown column in action_columns .*: 'akcion'; did you mean 'action'"):
         read_tables(tmp_path, control_hz=30, action_columns=["akcion"])
-
-
-def test_other_columns_in_another_file(tmp_path):
-    write_csv(tmp_path / "a.csv", columns_of())
-    write_csv(tmp_path / "b.csv", {"timestamp": [0.0, 0.02], "y": [0.0, 1.0], "x": [2.0, 3.0]})
-    assert read_tables(tmp_path, action_dim=1).states[1].tolist() == [[2, 0], [3, 1]]  # by name, not by place
-    write_csv(tmp_path / "c.csv", {"timestamp": [0.0, 0.02], "X": [0.0, 1.0], "y": [0.0, 1.0]})
-    with pytest.raises(
-        DataError, match="c.csv: its state columns are not those of a.csv: it lacks x and has X besides"
-    ):
-        read_tables(tmp_path)
-    assert read_tables(tmp_path, action_dim=1, state_columns=["y"]).state_names == ("y",)
 
 
 def test_an_empty_folder(tmp_path):
@@ -147,8 +123,7 @@ def test_damaged_archives_are_named(content, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("header", "message"),
-    [("time,x,y,x", "columns 2 and 4 are both named 'x'"), ("time,,x,y", "column 2 has no name")],
+    ("header", "message"), [("time,x,y,x", "columns 2 and 4 are both named 'x'"), ("time,,x,y", "column 2 has no name")]
 )
 def test_columns_that_would_be_lost_are_refused(header, message, tmp_path):
     (tmp_path / "a.csv").write_text(header + "\n0,0.1,1,2\n1,0.2,1,2\n")

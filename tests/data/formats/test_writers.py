@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a LeRobot data set looks like on disk; reading it back is tested with the readers."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

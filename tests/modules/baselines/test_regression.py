@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Ridge regressions: exact on a linear system, blind to hidden labels; components of windows, and their number."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from inverse_dynamics_test_base import InverseDynamicsTestBase, normalizers, partly_labelled

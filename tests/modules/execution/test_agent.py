@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A policy in a control loop: the actions of a rollout, one robot or a batch, and clear refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -21,7 +19,6 @@ from torchrl_koap.modules import (
     make_policy,
 )
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
-from torchrl_koap.modules.execution.policy_env import NoiseStreams
 
 STEPS = 13
 
@@ -34,6 +31,13 @@ def small_planner(**options):
 def policy_of(strategy="feedback", columns=(0, 1), **options):
     planner = small_planner(**options)
     return make_policy(planner, make_koopman_inverse_dynamics(2, 2), state_of=columns, execution=Execution(strategy))
+
+
+def ready(policy=None, **options):
+    """An agent at the beginning of an episode."""
+    agent = Agent(policy_of() if policy is None else policy, **options)
+    agent.reset()
+    return agent
 
 
 def chunks():
@@ -53,16 +57,14 @@ def test_the_actions_of_a_rollout_bit_for_bit(make, robots):
     env.set_seed(7)
     with torch.no_grad():
         rollout = env.rollout(STEPS, policy)
-    agent = Agent(policy, seed=7)
-    agent.reset()
+    agent = ready(policy, seed=7)
     for step in range(STEPS):
         action = agent.act(rollout["observation"][:, step])
         assert torch.equal(action, rollout["action"][:, step]), step
 
 
 def test_numpy_or_torch_one_robot_or_several():
-    agent = Agent(policy_of(), seed=3)
-    agent.reset()
+    agent = ready(seed=3)
     one = agent.act(np.array([0.1, 0.2]))
     assert isinstance(one, np.ndarray) and one.shape == (2,) and one.dtype == np.float32
     agent.reset()
@@ -79,14 +81,10 @@ def test_what_a_robot_gives_is_observed_first():
         state_of=(0, 1),
         observe=lambda given: torch.as_tensor(given["state"]) + given["top"].mean(),
     )
-    one, other = Agent(policy, seed=3), Agent(policy, seed=3)
-    one.reset(), other.reset()
-    action = one.act({"state": np.zeros(2), "top": np.full((4, 4, 3), 2.0)})
-    assert isinstance(action, np.ndarray) and np.array_equal(action, other.act(np.full(2, 2.0)))
-    blind = Agent(policy_of())
-    blind.reset()
+    action = ready(policy, seed=3).act({"state": np.zeros(2), "top": np.full((4, 4, 3), 2.0)})
+    assert isinstance(action, np.ndarray) and np.array_equal(action, ready(policy, seed=3).act(np.full(2, 2.0)))
     with pytest.raises(ValueError, match=r"trained without cameras: it takes one vector \[obs\], got state, top"):
-        blind.act({"state": np.zeros(2), "top": np.zeros((4, 4, 3))})
+        ready().act({"state": np.zeros(2), "top": np.zeros((4, 4, 3))})
 
 
 def test_reset_forgets_the_episode_before():
@@ -114,10 +112,6 @@ def test_refusals():
     agent.act(np.zeros(2))
     with pytest.raises(ValueError, match=r"the observation is \[3\], those before were \[2\]; reset"):
         agent.act(np.zeros(3))
-    with pytest.raises(ValueError, match=r"must be \[obs\] or \[n, obs\], got \[1, 1, 2\]"):
-        agent.act(np.zeros((1, 1, 2)))
-    with pytest.raises(ValueError, match=r"columns \[1\] of the observation are NaN or infinite"):
-        agent.act(np.array([0.0, np.nan]))
 
 
 def test_arrays_of_any_kind_are_observations():
@@ -125,9 +119,7 @@ def test_arrays_of_any_kind_are_observations():
     wanted = np.array([0.5, -0.25])
     acted = []
     for given in (wanted, wanted.astype(">f4"), wanted[::-1].copy()[::-1], wanted.astype(object), wanted.tolist()):
-        agent = Agent(policy_of(), seed=0)
-        agent.reset()
-        acted.append(agent.act(given))
+        acted.append(ready(seed=0).act(given))
         np.testing.assert_array_equal(acted[0], acted[-1])
 
 
@@ -145,21 +137,19 @@ def test_arrays_of_any_kind_are_observations():
         ([[1.0, 2.0], [3.0]], "must be numbers .*, got list"),
         (None, r"columns \[0\]|must be"),
         (np.zeros((0, 2)), r"must be \[obs\] or \[n, obs\], got \[0, 2\]"),
+        (np.zeros((1, 1, 2)), r"must be \[obs\] or \[n, obs\], got \[1, 1, 2\]"),
     ],
 )
 def test_what_is_no_observation(given, says):
-    agent = Agent(policy_of())
-    agent.reset()
     with pytest.raises(ValueError, match=says):
-        agent.act(given)
+        ready().act(given)
 
 
 def test_keys_of_the_policy_are_those_that_are_written_and_read():
     def acted(noise_key, **keys):
         planner = small_planner(noise_key=noise_key)
         follower = InverseDynamicsFollower(make_koopman_inverse_dynamics(2, 2))
-        agent = Agent(PlanningPolicy(planner, follower, state_of=(2, 3), **keys).eval(), seed=7)
-        agent.reset()
+        agent = ready(PlanningPolicy(planner, follower, state_of=(2, 3), **keys).eval(), seed=7)
         return np.stack([agent.act(np.full(4, float(step))) for step in range(3)])
 
     usual = acted("noise")
@@ -167,15 +157,12 @@ def test_keys_of_the_policy_are_those_that_are_written_and_read():
 
 
 def test_a_planner_that_draws_by_itself_is_handed_no_noise():
-    agent = Agent(policy_of(columns=(2, 3), noise_key=None))
-    agent.reset()
-    assert np.isfinite(agent.act(np.zeros((3, 4)))).all()
+    assert np.isfinite(ready(policy_of(columns=(2, 3), noise_key=None)).act(np.zeros((3, 4)))).all()
 
 
 def test_latencies_do_not_grow_for_ever(monkeypatch):
     monkeypatch.setattr("torchrl_koap.modules.execution.agent.KEPT", 3)
-    agent = Agent(policy_of())
-    agent.reset()
+    agent = ready()
     for _ in range(5):
         agent.act(np.zeros(2))
     assert agent.latency()["steps"] == 3
@@ -194,16 +181,6 @@ def test_episodes_of_an_agent_differ_and_are_drawn_again_by_its_seed():
     np.testing.assert_array_equal(episodes(3), [first, second])
 
 
-def test_a_default_of_float64_draws_the_same_noise():
-    usual = NoiseStreams([7], (3, 2), block=2).draw()
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    try:
-        assert torch.equal(NoiseStreams([7], (3, 2), block=2).draw(), usual)
-    finally:
-        torch.set_default_dtype(before)
-
-
 @pytest.mark.parametrize("make", POLICIES, ids=["feedback", "open loop", "chunks"])
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
 def test_a_compiled_policy_makes_every_plan_that_is_due(make, backend):
@@ -212,8 +189,7 @@ def test_a_compiled_policy_makes_every_plan_that_is_due(make, backend):
     path = np.random.default_rng(0).normal(size=(STEPS, 2))
 
     def acted(policy):
-        agent = Agent(policy, seed=7)
-        agent.reset()
+        agent = ready(policy, seed=7)
         return np.stack([agent.act(row) for row in path])
 
     def collected(compiled):
@@ -241,9 +217,7 @@ def test_an_origin_is_subtracted_and_added_in_float64(offset):
         state_of=(0, 1),
         origins=((offset, -offset), (0.0, offset)),
     )
-    agents = Agent(policy_of()), Agent(far)
-    for agent in agents:
-        agent.reset()
+    agents = ready(), ready(far)
     for place in path:
         near, moved = agents[0].act(place), agents[1].act(place + [offset, -offset])
         assert moved.dtype == np.float64

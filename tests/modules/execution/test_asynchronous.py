@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Plans made while the one before is executed."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

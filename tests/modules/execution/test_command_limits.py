@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Range, gain and lead: commands stay in range and near their robot, actions that do are left alone, policies agree."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Exported policies give the numbers of the policy."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A plan becomes actions: it is bent into the present state, decoded, and a rule has the last word."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from toy_policies import CountingPlanner, EchoController

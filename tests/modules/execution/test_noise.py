@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The noise of an episode depends on its seed and step alone; agents, environments and evaluations draw the same."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -1,31 +1,16 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which frame of which plan is used at which step, against a reference loop, in environments of any make."""
-
-from __future__ import annotations
+"""Which frame of which plan is used at which step, against a reference loop."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
-from toy_policies import (
-    CountingPlanner,
-    CountingSampler,
-    EchoController,
-    EpisodesOfRandomLength,
-    state_number,
-)
+from torchrl.envs import TransformedEnv
+from toy_policies import CountingPlanner, CountingSampler, EchoController, EpisodesOfRandomLength, state_number
 
-from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
-from torchrl_koap.evaluation.latency import measure_latency
-from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.modules import (
-    DiffusionPolicy,
     Execution,
     PlanningPolicy,
-    TemporalUnet,
-    make_policy,
     policy_transforms,
 )
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
@@ -143,100 +128,3 @@ def test_a_missing_transform_is_named():
         policy_of()(TensorDict({"observation_history": torch.zeros(2, 2, 3)}, [2]))
     with pytest.raises(ValueError, match=r"must hold 2 frames on axis -2, got \[2, 4, 3\]"):
         policy_of()(step_input(torch.zeros(2, 4, 3)))
-
-
-# ---- environments of any make
-
-
-class Counting(EnvBase):
-    """One environment, batch ``[]``: observes ``100 episode + step``; an episode has six steps."""
-
-    LENGTH = 6
-
-    def __init__(self):
-        super().__init__()
-        self.observation_spec = Composite({"observation": Unbounded((2,))})
-        self.action_spec, self.reward_spec = Unbounded((4,)), Unbounded((1,))
-        self.episode, self.step_number = -1, 0
-
-    def _seen(self, **more):
-        now = float(100 * max(self.episode, 0) + self.step_number)
-        done = torch.tensor([self.step_number >= self.LENGTH])
-        return TensorDict({"observation": torch.tensor([now, 7.0]), "done": done, "terminated": done.clone(), **more})
-
-    def _reset(self, tensordict):
-        self.episode, self.step_number = self.episode + 1, 0
-        return self._seen()
-
-    def _step(self, tensordict):
-        self.step_number += 1
-        return self._seen(reward=torch.zeros(1))
-
-    def _set_seed(self, seed):
-        pass
-
-
-def transformed():
-    return TransformedEnv(Counting(), policy_transforms(2))
-
-
-ENVIRONMENTS = {
-    "single": transformed,
-    "serial": lambda: TransformedEnv(SerialEnv(3, Counting), policy_transforms(2)),
-    "serial, transforms inside": lambda: SerialEnv(3, transformed),
-    "two dimensions": lambda: TransformedEnv(SerialEnv(2, lambda: SerialEnv(3, Counting)), policy_transforms(2)),
-}
-
-
-def check(kind, data):
-    observed = data["observation"][..., 0]
-    flat = observed.reshape(-1, observed.shape[-1])
-    actions = data["action"].reshape(len(flat), observed.shape[-1], -1)
-    for row, action in zip(flat, actions, strict=True):
-        for now, got in zip(row.tolist(), action.tolist(), strict=True):
-            first = now - now % 100  # what `expected_action` numbers by environment and episode
-            wanted = expected_action(0, 0, int(now) % 100, 4, kind)
-            shift = [0, *[first] * 2, 0] if kind == "chunks" else [first] * 4
-            assert got == [one + more for one, more in zip(wanted, shift, strict=True)]
-        assert row.max() >= 100  # more than one episode
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_every_action_in_environments_of_any_make(kind, name):
-    env = ENVIRONMENTS[name]()
-    check(kind, env.rollout(15, policy_of(kind, columns=(0, 1)), break_when_any_done=False))
-    steps = 15 * max(env.batch_size.numel(), 1)
-    collector = Collector(env, policy_of(kind, columns=(0, 1)), frames_per_batch=steps, total_frames=steps)
-    (data,) = collector
-    check(kind, data)
-    collector.shutdown()
-
-
-def test_every_action_of_parallel_workers_that_reset_by_themselves(copied_processes):
-    env = ParallelEnv(2, transformed)
-    check("feedback", env.rollout(15, policy_of(columns=(0, 1)), break_when_any_done=False))
-    env.close()
-
-
-# ---- real networks
-
-
-def diffusion_policy():
-    """Untrained."""
-    torch.manual_seed(0)
-    policy = DiffusionPolicy(TemporalUnet(2, 6, channels=(8, 16)), state_dim=3, action_dim=2, num_steps=3)
-    actions = torch.stack([0.004 * torch.randn(200), 0.01 * torch.rand(200)], -1)
-    policy.fit_normalizers(0.01 * torch.randn(50, 16, 3).cumsum(1), actions)
-    return policy.eval()
-
-
-def test_pictures_and_latency_need_no_plans():
-    policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
-    episodes = roll_out(policy, AvoidingEnv, [1, 2], max_steps=6)
-    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=mode_index, interval=4)
-    assert tensors["plan"].shape == (2, 0, 1, 2) and tensors["plan_step"].shape == (2, 0)
-    assert tensors["action"].shape == (2, 6, 2) and tensors["position"].shape == (2, 7, 2)
-    result = measure_latency(policy, 4, repeats=5)
-    assert result["plan_ms"] > result["control_ms"] > 0
-    assert result["control_hz"] == pytest.approx(1e3 / (result["control_ms"] + result["plan_ms"] / 4))

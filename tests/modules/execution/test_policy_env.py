@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The seed of an environment fixes whole rollouts, alone, in batches of environments and in collectors."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

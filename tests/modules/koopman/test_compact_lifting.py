@@ -1,12 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Components in units of the noise, coordinates along curved surfaces, and a lifting that finds their number."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.modules import make_koopman_inverse_dynamics
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting, NoiseAdjustedComponents, isomap
@@ -148,13 +145,6 @@ class TestCompactLifting:
     def test_other_columns_are_refused(self):
         with pytest.raises(ValueError, match="expected states with 24 columns"):
             CompactLifting(24, 2).encode(torch.randn(3, 25))
-
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_alone_in_a_sequence_and_with_other_keys(self, dtype):
-        lifting = CompactLifting(24, 2, in_key=("seen", "wide"), out_key="z").to(dtype)
-        batch = TensorDict({("seen", "wide"): torch.randn(2, 3, 16, 24, dtype=dtype)}, [2, 3])
-        made = TensorDictSequential(lifting)(batch)["z"]
-        assert made.shape == (2, 3, 16, 6) and made.dtype == dtype
 
     def test_the_model_of_the_preset(self):
         model = make_koopman_inverse_dynamics(24, 2, preset="semi_supervised", num_features=16)

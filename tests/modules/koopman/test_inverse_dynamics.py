@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The inverse dynamics model: inference path, normalisers, keys, rollouts, fitting, saving, composition."""
 
-from __future__ import annotations
-
 import inverse_dynamics_test_base as base
 import pytest
 import torch
@@ -156,23 +154,6 @@ def test_fitting_takes_any_batch_and_leaves_the_mode_alone():
     assert torch.equal(named.action_decoder.linear.weight, flat.action_decoder.linear.weight)
     nested.eval().fit_labels(data, mask)
     assert not nested.latent_action.training
-
-
-class RefusesNaN(Normalizer):
-    """A normaliser that checks what it gets."""
-
-    def forward(self, values):
-        assert values.isfinite().all()
-        return super().forward(values)
-
-
-def test_normalisers_never_see_an_action_outside_the_mask():
-    data, mask = labelled(20)
-    models = make_model(), make_model(action_normalizer=RefusesNaN(2, **ACTION_NORMALIZER))
-    for model in models:
-        model.fit_labels(data, mask)
-    for name, value in models[0].state_dict().items():
-        assert torch.equal(value, models[1].state_dict()[name]), name
 
 
 def test_bad_fits_are_explained():

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Lifting: batches and types, observables that are the state, linear maps of principal components."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -32,13 +30,6 @@ def test_states_are_the_first_observables():
     assert torch.equal(lifted[..., :3], state)
     torch.testing.assert_close(lifted[..., 3:], lifting.encoder(state))
     assert torch.equal(KoopmanLifting(3, 3, include_state=True).encode(state), state)
-
-
-def test_keys_of_the_lifting():
-    lifting = KoopmanLifting(3, 5, in_key=("agent", "x"), out_key=("agent", "z"))
-    td = lifting(TensorDict({"agent": {"x": torch.randn(2, 6, 3)}}, [2]))
-    assert td["agent", "z"].shape == (2, 6, 5)
-    assert lifting.in_keys == [("agent", "x")] and lifting.out_keys == [("agent", "z")]
 
 
 def test_bad_liftings_are_refused():

@@ -1,18 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Presets: every one trains, options are checked and reach the parts."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.modules import (
-    PRESETS,
-    LatentActionLSTM,
-    Normalizer,
-    make_koopman_inverse_dynamics,
-)
+from torchrl_koap.modules import PRESETS, LatentActionLSTM, Normalizer, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss
 
 

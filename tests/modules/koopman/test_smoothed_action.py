@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Latent actions of a lifted, smoothed window, the choice of the raw one, and the smoother itself."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

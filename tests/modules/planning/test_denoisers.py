@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Denoisers: shapes, dependence on time and condition; features that are right when the scene is moved and turned."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

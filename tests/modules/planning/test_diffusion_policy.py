@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The Diffusion Policy as a module: units, condition, hidden labels, and all that is a sampler's."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from sampler_test_base import SamplerTestBase, walks
@@ -36,8 +34,7 @@ def labels(number=80):
 class TestDiffusionPolicy(SamplerTestBase):
     out_key, width = "action_chunk", 3
 
-    def make(self, **options):
-        return make_policy(**options)
+    make = staticmethod(make_policy)
 
     def make_unet(self, **options):
         return DiffusionPolicy(TemporalUnet(3, 4, channels=(16,)), state_dim=2, action_dim=3, **options)

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scores of sampled sequences against recorded ones."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Schedule and solvers: closed forms, and agreement with an independent implementation."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The planner as a module: coordinates, modes of a bimodal future, and all that is a sampler's."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from sampler_test_base import SamplerTestBase, walks
@@ -23,8 +21,7 @@ def make_planner(**options):
 class TestStatePlanner(SamplerTestBase):
     out_key, width = "plan", 2
 
-    def make(self, **options):
-        return make_planner(**options)
+    make = staticmethod(make_planner)
 
     def make_unet(self, **options):
         return StatePlanner(TemporalUnet(2, 4, channels=(16,)), state_dim=2, **options)

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The U-Net: any horizon, padding, conditions with edges, impossible sizes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
