@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One thread per test process, and tiny demonstrations and runs shared by all tests."""
 
-from __future__ import annotations
-
 import multiprocessing
 import shutil
 from multiprocessing import forkserver

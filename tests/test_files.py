@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Locks between processes, saving that loses nothing, and errors that list every fault."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

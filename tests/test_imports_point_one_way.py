@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Which room may import which; a value that needs another arrow belongs into another room."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

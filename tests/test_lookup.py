@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Names in tables: what is found, and what is said of a name that is not there."""
 
-from __future__ import annotations
-
 import pytest
 
 from torchrl_koap.lookup import lookup

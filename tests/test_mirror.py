@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every file of the package has its test file at the same place, or stands here beside the one that covers it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -45,6 +43,7 @@ COVERED_BY = {
     "tasks/stacking.py": "tasks/test_registry.py",
     "tasks/modes.py": "tasks/test_task.py",
     "tasks/scene.py": "reports/test_scenes.py",
+    "training/checkpoints.py": "training/test_loop.py",
     "training/controller.py": "training/test_methods.py",
     "training/method.py": "training/test_methods.py",
     "training/planner.py": "training/test_on_disk.py",

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What `import torchrl_koap` offers, and that Python and shell do the same."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

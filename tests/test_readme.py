@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What the README says can be done: its commands parse, its code runs, its links lead somewhere."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import shlex

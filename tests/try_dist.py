@@ -8,8 +8,6 @@ In a fresh environment, outside of the repository: the package is imported from 
 and contexts that are data files are found, and what belongs to the repository alone is refused in one line.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tarfile

@@ -10,8 +10,6 @@ suite runs; where it would bring CUDA, gigabytes that no test needs, that pair i
 (``--any-torch`` brings them all the same).
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import re

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The scripts of ``benchmarks``, which import each other by their names."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

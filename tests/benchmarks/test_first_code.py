@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The networks of the first public code as a plugin: their sizes, what they read, and that they are trained."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Pages of results are what the committed figures give; tests/docs/test_results_form.py has the form of their text."""
 
-from __future__ import annotations
-
 import csv
 import re
 from pathlib import Path

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Committed cells as tables: averages over levels with an honest interval."""
 
-from __future__ import annotations
-
 import pytest
 
 LEVELS = (0.02, 0.05, 0.1, 0.25, 0.5)

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Grounds become data sets; rows of the table are those of rollouts, or of errors on recordings."""
 
-from __future__ import annotations
-
 import csv
 
 import numpy as np

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Regimes of observation: sizes, seeds, noise, what stays as it was."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

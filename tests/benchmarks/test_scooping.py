@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The study of Scooping: options, rows and cells, with planted answers."""
 
-from __future__ import annotations
-
 import csv
 import re
 

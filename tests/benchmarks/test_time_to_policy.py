@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Success against training time: what is trained, and what a row says."""
 
-from __future__ import annotations
-
 import csv
 from types import SimpleNamespace
 

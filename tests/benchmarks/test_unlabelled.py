@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Controllers that follow demonstrations in a regime: who reads the plan arrives, who stands still does not."""
 
-from __future__ import annotations
-
 import csv
 
 import pytest

@@ -1,7 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Runs that cannot be evaluated and disks that are full: one line, and nothing that was there is lost."""
-
-from __future__ import annotations
+"""Evaluations that cannot be done and disks that are full: one line, and nothing that was there is lost."""
 
 import errno
 import json
@@ -13,67 +11,6 @@ from tiny_runs import koap
 
 from torchrl_koap.commands.cli import HINT
 from torchrl_koap.runs import weights
-from torchrl_koap.runs.weights import load_tensors, save_tensors
-
-
-def edit_json(path, **entries):
-    content = {**json.loads(path.read_text()), **entries}
-    path.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
-
-
-def edit_weights(path, *, drop="", **about):
-    tensors, facts = load_tensors(path)
-    kept = {name: value for name, value in tensors.items() if not (drop and drop in name)}
-    assert not drop or len(kept) < len(tensors)
-    save_tensors(path, kept, {**facts, **about})
-
-
-BROKEN_RUNS = {
-    "another task": (
-        lambda run: edit_weights(run / "planner.safetensors", task="sorting"),
-        "planner.safetensors was trained on task 'sorting', not on 'avoiding'",
-    ),
-    "no statistics of the planner": (
-        lambda run: edit_weights(run / "planner.safetensors", drop="plan_normalizer"),
-        '"plan_normalizer.offset"',
-    ),
-    "no statistics of the controller": (
-        lambda run: edit_weights(run / "controller.safetensors", drop="action_normalizer"),
-        "action_normalizer.offset",
-    ),
-    "truncated weights": (
-        lambda run: os.truncate(run / "controller.safetensors", 5000),
-        "controller.safetensors is damaged",
-    ),
-    "no weights": (lambda run: (run / "planner.safetensors").unlink(), "planner.safetensors is missing"),
-    "no config": (lambda run: (run / "config.json").unlink(), "config.json is missing: is "),
-    "damaged config": (lambda run: os.truncate(run / "config.json", 100), "config.json is damaged"),
-    "incomplete config": (
-        lambda run: edit_json(run / "config.json", planner=None),
-        "config.json has no entry 'planner'",
-    ),
-    "unknown task": (
-        lambda run: edit_json(run / "config.json", task="avoidingg"),
-        "unknown task 'avoidingg'; did you mean 'avoiding'?",
-    ),
-    "other sizes": (
-        lambda run: edit_json(
-            run / "config.json",
-            planner={**json.loads((run / "config.json").read_text())["planner"], "width": 16},
-        ),
-        "planner.safetensors was trained on planner.width 8, not on 16",
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", BROKEN_RUNS)
-def test_a_run_that_cannot_be_evaluated_is_named(kind, copied_run, capsys):
-    (copied_run / "eval.json").write_text("an earlier result")
-    breaks, message = BROKEN_RUNS[kind]
-    breaks(copied_run)
-    before = contents(copied_run)
-    assert message in fails(capsys, "eval", copied_run, "--episodes", 1, "--threads", 1)
-    assert contents(copied_run) == before
 
 
 @pytest.mark.parametrize(
@@ -90,12 +27,6 @@ def test_an_evaluation_that_cannot_be_done_leaves_the_run_alone(options, message
     before = contents(copied_run)
     assert message in fails(capsys, "eval", copied_run, *options)
     assert contents(copied_run) == before
-
-
-def test_a_missing_run_folder_is_named(tmp_path, capsys):
-    line = fails(capsys, "eval", tmp_path / "nothing")
-    assert f"{tmp_path / 'nothing' / 'config.json'} is missing" in line
-    assert list(tmp_path.iterdir()) == []
 
 
 def full_disk(*arguments, **options):

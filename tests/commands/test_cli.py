@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What all commands share: calls, versions, logging to wandb, one command at a time in a folder."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import socket
@@ -160,16 +158,6 @@ def test_scores_of_an_evaluation_go_to_wandb_on_this_machine(copied_run, tmp_pat
     assert koap("eval", copied_run, *words) == 0
     assert wait_for(b"eval/success_rate", copied_run / "wandb")
     assert not (tmp_path / "wandb").exists()
-
-
-def test_wandb_that_is_not_installed_names_the_extra(demonstrations, tmp_path, monkeypatch, capsys):
-    find_spec = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: None if name == "wandb" else find_spec(name, *rest)
-    )
-    command = ["train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--logger", "wandb"]
-    assert "pip install 'torchrl_koap[wandb]'" in fails(capsys, *command)
-    assert not (tmp_path / "run").exists()
 
 
 # what every command has

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """``koap convert`` and ``koap validate``: what is written, what is said of it, what is refused."""
 
-from __future__ import annotations
-
 import re
 import shutil
 
@@ -56,11 +54,6 @@ def test_validation_says_how_many_labels_there_are(arm, tmp_path, capsys):
 def test_nothing_is_overwritten(arrays, arm, capsys):
     assert koap("convert", arrays, "--out", arm) == 1
     assert "exists already; choose another --out" in capsys.readouterr().err
-
-
-def test_an_unknown_format_is_told_before_anything_is_read(arm, tmp_path, capsys):
-    assert koap("convert", arm, "--out", tmp_path / "x", "--to", "lerobt") == 1
-    assert "unknown format 'lerobt'; did you mean 'lerobot'" in capsys.readouterr().err
 
 
 def test_validate_names_the_files(tmp_path, capsys):

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """From frames beside recordings to actions: convert, embed, train, and what takes frames after it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

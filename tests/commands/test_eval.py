@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """``koap eval``: what it writes, and what its options change."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """From a folder of arrays with few labels to a trained, exported policy by commands alone."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import partial
@@ -53,12 +51,6 @@ def test_a_policy_acts_on_the_users_observations(run):
         agent.act(np.zeros(5))
 
 
-def test_resume_goes_on_with_the_labels_of_before(run, capsys):
-    assert koap("train", "--out", run, "--resume") == 0
-    assert koap("train", "--out", run, "--resume", "--labels.fraction", 0.5) == 1
-    assert "was started with another labels.fraction" in capsys.readouterr().err
-
-
 def test_absolute_targets(arrays, tmp_path, capsys):
     (tmp_path / "arrays").mkdir()
     for file in arrays.iterdir():
@@ -90,14 +82,6 @@ def test_absolute_targets(arrays, tmp_path, capsys):
     assert limited.act(far).max() < moved.max() and limited.policy.limited.tolist() == [1, 1]
 
 
-def test_a_missing_data_set_is_named(run, tmp_path, capsys):
-    assert koap("train", "--dataset", "nowhere", "--out", tmp_path / "run") == 1
-    assert "dataset 'nowhere' is no folder of" in capsys.readouterr().err
-    for task in ("arn", "avoiding"):
-        assert koap("train", "--dataset", run.parent / "arm", "--out", tmp_path / "run", "--task", task, *TINY) == 1
-        assert f"holds its own task 'arm'; --task {task} does not fit it" in capsys.readouterr().err
-
-
 def test_export_and_latency(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(run_commands, "time_calls", partial(run_commands.time_calls, repeats=3))
     assert koap("export", run, "--out", tmp_path / "exported") == 0
@@ -113,16 +97,3 @@ def test_export_and_latency(run, tmp_path, capsys, monkeypatch):
     assert re.fullmatch(r"late steps +\d+ of 10; a step may take 50 ms", late)
     assert re.fullmatch(r"time per step +median \S+ ms, 99 % below \S+ ms, longest \S+ ms", times)
     assert koap("latency", run, "--steps", 10, "--async-replan") == 0
-
-
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        (("convert", "nowhere", "--out", "x"), "nowhere does not exist"),
-        (("latency", "nowhere"), "nowhere"),
-        (("export", "nowhere", "--format", "onxx"), "unknown export format 'onxx'; did you mean 'onnx'"),
-    ],
-)
-def test_faults_are_one_line(command, message, capsys):
-    assert koap(*command) == 1
-    assert message in capsys.readouterr().err.splitlines()[-1]

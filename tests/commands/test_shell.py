@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Signals, full devices and odd settings: one line, and the exit status that shells expect."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -119,10 +117,7 @@ def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0)
 @pytest.mark.faults
 @pytest.mark.parametrize(
     ("settings", "says"),
-    [
-        ({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is no backend"),
-        ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO"),
-    ],
+    [({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is no backend"), ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO")],
 )
 def test_settings_with_which_nothing_can_be_imported(settings, says):
     status, said = ended("doctor", settings=settings)

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Errors on hidden actions: the same steps for every controller, never a trajectory of the budget."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_controllers import controller_of

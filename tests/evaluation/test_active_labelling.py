@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Which demonstrations to label next: against brute force, and blind to every label."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -13,7 +11,6 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap.evaluation import active_labelling
 from torchrl_koap.evaluation.active_labelling import SuggestConfig, rank_trajectories, suggest
-from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.training import trained
 
 EPISODE = torch.arange(7).repeat_interleave(torch.tensor([5, 3, 6, 4, 5, 2, 5]))
@@ -183,16 +180,6 @@ def test_the_choice_is_made_for_the_decoder_of_the_run(demonstrations, copied_ru
         suggest(out, SuggestConfig(count=1))
         fit = json.loads((out / "summary.json").read_text())["decoder_fit"]
         assert seen["bias"] is bias and seen["penalty"] == fit["penalty"]
-
-
-def test_other_demonstrations_than_those_of_the_training_are_refused(copied_run, monkeypatch):
-    def without_last(data):
-        return data[data["episode"] < 7]
-
-    load = trained.load_demonstrations
-    monkeypatch.setattr(trained, "load_demonstrations", lambda *args, **options: without_last(load(*args, **options)))
-    with pytest.raises(RunDirectoryError, match="its trajectories or labels differ"):
-        suggest(copied_run)
 
 
 def test_runs_that_cannot_be_asked(demonstrations, copied_run, tmp_path, capsys):

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Planner alone, controller alone, both: the figures that `koap inspect` tells them apart by."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What is said about a run follows from its numbers."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

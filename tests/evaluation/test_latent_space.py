@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Spectrum, multi-step errors and linear probe: against systems whose answers are known."""
 
-from __future__ import annotations
-
 import json
 import math
 

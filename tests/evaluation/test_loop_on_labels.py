@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A closed loop on the labels finds a policy whose commands grow, and says where labels do not allow one."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

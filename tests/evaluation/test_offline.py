@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Runs of a robot without an environment, from data to a report."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scores of plans on recorded trajectories."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import nn

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Rollouts that depend on nothing but their seed, and the numbers made of them."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scores of made-up episodes, computed by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from toy_episodes import episode_of, number
@@ -78,12 +76,7 @@ def stack_of(letters, success):
 
 
 def test_stacked_boxes_by_hand():
-    episodes = [
-        stack_of((0, 1, 2), True),
-        stack_of((0, 2, 1), True),
-        stack_of((1, 0, 2), False),
-        stack_of((), False),
-    ]
+    episodes = [stack_of((0, 1, 2), True), stack_of((0, 2, 1), True), stack_of((1, 0, 2), False), stack_of((), False)]
     result = stacking_scores({}, episodes, [0, 0, 1, 1])
     assert {name: sum(good) for name, good in result["rates"].items()} == {
         "one box stacked": 3,

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Wilson interval and mode entropy against their definitions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The example without ``koap train`` is short, names the parts that it shows, and runs."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

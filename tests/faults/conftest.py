@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What all faults have in common: one template of everything that can be damaged."""
 
-from __future__ import annotations
-
 import pytest
 from fault_ledger import Place, make_template
 

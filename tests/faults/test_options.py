@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every option of every command with values that no option of its type can have."""
 
-from __future__ import annotations
-
 import re
 import types
 from collections.abc import Iterator

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Raw demonstrations and data sets on disk: every entry, every file, damaged in every way; and hostile ones."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

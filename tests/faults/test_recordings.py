@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Recordings of one's own robot in every format, with what would mislead a policy: each is told by `koap convert`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 

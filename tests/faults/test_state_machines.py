@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Trainings that are killed, damaged and resumed in any order, and label budgets one after the other."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What the package never does: unpickle, call a shell, look for something on the network."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What to try next follows from the numbers, and nothing is said where they are absent or good."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Moving pictures: what is in them, how many frames, where films start, and how they are written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

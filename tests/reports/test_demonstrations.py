@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The picture of the demonstrations: which steps it shows as labelled, and the objects beside it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

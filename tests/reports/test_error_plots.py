@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Losses and predicted actions: what is in the figures, what is said in their titles, and what bad input gets."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Spectrum, latent space and experiments: figures say what the numbers say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Modes as bars, ticks and colours."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The register of pictures: one decorated function is all that a picture needs, from outside the package too."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -19,7 +17,6 @@ from torchrl_koap.reports import pictures
 from torchrl_koap.reports.pictures import NothingToDraw, all_pictures, draw_pictures, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.tasks.columns import thousandths
 
 PLUGIN = """
 from matplotlib.figure import Figure
@@ -141,8 +138,3 @@ def test_drawing_needs_neither_training_nor_simulator():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.strip() == "[]"
-
-
-def test_units():
-    found = [thousandths(unit) for unit in ("m", "rad", "", "N m")]
-    assert found == [("mm", 1e3), ("mrad", 1e3), ("", 1.0), ("N m", 1.0)]

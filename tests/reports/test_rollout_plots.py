@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Executed paths and plans: cut, coloured, counted; bodies beside them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

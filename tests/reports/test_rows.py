@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a training says at its end: the labels it read, how its parts were trained, why that ended."""
 
-from __future__ import annotations
-
 import pytest
 from run_files import LABELS, run_of
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The report: right numbers, nothing dropped, everything escaped, absent and damaged files said."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scenes and bodies are drawn to scale and where the environments have them."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

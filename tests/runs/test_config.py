@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every section refuses numbers out of range by its own name."""
 
-from __future__ import annotations
-
 import pytest
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Options as JSON: what is written may be read, and anything else is refused by file and name."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Methods from outside the package, by name: in a run, in what reads it, in cells, and what is said when not."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Trained policies of the repository: found by name, written small, evaluated in a folder of one's own."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

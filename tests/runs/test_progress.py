@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Bars are never in the way of the work; loggers write into the run directory, and what is missing is named before."""
 
-from __future__ import annotations
-
 import importlib.util
 import io
 import sys

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A run goes on as what it was begun as."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Plain files of a run: read back as written, rewound exactly, never half-written."""
 
-from __future__ import annotations
-
 import pytest
 
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError

@@ -1,21 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Weights: complete, refused when they do not fit, never damaged by a failed save."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import nn
 
 from torchrl_koap.modules import Normalizer
 from torchrl_koap.runs import weights
-from torchrl_koap.runs.weights import (
-    CheckpointError,
-    load_tensors,
-    load_weights,
-    save_tensors,
-    save_weights,
-)
+from torchrl_koap.runs.weights import CheckpointError, load_tensors, load_weights, save_tensors, save_weights
 
 
 class Model(nn.Module):

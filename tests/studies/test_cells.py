@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Planners and cells of a study: labels reach no planner, results that cannot be read are made again or named."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -26,9 +24,8 @@ ROW = {"label_unit": "trajectory"}
 FEW = {"planner": PlannerConfig(steps=3, network="unet", width=8), "controller": ControllerConfig(steps=3)}
 
 
-def planner_config(out, demonstrations, share=1.0):
-    labels = LabelConfig(trajectories=share)
-    return TrainConfig(out=out, dataset=str(demonstrations), labels=labels, planner=FEW["planner"])
+def planner_config(out, demonstrations):
+    return TrainConfig(out=out, dataset=str(demonstrations), planner=FEW["planner"])
 
 
 def make(folder, config, evaluation=None):
@@ -85,17 +82,6 @@ def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypa
     name = "planner.safetensors"
     assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()
     assert read_result(tmp_path / "run")[0]["train_seconds"] > 0
-
-
-def test_a_planner_sees_the_share_of_the_demonstrations_that_it_is_told(planner, demonstrations, tmp_path, monkeypatch):
-    seen, train = [], on_disk.learn_planner
-    monkeypatch.setattr(on_disk, "learn_planner", lambda *rest, **more: seen.append(rest[2]) or train(*rest, **more))
-    make(tmp_path / "run", planner_config(tmp_path / "run", demonstrations, 0.5))
-    (data,) = seen
-    assert len(data["episode"].unique()) == 4
-    assert data["action"].isnan().all() and not data["has_action"].any()
-    name = "planner.safetensors"
-    assert (tmp_path / "run" / name).read_bytes() != (planner / name).read_bytes()
 
 
 def test_a_row_says_what_a_cell_found(finished):

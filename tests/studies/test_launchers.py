@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Jobs in processes: their order, every way in which one can die, what they print, and none that stays behind."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Paired comparison: exact cases by hand, coverage of a known difference, unequal pairs, correction."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The paper's tables as data, measured cells in their layout beside them, averages over whole rows of tasks alone."""
 
-from __future__ import annotations
-
 import pytest
 
 from torchrl_koap.studies import paper

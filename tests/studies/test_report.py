@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Report and pictures of a curve: written whatever is absent, right comparisons, everything said and escaped."""
 
-from __future__ import annotations
-
 import csv
 import random
 import re

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """``koap curve``: what it writes, that it grows and goes on without redoing, and that nothing takes it down."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -16,6 +14,7 @@ from late_files import wait_until
 from tiny_runs import koap, read_csv
 
 from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig
+from torchrl_koap.files import one_at_a_time
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies import run as run_module
 from torchrl_koap.studies.cells import Cell
@@ -207,18 +206,8 @@ def test_windows_of_every_seed_must_lie_in_the_trajectories_used(tmp_path, demon
 
 
 def test_two_curves_do_not_work_in_one_folder(curve, demonstrations, capsys):
-    holds = (
-        "import fcntl, sys; f = open(sys.argv[1]); fcntl.flock(f, fcntl.LOCK_EX); print('held', flush=True); input()"
-    )
-    other = subprocess.Popen(
-        [sys.executable, "-c", holds, str(curve / "lock")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert other.stdout.readline() == "held\n"
+    with one_at_a_time(curve / "lock", busy=""):
         assert f"another `koap curve` is working in {curve}" in fails(capsys, *command_of(curve, demonstrations))
-    finally:
-        other.communicate("\n")
-    assert run(curve, demonstrations)["done"] == 2
 
 
 def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations):

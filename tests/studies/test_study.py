@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a study asks of its cells: shared planners, defaults of methods, presets of the paper; nothing is trained."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Cells as a file, pooled and as a table: nothing dropped, types kept, damage named."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The weights that score best on held-out trajectories are kept, and a training ends when they are found."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -95,8 +95,3 @@ def test_columns_of_tasks():
 def test_tasks_whose_actions_are_commands_are_refused():
     with pytest.raises(ValueError, match="scooping"):
         controller_of("command_regression", task=get_task("scooping"))
-
-
-def test_a_method_builds_the_decoder_of_its_task():
-    decoder = controller_of("command_regression")
-    assert decoder.commands == [0, 1] and decoder.actions == [0, 1]

@@ -1,19 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations of a task, and trajectories that the planner never sees."""
 
-from __future__ import annotations
-
 import json
 
-import numpy as np
 import pytest
 import torch
 from offline_runs import save_arm, train_arm
-from tiny_runs import demonstration
 
 from torchrl_koap import PlannerConfig, RunConfig
 from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted
-from torchrl_koap.keys import validate
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.datasets import (
     choose_held_out,
@@ -99,16 +94,6 @@ TASK = get_task("avoiding")
 @pytest.fixture(scope="module")
 def data(demonstrations):
     return load_demonstrations(str(demonstrations), TASK)
-
-
-def test_raw_folders_become_states_and_actions(data):
-    validate(data)
-    commanded, measured = demonstration(2, 32)
-    third = data[data["episode"] == 2]
-    assert len(third) == 31
-    np.testing.assert_allclose(third["state"].numpy(), measured[:-1], atol=1e-7)
-    np.testing.assert_allclose(third["action"].numpy(), np.diff(commanded, axis=0), atol=1e-9)
-    assert data["has_action"].all()
 
 
 def test_recorded_folders_give_the_same(tmp_path, data):

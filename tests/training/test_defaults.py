@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What is trained where nothing is asked for: asked > method > task > network > library."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import pytest

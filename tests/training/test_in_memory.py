@@ -1,11 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Fitting in memory does what `koap train` does, on data that lack labels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
+import offline_runs
 import pytest
 import torch
 from tensordict import TensorDict
@@ -22,21 +21,9 @@ NAMES = ["q1", "q2", "goal_1", "goal_2"]
 SMALL = {"batch_size": 8, "width": 8}
 
 
-def record(number=6, steps=40, seed=0):
-    """A robot of two joints that follow delta commands with a lag, towards a goal."""
-    random = np.random.default_rng(seed)
-    states, actions = [], []
-    for _ in range(number):
-        joints, goal, speed = random.uniform(-1, 1, 2), random.uniform(-1, 1, 2), np.zeros(2)
-        rows, taken = [], []
-        for _ in range(steps):
-            rows.append(np.r_[joints, goal])
-            taken.append(0.15 * (goal - joints) + random.normal(0, 0.002, 2))
-            speed = 0.6 * speed + 0.4 * taken[-1]
-            joints = joints + speed
-        states.append(np.array(rows))
-        actions.append(np.array(taken))
-    return states, actions
+def record(number=6, **options):
+    """States ``[40, 4]`` and actions of a robot of two joints, and where these are to go."""
+    return offline_runs.record(number, joints=2, **options)
 
 
 def fit_controller(data, task=None, *, steps=500, preset=None, columns=None, **options):

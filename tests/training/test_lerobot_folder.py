@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The folder that LeRobot reads; that LeRobot runs it is tested beside its plugin."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The training loop: what one update is, what is logged, resuming bit for bit, and gradients that are outliers."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -14,7 +12,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_koap.modules import MLPDenoiser, StatePlanner, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import CheckpointError, load_tensors
+from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_weights
 from torchrl_koap.training import loop as loop_file
 from torchrl_koap.training.loop import SETTLED, DivergedError, limit_outlier, train_phase, warmup_cosine
 
@@ -203,6 +201,9 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path):
     run_training(Planner, tmp_path, num_steps=10)
     (tmp_path / "checkpoints" / "planner.safetensors").rename(tmp_path / "checkpoints" / "controller.safetensors")
     with pytest.raises(CheckpointError, match="controller.safetensors holds the state of another model"):
+        run_training(Controller, tmp_path, resume=True)
+    save_weights(tmp_path / "checkpoints" / "controller.safetensors", nn.Linear(2, 2), {"task": "avoiding"})
+    with pytest.raises(CheckpointError, match="is no state of a training"):
         run_training(Controller, tmp_path, resume=True)
 
 

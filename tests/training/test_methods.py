@@ -1,14 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The table of methods: every entry can be built, its losses train it, and unknown names are answered."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_controllers import controller_of, plain_task
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
-from torchrl_koap.modules import VariationalInverseDynamics
+from torchrl_koap.modules import SupervisedInverseDynamics
 from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.methods import METHODS
 
@@ -44,6 +42,12 @@ def test_an_entry_holds_together(name):
         assert bool(method.phases) or method.closed_form or method.fit is not None
     if method.sees == "labelled":
         assert {phase.windows for phase in method.phases} == {"labelled"}
+
+
+def test_relabel_is_a_decision_diffuser_with_a_teacher():
+    controller = controller_of("relabel")
+    assert isinstance(controller, SupervisedInverseDynamics) and controller.reader.look_ahead == (1,)
+    assert METHODS["relabel"].teacher == "dd_lookahead"
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -82,8 +86,3 @@ def test_statistics_are_those_of_what_a_method_may_see(name, data):
         assert not changed
     elif "state_normalizer.offset" in clean:
         assert "state_normalizer.offset" in changed
-
-
-def test_the_auto_encoder_reads_the_window_that_policies_hand_it():
-    model = controller_of("vae")
-    assert isinstance(model, VariationalInverseDynamics) and model.num_window_frames == 16

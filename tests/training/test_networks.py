@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """From options to planners and controllers."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_controllers import controller_of
@@ -50,8 +48,10 @@ def test_every_controller_takes_over_weights(method, preset, data):
     controller = controller_of(method, labelled, preset=preset).eval()
     if METHODS[method].fit is not None:
         METHODS[method].fit(controller, with_commands(labelled, data), 1)
-    restored = controller_of(method, preset=preset).eval()
-    restored.load_state_dict(controller.state_dict())
+    with torch.device("meta"):  # without storage, which the weights bring
+        restored = controller_of(method, preset=preset).eval()
+    restored.load_state_dict(controller.state_dict(), assign=True)
+    assert not any(value.is_meta for value in (*restored.parameters(), *restored.buffers()))
     state, other = controller.state_dict(), restored.state_dict()
     assert all(torch.allclose(state[name], other[name], rtol=0, atol=0, equal_nan=True) for name in state)
     if METHODS[method].fit is None:
@@ -77,11 +77,6 @@ def test_statistics_are_those_of_all_states_and_of_the_labelled_actions(data):
     paper = controller_of("dd", labelled, preset="paper")
     torch.testing.assert_close(paper.action_normalizer.inverse(torch.ones(1, 2))[0], shown.amax(0))
     torch.testing.assert_close(paper.state_normalizer.inverse(-torch.ones(1, 2))[0], data["state"].amin(0))
-
-
-def test_unknown_presets_suggest_the_nearest():
-    with pytest.raises(ValueError, match="unknown preset 'papper'; did you mean 'paper'"):
-        controller_of("koap", preset="papper")
 
 
 def test_absolute_actions_are_centred_and_read_off_the_present_frame():

@@ -1,10 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every method through ``koap train``: hidden labels reach no weight, and a killed run ends as if it was not."""
 
-from __future__ import annotations
-
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +11,6 @@ from tiny_runs import TINY as TINY_CALL
 from tiny_runs import koap, write_demonstrations
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, Trained, train
-from torchrl_koap.commands.cli import HINT
 from torchrl_koap.data import LabelBudget, save_demonstrations
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
@@ -196,34 +192,11 @@ def policy_run(request, tmp_path_factory, demonstrations, planner):
     return folder
 
 
-def test_a_policy_is_evaluated_without_a_planner(policy_run, tmp_path, capsys):
-    out = tmp_path / "run"
-    shutil.copytree(policy_run, out)
-    assert not (out / "planner.safetensors").exists()
-    assert koap("eval", out, "--episodes", 2, "--threads", 1, "--no-report") == 0
-    result = json.loads((out / "eval.json").read_text())
-    assert result["execution"]["strategy"] == "open_loop"
-    assert [row["seed"] for row in result["episode"]] == [100, 101]
-    assert result["rates"]["success"]["rate"] == sum(row["outcome"] == "success" for row in result["episode"]) / 2
-    rollouts = load_tensors(out / "rollouts.safetensors")[0]
-    assert rollouts["length"].tolist() == [row["steps"] for row in result["episode"]]
-    assert "95 % interval" in capsys.readouterr().out
-
-
 def test_a_policy_spends_the_labels_it_was_given(policy_run):
     summary = RunDirectory(policy_run).read_json("summary.json")
     assert summary["labels"]["selected_units"] == 2 and summary["planner_parameters"] == 0
     teacher = METHODS[RunDirectory(policy_run).read_json("config.json")["method"]].teacher
     assert summary["controller_updates"] == (8 if teacher else 4)
-
-
-@pytest.mark.parametrize("method", ["dp", "vpt"])
-def test_a_policy_takes_no_planner_over(method, planner, demonstrations, tmp_path, capsys):
-    command = ("train", "--out", tmp_path / "run", "--dataset", demonstrations, "--method", method)
-    assert koap(*command, "--planner.source", planner) == 1
-    err = capsys.readouterr().err
-    assert err == f"koap: planner.source: method '{method}' samples actions and has no planner ({HINT})\n"
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_goes_on_after_it_was_moved_together_with_what_it_builds_on(tmp_path):

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A training as one file acts as it did, and files that cannot be used are named."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -15,7 +13,6 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, fit, load_policy
 from torchrl_koap.data import make_demonstrations
-from torchrl_koap.modules import SupervisedInverseDynamics
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
@@ -157,10 +154,3 @@ def test_what_cannot_be_saved_or_executed(own, tmp_path):
     for part in ("planner", "controller"):
         with pytest.raises(ValueError, match=f"a policy needs planner and controller: no {part} was trained here"):
             replace(own, **{part: None}).policy()
-
-
-def test_relabel_is_a_decision_diffuser(demonstrations, tmp_path):
-    assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, "--method", "relabel", *TINY) == 0
-    trained = Trained.load(tmp_path / "run")
-    assert isinstance(trained.controller, SupervisedInverseDynamics) and trained.planner is not None
-    assert trained.controller.reader.look_ahead == (1,) and trained.method.teacher == "dd_lookahead"
