@@ -4,7 +4,7 @@
     PYTHONPATH=benchmarks koap train --plugin first_code --method first_code --dataset DIR --out runs/first_code
 
 ``first_code`` is KOAP with a recurrent lifting, a feed-forward ``f`` on raw frames with dropout and a diagonal
-operator, its decoder trained with the rest; ``first_code_dd`` is the supervised LSTM. What else differs there (learning
+operator, its decoder trained by gradients; ``first_code_dd`` is the supervised LSTM. What else differs there (learning
 rates, epochs of each method's own windows, selection on validation labels) is not taken over.
 """
 

@@ -28,8 +28,8 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         task (str): name of the task. ``po_sorting`` and ``stacking_1`` use the demonstrations of ``sorting`` and
             ``stacking``.
         root (str or Path): folder of the demonstrations, see :func:`~torchrl_koap.data.open_dataset`.
-        label_budget (LabelBudget, optional): hides labels, and the commands that would give them away, from everything
-            that uses this data set; what was spent is in :attr:`label_report`.
+        label_budget (LabelBudget, optional): hides labels, and commands whose changes are labels, from everything that
+            uses this data set; what was spent is in :attr:`label_report`.
         progress (callable, optional): called with the number of raw files read and that of all.
         batch_size, sampler, sample_unit, transform, prefetch, collate_fn (optional): as in
             :class:`~torchrl.data.TensorDictReplayBuffer`.

@@ -141,7 +141,7 @@ for _method in (
         knows_commands=True,
         execution=_EVERY_STEP,
     ),
-    Method("koap_sgd", "KOAP, decoder trained with the rest", _koap, _JOINT, presets=_ANY_PRESET),
+    Method("koap_sgd", "KOAP, decoder trained by gradients", _koap, _JOINT, presets=_ANY_PRESET),
     Method(
         "koap_paper",
         "KOAP as in the paper",

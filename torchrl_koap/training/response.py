@@ -239,8 +239,7 @@ def fit_predictions(response: ResponseModel, stretches: Stretches, *, coupled: b
 
     A fit to single steps takes what it cannot explain for a shorter memory or a weaker pull of the command; the error
     then grows with every step that is predicted. Coefficients stay near the ones that the response has
-    (:data:`STAY`), where stretches tell little; without any, nothing changes. Coupled axes answer the commands of
-    others.
+    (:data:`STAY`), where stretches tell little; without any, nothing changes. Coupled axes have cross-axis terms.
     """
     if not len(stretches.known):
         return

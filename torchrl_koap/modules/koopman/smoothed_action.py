@@ -63,7 +63,7 @@ class WienerSmoother(nn.Module):
 
 
 class LatentActionSmoothed(LatentActionModule):
-    r"""Computes observables of a lifted and smoothed window, or of the raw one if its held-out error is clearly lower.
+    r"""Infers latent actions from a reduced and smoothed window, or from the raw one if its held-out error is lower.
 
     .. math::
         w_t = (g(x_{t-n}), \dots, g(x_t), g(x_{t+2}), \dots, g(x_{t+k})), \quad
