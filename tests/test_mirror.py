@@ -46,7 +46,6 @@ COVERED_BY = {
     "training/checkpoints.py": "training/test_loop.py",
     "training/controller.py": "training/test_methods.py",
     "training/method.py": "training/test_methods.py",
-    "training/planner.py": "training/test_on_disk.py",
     "training/policy_facts.py": "modules/execution/test_command_limits.py",
     "vision/backbones.py": "vision/test_encoder.py",
     "vision/projection.py": "vision/test_encoder.py",

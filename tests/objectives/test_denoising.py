@@ -64,6 +64,16 @@ def test_value_in_closed_form(dtype):
     assert value.dtype == dtype
 
 
+def test_weights_scale_the_errors_of_their_columns():
+    plain, weighted = make_loss(reduction="none"), make_loss(reduction="none", weights=torch.tensor([3.0, 1.0]))
+    data = batch_of(5)
+    scale = torch.tensor([1.5, 0.5])
+    torch.testing.assert_close(weighted(data)["loss_planner"], scale * plain(data)["loss_planner"])
+    for wrong in (torch.ones(3), torch.tensor([1.0, 0.0])):
+        with pytest.raises(ValueError, match=r"weights must be \[2\] \[width\] and positive"):
+            make_loss(weights=wrong)
+
+
 @pytest.mark.parametrize("network", ["mlp", "unet"])
 def test_forward_and_plan_compile_without_a_graph_break(network):
     torch._dynamo.reset()  # TorchRL wraps every loss in one function: their graphs share its recompilation limit

@@ -38,9 +38,15 @@ class DenoisingLoss(NetworkLoss):
             (``"none"``: 0 where they do not). Defaults to ``"mean"``.
         dtype (torch.dtype, optional): of the denoiser's matrix products, such as ``torch.bfloat16``. Default: that of
             its weights.
+        weights (Tensor, optional): of the columns ``[width]`` in the loss, scaled to a mean of 1. Default: all count
+            alike.
+
+    Raises:
+        ValueError: for weights of another shape, or that are not positive.
     """
 
     network: ConditionalSampler
+    weights: Tensor | None
 
     def __init__(
         self,
@@ -49,9 +55,15 @@ class DenoisingLoss(NetworkLoss):
         create_target_params: bool = True,
         reduction: Literal["none", "mean", "sum"] = "mean",
         dtype: torch.dtype | None = None,
+        weights: Tensor | None = None,
     ):
         super().__init__(network, create_target_params=create_target_params, reduction=reduction)
         self.dtype = dtype
+        if weights is not None:
+            if weights.shape != network.noise_shape[1:] or not (weights > 0).all():
+                raise ValueError(f"weights must be {list(network.noise_shape[1:])} [width] and positive, got {weights}")
+            weights = weights / weights.mean()
+        self.register_buffer("weights", weights)
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads raw histories ``[*B, h, d]`` and sequences ``[*B, H, width]``, and which of their steps count.
@@ -72,6 +84,8 @@ class DenoisingLoss(NetworkLoss):
                     clean = torch.where(counts, clean, 0.0)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
             error = network.denoising_error(condition, clean, noise, time, dtype=self.dtype)  # [*B, H, width]
+            if self.weights is not None:
+                error = error * self.weights
 
         result = TensorDict({self.out_keys[0]: self._reduce(error, counts)}, batch_size=[])
         self._clear_weakrefs(tensordict, result, "network_params", "target_network_params")

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
+from torch import Tensor
 
 from torchrl_koap.data import (
     GripperRecovery,
@@ -93,7 +95,8 @@ def learn_planner(
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
 
-    loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision])
+    weights = column_weights(task)
+    loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision], weights=weights).to(config.run.device)
     best = None
     if held_out is not None:
         best = BestWeights(loss, plan_score(planner, held_out, task), check_interval(section, planner.num_steps))
@@ -118,6 +121,19 @@ def learn_planner(
         planner.load_state_dict(best.network.state_dict())
         values["held_out_seconds"] = best.seconds
     return planner, values
+
+
+def column_weights(task: Task) -> Tensor | None:
+    """Weights ``[d]`` of the state columns in a planner's loss: those of the robot, which are executed, count half.
+
+    None, all columns alike, where the robot has half of them or more, and in tasks with an environment.
+    """
+    columns, robot = task.state_dim, len(task.robot)
+    if task.env is not None or not 0 < 2 * robot < columns:
+        return None
+    weights = torch.full([columns], 0.5 / (columns - robot))
+    weights[list(task.robot)] = 0.5 / robot
+    return weights
 
 
 def check_interval(section: PlannerConfig, solver_steps: int) -> int:

@@ -1,0 +1,32 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a planner's training decides by itself: how often it is scored, and what its columns count."""
+
+import numpy as np
+import pytest
+
+from torchrl_koap import PlannerConfig, make_demonstrations
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training.planner import check_interval, column_weights
+
+
+@pytest.mark.parametrize(("steps", "batch_size", "every"), [(20_000, 512, 500), (4000, 256, 134), (100, 64, 100)])
+def test_scores_take_a_twentieth_of_the_training(steps, batch_size, every):
+    section = PlannerConfig(steps=steps, batch_size=batch_size)
+    assert check_interval(section, solver_steps=10) == every
+    forward_passes = 128 * 4 * 10 / every, 3 * batch_size
+    assert every == steps or forward_passes[0] <= 0.05 * forward_passes[1]
+
+
+@pytest.mark.parametrize(("columns", "robot", "share"), [(9, (3, 4), 0.5), (5, (0, 1, 2), None), (4, (0, 1), None)])
+def test_the_robot_counts_half_of_the_loss_or_more(columns, robot, share):
+    paths = [np.random.default_rng(seed).normal(size=(20, columns)).cumsum(0) for seed in range(3)]
+    _, task = make_demonstrations(paths, [path[1:, :2] for path in paths], control_hz=10, robot=robot)
+    weights = column_weights(task)
+    assert (weights is None) == (share is None)
+    if share is not None:
+        assert weights[list(robot)].sum().item() == pytest.approx(share * weights.sum().item())
+        assert len(weights.unique()) == 2
+
+
+def test_columns_of_tasks_with_a_simulator_count_alike():
+    assert column_weights(get_task("aligning")) is None
