@@ -8,17 +8,16 @@ import pytest
 
 from torchrl_koap.commands.options import parse
 from torchrl_koap.commands.subcommands import Subcommand
+from torchrl_koap.evaluation.findings import EXPERIMENTS
 from torchrl_koap.reports.advice import RULES, advice
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
+AVOIDING = get_task("avoiding")  # 57 episodes without preferences have an entropy of 0.93; a control step takes 35 ms
 
-def inspected(imagined, followed, closed):
-    return {
-        name: {"rate": rate}
-        for name, rate in (("planner_alone", imagined), ("controller_alone", followed), ("both", closed))
-        if rate is not None
-    }
+
+def inspected(*shares):
+    return {name: {"rate": rate} for name, rate in zip(EXPERIMENTS, shares, strict=True)}
 
 
 def found(**numbers):
@@ -38,24 +37,27 @@ def commands(**numbers):
     return [item.command for item in found(**numbers)]
 
 
-def test_nothing_is_known_and_nothing_is_said():
-    assert found() == []
+GOOD = rates(0.95, low=0.86, high=0.98) | {"mode_entropy": 0.9} | actions(0.1, 0.3)
+SUCCEEDS = {"task": AVOIDING, "config": {"method": "koap"}, "evaluation": GOOD}
+FEW = rates(0.95) | {"mode_entropy": 0.3}
 
 
-def test_a_run_that_succeeds_in_many_ways_needs_nothing():
-    evaluation = rates(0.95, low=0.86, high=0.98) | {"mode_entropy": 0.9}
-    summary = {"labels": {"labelled_transitions": 80}}
-    evaluation |= actions(0.1, 0.3)
-    run = {"task": get_task("avoiding"), "config": {"method": "koap"}}
-    assert commands(summary=summary, evaluation=evaluation, **run) == []
-
-
-def test_failure_without_inspection_asks_for_one():
-    assert commands(evaluation=rates(0.5)) == ["koap inspect {run}"]
-
-
-def test_a_policy_of_its_own_cannot_be_inspected():
-    assert commands(summary={"planner_parameters": 0}, evaluation=rates(0.5)) == []
+@pytest.mark.parametrize(
+    ("numbers", "wanted"),
+    [
+        ({}, []),
+        (SUCCEEDS | {"summary": {"labels": {"labelled_transitions": 80}}}, []),
+        ({"evaluation": rates(0.5)}, ["koap inspect {run}"]),
+        ({"evaluation": rates(0.5), "summary": {"planner_parameters": 0}}, []),  # a policy of its own
+        ({"evaluation": FEW, "task": AVOIDING}, ["koap inspect {run}"]),
+        ({"evaluation": FEW | {"mode_entropy": 0.8}, "task": AVOIDING}, []),
+        ({"evaluation": FEW}, []),  # modes of which nothing is known
+        ({"evaluation": {"plan_ms": 40.0}, "task": AVOIDING}, ["koap latency {run}"]),
+        ({"evaluation": {"plan_ms": 30.0}, "task": AVOIDING}, []),
+    ],
+)
+def test_what_is_proposed(numbers, wanted):
+    assert commands(**numbers) == wanted
 
 
 @pytest.mark.parametrize(
@@ -78,14 +80,6 @@ def test_more_labels_are_not_proposed_where_the_planner_fails():
     assert "koap suggest {run} --count 5" not in commands(**numbers, inspection=inspected(0.6, 0.9, 0.5))
 
 
-def test_low_entropy():
-    evaluation = rates(0.95) | {"mode_entropy": 0.3}
-    task = get_task("avoiding")  # in which 57 episodes without preferences have an entropy of 0.93
-    assert commands(task=task, evaluation=evaluation) == ["koap inspect {run}"]
-    assert commands(task=task, evaluation=evaluation | {"mode_entropy": 0.8}) == []
-    assert commands(evaluation=evaluation) == []  # modes of which nothing is known
-
-
 def test_a_ridge_that_errs_less_is_pointed_out():
     (item,) = found(config={"method": "koap"}, evaluation=actions(0.32, 0.31))
     assert item.finding == "actions of koap err 0.32 times as much as their mean would, a plain ridge's 0.31 times"
@@ -93,12 +87,6 @@ def test_a_ridge_that_errs_less_is_pointed_out():
     call = shlex.split(item.command.format(data="arm"))
     study = parse(Subcommand, call[1:]).config
     assert study.methods == ("koap", "koap_untrained", "linear_steps", "linear") and study.datasets == ("arm",)
-
-
-def test_slow_plans():
-    task = get_task("avoiding")  # a control step takes 35 ms
-    assert commands(task=task, evaluation={"plan_ms": 40.0}) == ["koap latency {run}"]
-    assert commands(task=task, evaluation={"plan_ms": 30.0}) == []
 
 
 def test_wide_intervals_come_last():

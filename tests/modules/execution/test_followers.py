@@ -95,9 +95,3 @@ def test_the_factory_knows_how_a_controller_is_followed(kind):
                     changes=(0, 1),
                     execution=execution.replaced(**{asked: named}),
                 )
-
-
-def test_open_loop_and_chunks_need_no_plan_at_every_step():
-    sampled = make_policy(CountingPlanner(), state_of=(0, 1))
-    assert sampled.follower is None and sampled.execution.strategy == "open_loop"
-    assert make_policy(CountingPlanner(), EchoController(), state_of=(0, 1)).out_keys == ["action", "plan"]

@@ -93,12 +93,6 @@ def test_longer_histories_reach_the_follower_shorter_ones_the_planner(kind):
     assert td["action"].tolist() == [[10.0, 13.0, 1013.0, 13.0]]
 
 
-def test_the_state_may_be_a_function_of_the_observation():
-    observed = torch.arange(12.0).reshape(2, 2, 3)
-    action = policy_of("chunks", columns=lambda seen: 10 * seen[..., [2, 0]])(step_input(observed))["action"]
-    assert action.tolist() == [[0, 50, 20, 30], [0, 110, 80, 90]]
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_renamed_keys(kind):
     policy = policy_of(kind, history_key=("agent", "frames"), action_key=("agent", "command"))

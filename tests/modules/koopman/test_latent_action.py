@@ -39,17 +39,6 @@ def test_states_of_another_width_are_refused(kind):
         kind(2, 6).gather(windows(3, d=5))
 
 
-def test_the_lstm_reads_its_frames_in_order():
-    network = LatentActionLSTM(2, 3, hidden_dim=5, num_past=2, look_ahead=4)
-    reference = torch.nn.LSTM(2, 5, batch_first=True)
-    reference.load_state_dict(network.lstm.state_dict())
-    state = windows(1)[0]
-    latent = network.infer(network.gather(state))
-    for t in range(2, 12):
-        last = reference(state[[t - 2, t - 1, t, t + 4]][None])[0][0, -1]
-        torch.testing.assert_close(latent[t], network.readout(last))
-
-
 # Fourier observables
 
 
