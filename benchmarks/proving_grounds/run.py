@@ -93,7 +93,7 @@ def judge(trained: Trained) -> dict[str, Any]:
     action = result["action_errors"]["outside_budget"]  # both as shares of the error of the mean action
     errors = {
         "plan_error": result["relative_plan_error"],
-        "action_error": action["relative"] / action["relative_of_ridge"],
+        "action_error": action["relative"] / action["ridge_relative"],
     }
     return {name: "" if error is None else f"{error:.4f}" for name, error in errors.items()}
 

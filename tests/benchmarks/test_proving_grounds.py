@@ -134,7 +134,7 @@ def table_of(monkeypatch, tmp_path):
         monkeypatch.setattr(run, "train", lambda config: asked.append(config) or Ran)
         monkeypatch.setattr(run, "load_policy", lambda *args, **options: None)
         monkeypatch.setattr(run, "roll_out", episodes)
-        outside = {"relative": 0.6, "relative_of_ridge": 0.8}
+        outside = {"relative": 0.6, "ridge_relative": 0.8}
         errors = {"relative_plan_error": 0.5, "action_errors": {"outside_budget": outside}}
         monkeypatch.setattr(run, "evaluate", lambda folder, config: errors)
         monkeypatch.setattr(run.Observer, "of", lambda *args: None)

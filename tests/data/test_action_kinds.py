@@ -52,6 +52,16 @@ def test_one_absolute_column_beside_changes():
     assert not warnings(PATHS, mixed, action_kind=["delta", "absolute"])
 
 
+def test_a_gripper_of_two_values():
+    """As a change it would widen the range in which all commands of its unit are kept."""
+    opening = [np.column_stack([steps[:, 0], steps[:, 1] > 0]) for steps in DELTAS]
+    (said,) = warnings(PATHS, opening, acting=("a", "grip"))
+    assert said.startswith("grip: an action of two values") and said.endswith("--action-kind delta raw")
+    assert not warnings(PATHS, opening, action_kind=["delta", "raw"])
+    with pytest.raises(ValueError, match="'gripper': it is 'raw' if two values open and close, 'absolute' if a width"):
+        demonstrations(PATHS, opening, action_kind=["delta", "gripper"])
+
+
 @pytest.mark.parametrize("scale", [1, 10], ids=["change", "velocity"])
 def test_changes(scale):
     steps = [scale * step for step in DELTAS]

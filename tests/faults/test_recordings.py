@@ -57,12 +57,17 @@ KINDS: dict[str, tuple[Callable, str, tuple[str, ...]]] = {
     "an end of halves": (put("done", lambda d: d + 0.5), "'done' of the ends of episodes must be 0 or 1", ()),
     "names of episodes": (put("episode", lambda e: np.array(["reach", "push"]).repeat(LENGTH // 2)), "", ()),
     "a start that is flagged": (put("is_first", lambda f: 1.0 * (np.arange(LENGTH) % 20 == 0)), "", ()),
+    "sessions of trials": (
+        lambda episode: episode[0].update({"session": np.arange(LENGTH) // 20, "trial": np.arange(LENGTH) // 10 % 2}),
+        "",
+        (),
+    ),
     "whole numbers": (put("q0", lambda q: np.round(9 * q).astype(int)), "", ()),
     "an action of text": (put("v0", lambda v: v.astype(str) + "!", actions=True), "action", ()),
     "an unknown column": (lambda episode: None, "unknown column in drop_columns", ("--drop-columns", "q9")),
 }
 # an HDF5 file, a LeRobot set and Minari have their own ends of episodes, and no text; LeRobot's names have another form
-OWN = ("an end of text", "an end of halves", "names of episodes", "a start that is flagged")
+OWN = ("an end of text", "an end of halves", "names of episodes", "a start that is flagged", "sessions of trials")
 ELSEWHERE = {
     *((form, kind) for form in ("lerobot", "hdf5", "minari") for kind in OWN),
     ("lerobot", "an episode that comes back"),
@@ -92,6 +97,19 @@ WARNED: dict[str, tuple[Callable, str]] = {
         "a measurement that failed",
     ),
     "still frames": (stand, "nothing moves in 5.% of all frames at the start"),
+    "a mark in states": (
+        put("q0", lambda q: np.where(np.arange(LENGTH) % 9, q, -9999)),
+        "a mark of what is missing. fill it",
+    ),
+    "a mark in actions": (
+        put("v0", lambda v: np.where(np.arange(LENGTH) % 3, v, -999), actions=True),
+        "a mark of what is missing. make it NaN",
+    ),
+    "an action of two values": (put("v0", lambda v: 1.0 * (v > 0), actions=True), "--action-kind raw delta"),
+    "a count that wraps": (
+        put("q0", lambda q: (np.arange(LENGTH) * 30 + 3300.5 + np.sin(np.arange(LENGTH))) % 4096),
+        "a count or an angle that was wrapped",
+    ),
     "a constant state": (put("q1", lambda q: 0 * q + 3), "'?q1'? is 3 in all"),
     "a constant action": (put("v1", lambda v: 0 * v + 2, actions=True), "is 2 in all labels"),
     "an action that leaps": (

@@ -29,7 +29,7 @@ def rates(success, **more):
 
 
 def actions(own, ridge):
-    errors = {"left_out": {"relative": own, "relative_of_ridge": ridge}}
+    errors = {"left_out": {"relative": own, "ridge_relative": ridge}}
     return {"action_errors_on": "left_out", "action_errors": errors}
 
 

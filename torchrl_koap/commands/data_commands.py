@@ -18,7 +18,7 @@ from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.action_kinds import describe_likely, likely_kinds
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings
-from torchrl_koap.data.quality import drop_short, find_warnings, plan_coverage, trim_still
+from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
 from torchrl_koap.data.ted import stored_folder
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport
@@ -200,6 +200,7 @@ class Convert(Command):
             "controller reads": ", ".join(task.state_names[column] for column in task.robot),
             "action kind": ", ".join(self.action_kind) or "delta (default)",
             "labels look": describe_likely(likely_kinds(data, task)) or "like no kind: too few",
+            "constant in each trajectory": ", ".join(goal_columns(recordings)) or "nothing",
             "skipped": ", ".join(recordings.skipped) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],
@@ -296,6 +297,9 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
 
 def _numbered(found: list[str], data: TensorDictBase) -> dict[str, str]:
     """What is unlikely in data, numbered."""
+    if len(data["episode"].unique()) == 1:
+        said = "there is one trajectory alone: if it holds several episodes, say where they end"
+        found = [f"{said} (a column 'episode_index' or 'timeouts')", *found]
     if not data["has_action"].any():
         found = ["no recording has actions: a planner can be trained, a policy cannot", *found]
     return {f"warning {number}": warning for number, warning in enumerate(found, 1)}

@@ -24,6 +24,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from torchrl_koap.evaluation.config import EvalConfig
 from torchrl_koap.files import read_bytes
 from torchrl_koap.lookup import lookup
 from torchrl_koap.runs.config import TrainConfig
@@ -191,6 +192,8 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
         sections = get_type_hints(TrainConfig)
         short = {(sections[path.split(".")[0]], path.split(".")[1]): option for option, path in SHORT.items()}
         arguments = ["train", *expand(arguments[1:])]
+    elif arguments[:1] in (["curve"], ["bench"]):
+        short = {(EvalConfig, name): f"--{name.replace('_', '-')}" for name in ("env", "env_kwargs", "num_envs")}
     registry = ConstructorRegistry()
     registry.struct_rule(partial(_described, short, []))
     return tyro.cli(kind, args=arguments, registry=registry, **({"prog": "koap"} | how))

@@ -78,8 +78,8 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     """Finds actions that contradict their kind.
 
     Changes look wrong where they lie at the next value of a state column, or follow columns more than their changes;
-    absolute targets where they lie at the change of their column, per frame or per second, or far from the column; raw
-    actions where all of them are near columns, or all follow changes.
+    or have two values alone; absolute targets where they lie at the change of their column, per frame or per second, or
+    far from the column; raw actions where all of them are near columns, or all follow changes.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout.
@@ -112,6 +112,15 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
             f"actions lie within {max(likely[name].distance for name in wrong):.2g} of {some(reached)} on average: they"
             f" look like absolute targets; convert again with --action-kind {asked}"
         )
+    levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
+    switches = [name for name, kind in kinds.items() if kind == "delta" and levels[name] == 2]
+    if switches:
+        asked = " ".join("raw" if name in switches else kind for name, kind in kinds.items())
+        yield (
+            f"{some(switches)}: an action of two values, such as a gripper's that opens and closes: convert again with"
+            f" --action-kind {asked}"
+        )
+    wrong.update(switches)
     changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
     still = [each for each in changes if each.kind == "raw" and _clear(each.follows_column, each.follows_change)]
     if 2 * len(still) > len(changes):

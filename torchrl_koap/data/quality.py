@@ -16,23 +16,31 @@ from torchrl_koap import keys
 from torchrl_koap.data.action_kinds import kind_warnings
 from torchrl_koap.data.formats.clocks import FASTEST, SLOWEST, rises_evenly
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds
+from torchrl_koap.data.odd_values import (
+    leap_warnings,
+    mark_warnings,
+    quaternion_warnings,
+    scale_warnings,
+    spike_warnings,
+)
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import DataError, option, some
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
 STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
+JITTER = 0.5  # share of its mean step by which a clock's steps may differ
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
 
 def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -> list[str]:
     """Finds what is unlikely in demonstrations, a sentence each.
 
-    Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, or reach a
-    place beyond 100 m or rad; state columns that never change, equal another one, leap, or are clocks; frames at both
-    ends in which nothing moves; actions of another kind than declared, that never change or leap for one frame; labels
-    that stand alone; an unlikely rate; plans that are short against the motion.
+    Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, are in another
+    unit, or reach a place beyond 100 m or rad; state columns that never change, equal another one, leap, hold marks of
+    what is missing, are clocks or quaternions that change their sign; frames at both ends in which nothing moves;
+    actions of another kind than declared, that never change, leap for one frame or hold marks; labels that stand alone;
+    an unlikely rate; plans that are short against the motion.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout, with ``state``.
@@ -65,10 +73,15 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *_trajectory_warnings(data, task, lengths, called),
         *_short(lengths, called),
         *_column_warnings(state, task.state_names),
-        *_leaps(frames, called, task.state_names),
+        *leap_warnings(frames, called, task.state_names),
+        *quaternion_warnings(frames, task.state_names),
+        *mark_warnings(np.concatenate(frames), task.state_names, "column"),
+        *scale_warnings(frames, called, task.state_names, "column"),
         *_stillness(frames, called),
         *_clocks(frames, task),
-        *_spikes(labels, called, task.action_names),
+        *spike_warnings(labels, called, task.action_names),
+        *mark_warnings(np.concatenate(labels), task.action_names, "action"),
+        *scale_warnings(labels, called, task.action_names, "action"),
         *_single_labels(data.get(keys.HAS_ACTION).squeeze(-1).split(lengths), called),
         *(
             f"action {name!r} is {value:g} in all labels: controllers command that, method dp something near it"
@@ -133,62 +146,15 @@ def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
     return found
 
 
-def _leaps(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Columns whose largest step is above 1/3 of their range and twenty times the usual one, and why."""
-    if all(len(frames) < 2 for frames in trajectories):
-        return []
-    bound, usual = leap_bounds(trajectories)
-    found: dict[str, list[str]] = {}
-    for column, name in enumerate(names):
-        where = [np.flatnonzero(np.abs(np.diff(frames[:, column])) > bound[column]) for frames in trajectories]
-        number = sum(map(len, where))
-        if not number:
-            continue
-        trajectory = next(index for index, at in enumerate(where) if len(at))
-        at = int(where[trajectory][0])
-        frames = trajectories[trajectory]
-        before, after = frames[at : at + 2]
-        leaping = (np.abs(after - before) > bound).mean()
-        flipped = (np.abs(after + before) < UNUSUAL * usual) & (np.abs(after - before) > UNUSUAL * usual)
-        why = _cause(frames[at : at + 3, column], UNUSUAL * usual[column], flipped.sum() > 1, leaping > 0.5)
-        more = f" and {number - 1} times more" if number > 1 else ""
-        found.setdefault(why, []).append(
-            f"{name!r} from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of"
-            f" {called[trajectory]}{more})"
-        )
-    return [f"columns leap: {', '.join(which)}: {why}" for why, which in found.items()]
-
-
 def _clocks(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
     moving = np.flatnonzero(np.ptp(np.concatenate(trajectories), axis=0))
-    even = [column for column in moving if rises_evenly([frames[:, column] for frames in trajectories])]
+    even = [column for column in moving if rises_evenly([frames[:, column] for frames in trajectories], room=JITTER)]
     if len(even) < len(moving):  # else it is how all move
         for column in even:
-            said = "rises by the same amount in every frame: a clock is no state, leave it out"
+            said = "rises by much the same amount in every frame: a clock is no state, leave it out"
             yield f"column {task.state_names[column]!r} {said}"
     if not SLOWEST <= task.control_hz <= FASTEST:
         yield f"control_hz is {task.control_hz:g}: frames per second, not seconds per frame?"
-
-
-def _spikes(actions: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> Iterator[str]:
-    """Labels ``[T_i, a]`` that leap for one frame."""
-    known = [(name, steps) for name, steps in zip(called, actions, strict=True) if len(steps) > 2]
-    if not known:
-        return
-    bound, _ = leap_bounds([steps for _, steps in known])
-    for column, name in enumerate(names):
-        found = []
-        for source, steps in known:
-            change = np.diff(steps[:, column])
-            out = (np.abs(change) > bound[column])[:-1] & (np.abs(change) > bound[column])[1:]
-            at = np.flatnonzero(out & (change[:-1] * change[1:] < 0)) + 1
-            found += [f"{steps[step, column]:.3g} in label {step} of {source}" for step in at]
-        if found:
-            more = f" and {len(found) - 1} times more" if len(found) > 1 else ""
-            yield (
-                f"action {name!r} is {found[0]}{more} and far from that before and behind: the difference of wrapped"
-                " angles, or a command that was not logged? mend it, or make it NaN"
-            )
 
 
 def _single_labels(known: Sequence[Tensor], called: Sequence[str]) -> Iterator[str]:
@@ -203,24 +169,6 @@ def _single_labels(known: Sequence[Tensor], called: Sequence[str]) -> Iterator[s
             f"labels stand alone in {len(few)} trajectories: {some(few)}; if actions are logged only where they change,"
             " repeat the last one"
         )
-
-
-def _cause(values: np.ndarray, near: float, flipped: bool, most: bool) -> str:
-    """Why a column leaps between the first two of three values, and what to do."""
-    leap = abs(values[1] - values[0])
-    turn = next((turn for turn in (2 * np.pi, 360.0) if abs(leap - turn) < max(near, 0.1 * turn)), None)
-    if turn is not None:
-        bound = "pi" if turn < 10 else "180 degrees"
-        return f"angles that were wrapped at {bound}? np.unwrap them, or give their sine and cosine"
-    if flipped and leap <= 2 + near:
-        return "a quaternion that changes its sign? flip it where its product with the frame before is negative"
-    if len(values) > 2 and abs(values[2] - values[0]) < near:
-        return "a measurement that failed for a frame? fill it from its neighbours"
-    if most:
-        return (
-            "two episodes in one trajectory? part them, or say where they end (a column 'episode_index' or 'timeouts')"
-        )
-    return "a switch, or a measurement that failed? leave it out, or fill it from its neighbours"
 
 
 def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
@@ -312,6 +260,13 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
         f"a plan covers {covers}, {HORIZON / frames:.1%} of a demonstration: short against the motion. A rate of"
         f" {control_hz / every:.3g} Hz (one frame in {every}) would let it look farther: {option('resample')}"
     )
+
+
+def goal_columns(recordings: Recordings) -> list[str]:
+    """Names state columns that are constant in each trajectory and differ between them: goals, or what was varied."""
+    constant = np.all([np.ptp(frames, axis=0) == 0 for frames in recordings.states], axis=0)
+    differ = np.ptp([frames[0] for frames in recordings.states], axis=0) > 0
+    return [name for name, goal in zip(recordings.state_names, constant & differ, strict=True) if goal]
 
 
 def constant_columns(actions: np.ndarray) -> list[float | None]:

@@ -183,7 +183,8 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
 
     Returns:
         dict: ``labels``, ``trajectories``; ``relative``: the controller's error as a share of that of the mean action,
-        root mean square over columns (1: no better than always giving the mean action); ``unit`` and ``column``: rows
+        root mean square over columns (1: no better than always giving the mean action); ``ridge_relative``: the
+        ridge's likewise; ``unit`` and ``column``: rows
         with the errors of every model in the unit of the data; ``trajectory``: the relative error of each.
     """
     square = {name: (predicted - true).square() for name, predicted in models.items()}
@@ -196,7 +197,7 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
         "labels": len(true),
         "trajectories": len(episode.unique()),
         "relative": _relative(square),
-        "relative_of_ridge": _relative(square, "ridge") if "ridge" in square else None,
+        "ridge_relative": _relative(square, "ridge") if "ridge" in square else None,
         "unit": [
             {"unit": unit, "columns": [names[column] for column in columns], **root(columns)}
             for unit, columns in unit_groups(units).items()

@@ -96,7 +96,7 @@ def control_is_as_good(run: RunFacts) -> Advice | None:
     """A plain ridge errs no more than the method."""
     method, split = run.config.get("method"), run.evaluation.get("action_errors_on")
     errors = run.action_errors.get(split) if split else None
-    own, ridge = (number((errors or {}).get(name)) for name in ("relative", "relative_of_ridge"))
+    own, ridge = (number((errors or {}).get(name)) for name in ("relative", "ridge_relative"))
     if own is None or ridge is None or own < ridge or method in CONTROLS:
         return None
     return Advice(

@@ -110,8 +110,9 @@ def test_another_rate_than_that_of_the_data_is_warned_of(recwarn):
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match="control_hz must be a positive number"):
-        AsynchronousAgent(policy_of(), control_hz=0)
+    for wrong in (0, "20", None, float("nan"), True):
+        with pytest.raises(ValueError, match=f"control_hz must be a positive number .*, got {wrong!r}"):
+            AsynchronousAgent(policy_of(), control_hz=wrong)
     with pytest.raises(ValueError, match="with strategy 'feedback', not 'open_loop'"):
         AsynchronousAgent(policy_of(strategy="open_loop"), control_hz=30)
     assert issubclass(AsynchronousAgent, Agent)

@@ -80,7 +80,12 @@ _ELSEWHERE = {
     "*.npy": "it holds *.npy files: save each recording with np.savez(file, states=..., actions=...)",
     "*.tsv": "it holds *.tsv files: call them *.csv",
     **dict.fromkeys(("*.h5", "*.hdf5"), "it holds HDF5 files: name one of them"),
-    **dict.fromkeys(("*/*.npz", "*/*.csv"), "its folders hold tables: name one of them"),
+    **dict.fromkeys(
+        (f"{below}*.{kind}" for below in ("*/", "*/*/") for kind in ("npz", "csv", "parquet")),
+        "folders below it hold tables: name one of them",
+    ),
+    "*/meta/info.json": "folders below it hold LeRobot data sets: name one of them",
+    **dict.fromkeys(("*.gz", "*.zip", "*.tar", "*.xz"), "it holds packed files: unpack them"),
 }
 # options of all but this library's own
 COMMON = ("control_hz", "resample", "action_kind", "action_dim", "state_columns", "drop_columns")
@@ -178,7 +183,7 @@ def read_recordings(
     if name is None and not Path(source).exists():
         raise FileNotFoundError(f"{source} does not exist")
     if name is None:
-        said = [hint for ending, hint in _ELSEWHERE.items() if any(Path(source).glob(ending))]
+        said = [*dict.fromkeys(hint for ending, hint in _ELSEWHERE.items() if any(Path(source).glob(ending)))]
         said.append("there are readers for " + ", ".join(form.what for form in FORMATS.values()))
         raise ValueError(f"{source} holds no recordings that can be read; {'; '.join(said)}")
     form = FORMATS[name]

@@ -105,8 +105,9 @@ def assemble(
     if unclear and not state_columns:
         problems.append(
             f"{', '.join(map(repr, unclear))} may say which episode a frame is of, or where episodes end: call it"
-            " episode_index, timeouts or episode_ends then; else name the state's columns in"
-            f" {option('state_columns')}, or drop it in {option('drop_columns')}"
+            " episode_index, timeouts or episode_ends then; if it is a column of the states or the actions, put it"
+            f" there; else name the state's columns in {option('state_columns')}, or drop it in"
+            f" {option('drop_columns')}"
         )
     even = set() if state_columns else _even(pieces)
     usable = [name for name in names if kind_of(name)[0] is None and name not in even]

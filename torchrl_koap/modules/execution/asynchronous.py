@@ -62,8 +62,6 @@ class AsynchronousAgent(Agent):
             raise ValueError(
                 f"plans are made asynchronously with strategy 'feedback', not {policy.execution.strategy!r}"
             )
-        if not (math.isfinite(control_hz) and control_hz > 0):
-            raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz}")
         policy.check_rate(control_hz)
         self.control_hz = control_hz
         self._delay = 1  # steps that a plan takes

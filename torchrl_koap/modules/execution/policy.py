@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -127,7 +128,14 @@ class PlanningPolicy(TensorDictModuleBase):
         return self.planner.noise_shape
 
     def check_rate(self, control_hz: float) -> None:
-        """Warns of a control rate (Hz) that differs by more than a fifth from that of the data."""
+        """Warns of a control rate (Hz) that differs by more than a fifth from that of the data.
+
+        Raises:
+            ValueError: if it is no positive number.
+        """
+        number = isinstance(control_hz, (int, float)) and not isinstance(control_hz, bool)
+        if not (number and math.isfinite(control_hz) and control_hz > 0):
+            raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz!r}")
         if self.control_hz is not None and not 0.8 <= control_hz / self.control_hz <= 1.25:
             warnings.warn(
                 f"control_hz is {control_hz:g}, the policy was trained on data of {self.control_hz:g} Hz: its plans and"

@@ -1,0 +1,91 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Leaps, marks, other units and signs: each is told with its cause."""
+
+import re
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data.odd_values import (
+    leap_warnings,
+    mark_warnings,
+    quaternion_warnings,
+    scale_warnings,
+    spike_warnings,
+)
+
+TIME = np.linspace(0, 2, 60)[:, None]
+
+
+def seen(*trajectories):
+    """Warnings about leaps beside a smooth column."""
+    frames = [np.hstack([np.sin(TIME + index), columns]) for index, columns in enumerate(trajectories)]
+    names = ["sine", *(f"q{index}" for index in range(trajectories[0].shape[1]))]
+    return leap_warnings(frames, [f"trajectory {index}" for index in range(len(frames))], names)
+
+
+def leaping(frames, at, change):
+    frames = frames.copy()
+    frames[at] = change(frames[at])
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ((3 * TIME + 1 + np.pi) % (2 * np.pi) - np.pi, r"'q0' from 3.14 to -3.05 \(frame 22 of trajectory 0\): angles"),
+        ((170 * TIME + 180) % 360 - 180, "angles that were wrapped by 360"),
+        ((900 * TIME + 2600) % 4096, "a count or an angle that was wrapped by 4.0.e.03"),
+        (np.hstack([np.cos(TIME), np.sin(TIME)]) * np.where(TIME < 1, 1, -1), "'q0' .*, 'q1' .*: a quaternion"),
+        (
+            leaping(TIME + 3, 17, lambda value: 0 * value),
+            "from 3.54 to 0 .*and 1 times more.*: a measurement that failed",
+        ),
+        (leaping(TIME, slice(40, None), lambda value: value + 9), "'q0' .*: a switch, or a measurement that failed"),
+        (leaping(np.hstack([TIME, TIME**2]), slice(40, None), lambda value: value + 9), "two episodes in one"),
+    ],
+)
+def test_leaps_are_named_with_their_cause(columns, message):
+    (warning,) = seen(columns)
+    assert re.search(message, warning)
+
+
+def test_switches_and_smooth_columns_do_not_leap():
+    assert seen(np.hstack([TIME > 1, np.exp(-3 * TIME), np.repeat([[0.0], [0.04], [0.08]], 20, 0)])) == []
+
+
+def test_labels_that_leap():
+    steps = 0.01 * np.sin(np.arange(1, 20)[:, None] / 4.5)
+    steps[7] -= 2 * np.pi
+    (warning,) = spike_warnings([steps], ["a.csv"], ["v"])
+    assert warning.startswith("action 'v' is -6.27 in label 7 of a.csv and far from that before")
+    assert list(spike_warnings([(np.arange(19) == 7).astype(float)[:, None]], ["a.csv"], ["v"])) == []  # a switch
+
+
+OFTEN = np.where(np.arange(60) % 3, 1, -1)[:, None]
+
+
+@pytest.mark.parametrize("signs", [(OFTEN, OFTEN), (1, -1)], ids=["in most frames", "between trajectories"])
+def test_signs_of_quaternions(signs):
+    turn, names = np.hstack([np.cos(TIME / 4), np.sin(TIME / 4), 0 * TIME, 0 * TIME]), ["w", "x", "y", "z", "height"]
+    trajectories = [np.hstack([turn * sign, TIME]) for sign in signs]
+    (warning,) = quaternion_warnings(trajectories, names)
+    assert warning.startswith("columns w, x, y, z are a quaternion that changes its sign")
+    assert not [*quaternion_warnings([np.hstack([turn, TIME])] * 2, names)]
+
+
+@pytest.mark.parametrize("kind", ["column", "action"])
+def test_marks_of_what_is_missing(kind):
+    rows = np.where(np.arange(60)[:, None] % 7, np.sin(TIME), -999)
+    (warning,) = mark_warnings(rows, ["v"], kind)
+    assert warning.startswith(f"{kind} 'v' is -999 in 9 of 60 rows and within 0") and "missing?" in warning
+    for sound in (TIME > 1, np.round(TIME), np.minimum(TIME, 1), np.where(TIME > 1.97, 99, TIME)):
+        assert not [*mark_warnings(sound.astype(float), ["v"], kind)]
+
+
+def test_a_trajectory_in_another_unit():
+    frames, called = [np.sin(TIME + index) for index in range(4)], ["a", "b", "c", "d"]
+    assert not [*scale_warnings(frames, called, ["q"], "column")]
+    frames[2] = np.degrees(frames[2])
+    (warning,) = scale_warnings(frames, called, ["q"], "column")
+    assert re.fullmatch("column 'q' reaches .* times as far as usual in c: another unit, or .*", warning)

@@ -1,0 +1,148 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Numbers that are unlikely in a column: leaps, marks of what is missing, other units, signs of quaternions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds
+from torchrl_koap.files import some
+
+AWAY, OFTEN = 10.0, 3  # a mark lies that many ranges of the others away from them, and stands so often
+OTHER = 20.0  # times as far as in most trajectories
+_UNIT = 0.01  # how far the length of a quaternion may be from 1
+
+
+def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Finds columns of ``[T_i, d]`` whose largest step is above 1/3 of their range and twenty times the usual one.
+
+    It says why, and what would mend them.
+    """
+    if all(len(frames) < 2 for frames in trajectories):
+        return []
+    bound, usual = leap_bounds(trajectories)
+    low, high = (end(np.concatenate(trajectories), axis=0) for end in (np.min, np.max))
+    found: dict[str, list[str]] = {}
+    for column, name in enumerate(names):
+        where = [np.flatnonzero(np.abs(np.diff(frames[:, column])) > bound[column]) for frames in trajectories]
+        number = sum(map(len, where))
+        if not number:
+            continue
+        trajectory = next(index for index, at in enumerate(where) if len(at))
+        at = int(where[trajectory][0])
+        frames = trajectories[trajectory]
+        before, after = frames[at : at + 2]
+        leaping = (np.abs(after - before) > bound).mean()
+        flipped = (np.abs(after + before) < UNUSUAL * usual) & (np.abs(after - before) > UNUSUAL * usual)
+        ends = np.sort(frames[at : at + 2, column]) - [low[column], high[column]]
+        wraps = bool((np.abs(ends) < 0.05 * (high - low)[column]).all())
+        near = UNUSUAL * usual[column]
+        why = _cause(frames[at : at + 3, column], near, flipped.sum() > 1, leaping > 0.5, wraps)
+        more = f" and {number - 1} times more" if number > 1 else ""
+        found.setdefault(why, []).append(
+            f"{name!r} from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of"
+            f" {called[trajectory]}{more})"
+        )
+    return [f"columns leap: {', '.join(which)}: {why}" for why, which in found.items()]
+
+
+def _cause(values: np.ndarray, near: float, flipped: bool, most: bool, wraps: bool) -> str:
+    """Why a column leaps between the first two of three values, and what to do."""
+    leap = abs(values[1] - values[0])
+    turn = next((turn for turn in (2 * np.pi, 360.0) if abs(leap - turn) < max(near, 0.1 * turn)), None)
+    if turn is not None:
+        return f"angles that were wrapped by {turn:.3g}? np.unwrap them, or give their sine and cosine"
+    if flipped and leap <= 2 + near:
+        return "a quaternion that changes its sign? flip it where its product with the frame before is negative"
+    if len(values) > 2 and abs(values[2] - values[0]) < near:
+        return "a measurement that failed for a frame? fill it from its neighbours"
+    if most:
+        return (
+            "two episodes in one trajectory? part them, or say where they end (a column 'episode_index' or 'timeouts')"
+        )
+    if wraps:
+        return f"a count or an angle that was wrapped by {leap:.3g}? np.unwrap it with that period"
+    return "a switch, or a measurement that failed? leave it out, or fill it from its neighbours"
+
+
+def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
+    """Finds four neighbouring columns of length 1 whose sign changes often, or from one trajectory to another.
+
+    A few changes inside of trajectories are leaps already.
+    """
+    if all(len(frames) < 2 for frames in trajectories):
+        return
+    bound, _ = leap_bounds(trajectories)
+    for start in range(len(names) - 3):
+        turns = [frames[:, start : start + 4] for frames in trajectories]
+        if any((np.abs(np.linalg.norm(turn, axis=1) - 1) > _UNIT).any() for turn in turns):
+            continue
+        steps = np.concatenate([np.diff(turn, axis=0)[(turn[1:] * turn[:-1]).sum(1) < 0] for turn in turns])
+        leaps = bool((np.abs(steps) > bound[start : start + 4]).any())
+        opposite = sum(bool(np.linalg.norm(turn[0] + turns[0][0]) < 0.5) for turn in turns)
+        if (len(steps) and not leaps) or opposite:
+            said = f"in {len(steps)} frames, and in {opposite} trajectories against that of the first"
+            yield (
+                f"columns {', '.join(names[start : start + 4])} are a quaternion that changes its sign {said}: flip it"
+                " where its product with the frame before, or with the first of all, is negative"
+            )
+
+
+def mark_warnings(rows: np.ndarray, names: Sequence[str], kind: str) -> Iterator[str]:
+    """Finds numbers of ``[N, d]`` that come again and again, far from all others: marks of what is missing.
+
+    ``kind`` is ``"column"`` or ``"action"``.
+    """
+    for name, values in zip(names, rows.T, strict=True):
+        levels, counts = np.unique(values, return_counts=True)
+        for mark, others in ((0, levels[1:]), (-1, levels[:-1])):
+            far = len(others) > OFTEN and np.abs(others - levels[mark]).min() > AWAY * np.ptp(others)
+            if far and counts[mark] >= OFTEN:
+                yield (
+                    f"{kind} {name!r} is {levels[mark]:g} in {counts[mark]} of {len(values)} rows and within"
+                    f" {others[0]:.3g} to {others[-1]:.3g} in all others: a mark of what is missing? "
+                    + ("make it NaN" if kind == "action" else "fill it, or leave these frames out")
+                )
+
+
+def scale_warnings(
+    trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str], kind: str
+) -> Iterator[str]:
+    """Finds trajectories in which a column reaches twenty times as far as in three quarters of the others."""
+    known = [(name, rows) for name, rows in zip(called, trajectories, strict=True) if len(rows)]
+    if len(known) < 3:
+        return
+    middle = np.median(np.concatenate([rows for _, rows in known]), axis=0)
+    reach = np.stack([np.abs(rows - middle).max(0) for _, rows in known])
+    usual = np.sort(reach, axis=0)[3 * (len(known) - 1) // 4]
+    for column, name in enumerate(names):
+        odd = np.flatnonzero(reach[:, column] > OTHER * usual[column]) if usual[column] > 0 else []
+        if len(odd):
+            times, where = reach[odd, column].min() / usual[column], some([known[index][0] for index in odd])
+            yield (
+                f"{kind} {name!r} reaches {times:.3g} times as far as usual in {where}: another unit, or a measurement"
+                " that failed?"
+            )
+
+
+def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> Iterator[str]:
+    """Finds labels ``[T_i, a]`` that leap for one frame."""
+    known = [(name, steps) for name, steps in zip(called, actions, strict=True) if len(steps) > 2]
+    if not known:
+        return
+    bound, _ = leap_bounds([steps for _, steps in known])
+    for column, name in enumerate(names):
+        found = []
+        for source, steps in known:
+            change = np.diff(steps[:, column])
+            out = (np.abs(change) > bound[column])[:-1] & (np.abs(change) > bound[column])[1:]
+            at = np.flatnonzero(out & (change[:-1] * change[1:] < 0)) + 1
+            found += [f"{steps[step, column]:.3g} in label {step} of {source}" for step in at]
+        if found:
+            more = f" and {len(found) - 1} times more" if len(found) > 1 else ""
+            yield (
+                f"action {name!r} is {found[0]}{more} and far from that before and behind: the difference of wrapped"
+                " angles, or a command that was not logged? mend it, or make it NaN"
+            )
