@@ -3,13 +3,11 @@
 
 import json
 import re
-from functools import partial
 
 import numpy as np
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.commands import run_commands
 from torchrl_koap.data import load_ted, stored_task
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
@@ -82,12 +80,11 @@ def test_absolute_targets(arrays, tmp_path, capsys):
     assert limited.act(far).max() < moved.max() and limited.policy.limited.tolist() == [1, 1]
 
 
-def test_export_and_latency(run, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(run_commands, "time_calls", partial(run_commands.time_calls, repeats=3))
+def test_export_and_latency(run, tmp_path, capsys):
     assert koap("export", run, "--out", tmp_path / "exported") == 0
     assert {file.name for file in (tmp_path / "exported").iterdir()} == {"policy.pt2", "policy.json"}
     printed = capsys.readouterr().out
-    assert "policy ms eager" in printed and "open loop between plans" in printed
+    assert "open loop between plans" in printed
     facts = json.loads((tmp_path / "exported" / "policy.json").read_text())
     observed, acted = facts["inputs"]["observations"], facts["outputs"]["actions"]
     assert (observed["columns"], acted["columns"]) == (["q1", "q2", "goal1", "goal2"], ["dq1", "dq2"])

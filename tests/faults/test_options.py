@@ -28,7 +28,7 @@ BASE = {
     "bench": ("--out", "{out}", "--table", "1", "--tasks", "avoiding", "--seeds", "1", "--workers", "1"),
     "inspect": ("{run}", "--episodes", "1", "--threads", "1"),
     "suggest": ("{run}",),
-    "export": ("{run}", "--no-latency"),
+    "export": ("{run}",),
     "latency": ("{run}", "--steps", "2"),
     "doctor": (),
     "validate": ("{data}",),

@@ -20,7 +20,7 @@ EVAL = ("eval", "{run}", "--episodes", "1", "--threads", "1", "--no-report")
 RESUME = ("train", "--out", "{run}", "--resume")
 READERS = {
     "eval": EVAL,
-    "export": ("export", "{run}", "--no-latency"),
+    "export": ("export", "{run}"),
     "suggest": ("suggest", "{run}"),
     "inspect": ("inspect", "{run}", "--episodes", "1", "--threads", "1"),
     "latency": ("latency", "{run}", "--steps", "2"),

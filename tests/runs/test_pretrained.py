@@ -99,7 +99,7 @@ def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd
     looked = ("--latent-only", "--threads", "1", "--dataset", tmp_path / "demos")
     assert koap("inspect", "pretrained:avoiding", "--out", out, *looked) == 0
     assert "findings" in json.loads((out / "inspect.json").read_text())
-    assert koap("export", "pretrained:avoiding", "--out", exported, "--no-latency") == 0
+    assert koap("export", "pretrained:avoiding", "--out", exported) == 0
     assert {file.name for file in exported.iterdir()} == {"policy.pt2", "policy.json"}
     assert koap("latency", "pretrained:avoiding", "--steps", "2") == 0
     written = {path.name for path in (policies / "avoiding").iterdir()}

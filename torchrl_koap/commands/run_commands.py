@@ -20,7 +20,7 @@ from torchrl_koap.evaluation import (
     load_policy,
     suggest,
 )
-from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop, time_calls
+from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.export import SUFFIXES, export_policy, exportable
 from torchrl_koap.reports.pictures import draw_pictures
@@ -183,17 +183,15 @@ class Export(Command):
         format: "torch" (torch.export), "onnx" (ONNX Runtime), "aoti" (AOTInductor, needs a C++ compiler) or "lerobot"
             (a folder for lerobot-eval and lerobot-record).
         threads: torch threads.
-        latency: time the exported policy against the eager one.
     """
 
     run: tyro.conf.Positional[str]
     out: Path | None = None
     format: str = "torch"
     threads: int = 1
-    latency: bool = True
 
     def __call__(self) -> dict[str, Any]:
-        """Exports, compares, times."""
+        """Exports and compares."""
         suffix = lookup(SUFFIXES | {"lerobot": None}, self.format, "export format")
         set_up_torch(self.threads, "cpu")
         trained = Trained.load(self.run)
@@ -203,12 +201,9 @@ class Export(Command):
         policy = load_policy(trained)
         out.mkdir(parents=True, exist_ok=True)
         what, file = exportable(policy, columns=_columns(trained.task)), out / f"policy{suffix}"
-        loaded = export_policy(what, file, kind=self.format)
+        export_policy(what, file, kind=self.format)
         result: dict[str, Any] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
         result |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}
-        if self.latency:
-            inputs = tuple(what.inputs.values())
-            result["policy ms"] = time_calls({"eager": what.module, self.format: loaded}, inputs)
         RunDirectory(out).write_json("policy.json", {"task": trained.task.name, "file": file.name, **what.facts})
         return result | {"note": what.facts["note"]}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torch import Tensor
 
 from torchrl_koap.evaluation.rollouts import device_of
 from torchrl_koap.keys import ACTION
@@ -120,31 +119,4 @@ def run_control_loop(agent: Agent, observations: Sequence[Any] | np.ndarray, *, 
         "p50": float(p50),
         "p99": float(p99),
         "max": float(times.max()),
-    }
-
-
-def time_calls(
-    functions: Mapping[str, Callable[..., Tensor]], inputs: tuple[Tensor, ...], *, repeats: int = 100
-) -> dict[str, dict[str, float]]:
-    """Times functions that are called in turn, so that a busy machine slows all of them alike.
-
-    Ten calls of each come before those that count. By name: ``p50`` and ``p99`` in ms, and ``ratio``, the median of its
-    time over that of the first function in the same turn.
-    """
-    taken: dict[str, list[float]] = {name: [] for name in functions}
-    with torch.no_grad():
-        for turn in range(repeats + 10):
-            for name, function in functions.items():
-                began = time.perf_counter()
-                function(*inputs)
-                if turn >= 10:
-                    taken[name].append(1e3 * (time.perf_counter() - began))
-    first = np.array(next(iter(taken.values())))
-    return {
-        name: {
-            "p50": float(np.percentile(times, 50)),
-            "p99": float(np.percentile(times, 99)),
-            "ratio": float(np.median(np.array(times) / first)),
-        }
-        for name, times in taken.items()
     }
