@@ -151,8 +151,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         if self.COLLIDES:
             leaves[keys.COLLISION] = Binary(**flag)
         if self.task.objects:
-            size = (*shape, *self._contexts.shape[1:])
-            leaves[keys.CONTEXT] = Unbounded(size, device=device, dtype=self._dtype)
+            leaves[keys.CONTEXT] = Unbounded((*shape, *self._contexts.shape[1:]), device=device, dtype=self._dtype)
         self.observation_spec = Composite(leaves, shape=shape)
         size = (*shape, self.task.action_dim)
         bounds = (torch.as_tensor(bound, dtype=self._dtype, device=device) for bound in self.ACTION_BOUND)
@@ -208,7 +207,6 @@ class ManipulationEnv(EpisodeState, EnvBase):
     def _start(self, rows: np.ndarray) -> None:
         """Puts the simulations into their first states, those of ``self._contexts[rows]``."""
         self.sims.reset(rows, np.asarray(self.START_JOINTS), self._place(rows), width=self.RESET_WIDTH)
-        self.sims.widths[rows] = controller.FINGER_OPEN
 
     def _draw_contexts(self, rows: np.ndarray, contexts) -> None:
         if contexts is not None:
@@ -263,11 +261,8 @@ class ManipulationEnv(EpisodeState, EnvBase):
         action = action.detach().to("cpu", torch.float64).numpy()[rows]
         bad = ~np.isfinite(action).all(-1)
         if bad.any():
-            row = int(rows[bad][0])
-            raise ValueError(
-                f"{keys.ACTION!r} must be finite, got {action[bad][0].tolist()} for environment {row}"
-                f" ({int(bad.sum())} of {len(rows)} environments concerned)"
-            )
+            first = f"{action[bad][0].tolist()} for environment {rows[bad][0]} ({bad.sum()} of {len(rows)} concerned)"
+            raise ValueError(f"{keys.ACTION!r} must be finite, got {first}")
         if not self._ready[rows].all():
             raise RuntimeError("step() before the first reset() of these environments")
         return action
@@ -326,20 +321,11 @@ class ManipulationEnv(EpisodeState, EnvBase):
         super().close(**kwargs)
 
     def raw_log(self) -> dict[str, np.ndarray]:
-        """Returns what D3IL's recorder logs for the last control step (docs/appendix/d3il.md, Recordings).
-
-        It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins, ``des_c_pos`` its command.
-        Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s; an array ``[n, ...]`` each.
-        """
-        row = {name: self.sims.log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
-        row["gripper_width"] = row["gripper_width"][:, 0]
-        if self.COMMAND_DIM == 7:  # a pose; joints are in the log already
-            row |= {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:]}
-        row["time_stamp"] = self.sims.log_time.copy()
-        row["sim_step"] = np.rint(self.sims.log_time / controller.TIMESTEP).astype(np.int64)
-        return row
+        """Returns what D3IL's recorder logs for the last control step, and its command ``des_c_pos`` (m)."""
+        pose = {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:]}
+        return self.sims.logged() | (pose if self.COMMAND_DIM == 7 else {})  # joints are in the log already
 
     def raw_objects(self) -> dict[str, np.ndarray]:
         """Returns the poses [n, 7] (m, quaternion) of the task's objects by name, as D3IL's recorder logs them."""
-        poses = self.sims.log[:, controller.LOG_WIDTH :].reshape(len(self.sims), -1, 7)
-        return {name: poses[:, index].copy() for index, name in enumerate(self.task.objects[: poses.shape[1]])}
+        poses = self.sims.logged_poses()
+        return {name: poses[:, index] for index, name in enumerate(self.task.objects[: poses.shape[1]])}

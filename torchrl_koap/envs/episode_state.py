@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.tasks import Task
 
 
@@ -56,20 +55,13 @@ class EpisodeState(abc.ABC):
             ValueError: if a size is wrong.
         """
         self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
-        self.sims.widths[index] = controller.FINGER_OPEN
         self._begin_episode(np.array([index]))
 
     def simulate_actions(self, actions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Simulates action sequences from the present state and restores it.
 
-        Entry ``k`` is the state that the actions 0 to ``k`` lead to; :meth:`step` observes it one control step later.
-
-        Args:
-            actions (np.ndarray): sequences to try ``[m, len(rows), k, act]``.
-            rows (np.ndarray, optional): which environments. Default: all.
-
-        Returns:
-            np.ndarray: observations ``[m, len(rows), k, obs]``.
+        Sequences ``[m, len(rows), k, act]`` lead to observations ``[m, len(rows), k, obs]``, in all environments or in
+        ``rows``. Entry ``k`` is the state after actions 0 to ``k``; :meth:`step` observes it one control step later.
 
         Raises:
             ValueError: if the shape is wrong.

@@ -13,8 +13,7 @@ What an environment has to offer, D3IL's (:class:`~torchrl_koap.envs.Manipulatio
     context          [n, bodies, 3], where the task has bodies
     reward, done, terminated, truncated
 
-Not needed, but used where it is there: ``raw_log()`` and ``raw_objects()`` for recordings in D3IL's own format,
-``render(index, width, height, camera)``, ``sims`` for films.
+Films read ``sims.model`` and ``sims.data`` of MuJoCo where they are there.
 """
 
 from __future__ import annotations

@@ -161,6 +161,7 @@ class SimulationBatch(Simulations):
         self.widths[rows] = width
         self.grasping[rows] = False
         self.track_joints(rows, commands, substeps=1)
+        self.widths[rows] = controller.FINGER_OPEN
 
     def track_pose(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
         """Advances simulations by ``substeps`` while the TCP follows ``commands`` [n, 7] (position, quaternion)."""
@@ -214,7 +215,21 @@ class SimulationBatch(Simulations):
         mujoco.mj_forward(self.model, data)
         if qacc_warmstart is not None:  # the forward pass has replaced it
             data.qacc_warmstart[:] = qacc_warmstart
-        self.started[row] = False
+        self.started[row], self.widths[row] = False, controller.FINGER_OPEN
+
+    def logged(self) -> dict[str, np.ndarray]:
+        """Returns what D3IL's recorder logs for the last control step (docs/appendix/d3il.md, Recordings).
+
+        It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins. Joints in rad, velocities in
+        rad/s and m/s, ``time_stamp`` in s; an array ``[n, ...]`` each.
+        """
+        row = {name: self.log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
+        row["gripper_width"], row["time_stamp"] = row["gripper_width"][:, 0], self.log_time.copy()
+        return row | {"sim_step": np.rint(self.log_time / controller.TIMESTEP).astype(np.int64)}
+
+    def logged_poses(self) -> np.ndarray:
+        """Returns the logged poses of the free bodies [n, objects, 7] (m, quaternion)."""
+        return self.log[:, controller.LOG_WIDTH :].reshape(len(self), -1, 7).copy()
 
     def contacts(self, row: int, geom: int, others: Sequence[int]) -> np.ndarray:
         """Returns which of the geoms ``others`` touched ``geom`` in the last substep, bool [len(others)]."""
