@@ -50,6 +50,14 @@ def test_a_policy_that_feeds_on_its_own_velocity_is_unstable(trained):
     assert free["limited_commands"] == 0 and free["distance_to_demonstrations"] > found["distance_to_demonstrations"]
 
 
+def test_a_policy_that_stays_where_it_is(trained):
+    model, data = trained
+    assert check_loop(model, data, data)["share_of_way"] > 0.8
+    found = check_loop(model, data, data, execution=ExecutionConfig(gain=0.01))
+    assert found["share_of_way"] < 0.2
+    assert found["faults"][0].startswith("this policy does not leave the start: on a linear model of the robot")
+
+
 def test_labels_that_say_little_are_named():
     data, task = recordings(noise=1.0)
     noisy = data.copy()

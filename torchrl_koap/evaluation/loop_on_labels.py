@@ -23,6 +23,7 @@ from torchrl_koap.training.trained import Trained
 STEPS, ROBOTS = 300, 16
 UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of the loop
 FAR = 3.0  # standard deviations of the recorded states from the nearest of them
+STAYS = 0.2  # of the way of the demonstrations
 _EXPLAINED = 0.5  # of the variance of changes, below which labels do not say how states follow actions
 _DRIFT = 1.0  # standard deviations that recorded actions may end beside their recording
 _ROWS = 4000  # recorded states that distances are measured to
@@ -61,8 +62,9 @@ def check_loop(
     Returns:
         dict: ``steps``, ``robots``, ``explained`` (share of the changes' variance on labels left out),
         ``largest_command`` and ``largest_command_late`` (in the last third), over the largest demonstrated one,
-        ``distance_to_demonstrations`` (late, 95 % quantile, standard deviations), ``limited_commands``, ``commands``,
-        and sentences in ``faults``; or a ``note`` that says why there is none.
+        ``distance_to_demonstrations`` (late, 95 % quantile, standard deviations), ``share_of_way`` (how far it
+        gets from its starts, over how far demonstrations get, medians), ``limited_commands``, ``commands``, and
+        sentences in ``faults``; or a ``note`` that says why there is none.
     """
     task = trained.task
     ranges = command_ranges(task, labelled)
@@ -80,7 +82,7 @@ def check_loop(
     execution = (execution or ExecutionConfig()).on(trained.execution)
     free = trained.policy(execution.replaced(limits=math.inf))
     steps = min(STEPS, task.max_steps)
-    commands, distance = _roll(free, response, data, steps, seed)
+    commands, *where = _roll(free, response, data, steps, seed)
     growth, late = _growth(commands, ends_of(ranges), steps)
     if late > UNSTABLE:
         # actions of an expert that knew the states without noise tell that noise: states then explain changes wrongly
@@ -89,10 +91,10 @@ def check_loop(
             again = _roll(free, other, data, steps, seed)
             grown = _growth(again[0], ends_of(ranges), steps)
             if grown[1] < late:
-                response, (commands, distance), (growth, late) = other, again, grown
+                response, (commands, *where), (growth, late) = other, again, grown
     policy = trained.policy(execution)
     if policy.limits is not None and growth.max() > 1:
-        _, distance = _roll(policy, response, data, steps, seed)
+        _, *where = _roll(policy, response, data, steps, seed)
     limited = int(policy.limited[0])
     found = {
         "steps": steps,
@@ -100,7 +102,8 @@ def check_loop(
         "explained": response.explained,
         "largest_command": min(float(growth.max()), 1e30),
         "largest_command_late": min(late, 1e30),
-        "distance_to_demonstrations": distance,
+        "distance_to_demonstrations": where[0],
+        "share_of_way": where[1],
         "limited_commands": limited,
         "commands": steps * commands.shape[1],
     }
@@ -125,6 +128,12 @@ def _faults(found: Mapping[str, Any]) -> list[str]:
         faults.append(
             f"this policy leaves its demonstrations: on a linear model of the robot it ends {distance:.3g} standard"
             " deviations from the nearest recorded state; train longer (--steps) or record more"
+        )
+    if found["share_of_way"] < STAYS:
+        faults.append(
+            f"this policy does not leave the start: on a linear model of the robot it gets {found['share_of_way']:.2g}"
+            f" times as far as the demonstrations in {found['steps']} steps; cut pauses at their ends (`koap convert"
+            " --trim-still`), or train longer (--steps)"
         )
     return faults
 
@@ -189,8 +198,11 @@ def _replay_error(response: _Response, data: TensorDictBase) -> float:
 
 def _roll(
     policy: PlanningPolicy, response: _Response, data: TensorDictBase, steps: int, seed: int
-) -> tuple[Tensor, float]:
-    """Commands ``[steps, n, act]``, fewer where they are no numbers any more, and the distance to recorded states."""
+) -> tuple[Tensor, float, float]:
+    """Commands ``[steps, n, act]``, fewer where they are no numbers any more, and where the robots get.
+
+    The distance to recorded states, and the share of the way that the demonstrations take.
+    """
     observed, first = data[OBSERVATION].double(), _first(data)
     starts = (first.roll(1) & ~first & (observed + observed.roll(1, 0)).isfinite().all(-1)).nonzero().squeeze(-1)
     starts = spread_evenly(starts, ROBOTS)
@@ -207,12 +219,20 @@ def _roll(
         commands.append(action)
         visited.append(now)
     if not (now.abs() < 1e30).all():
-        return torch.stack(commands), math.inf
+        return torch.stack(commands), math.inf, math.inf
     spread, recorded = _spread(data), observed[observed.isfinite().all(-1)]
+    ways = [observed[data[EPISODE] == number][1 : steps + 2] for number in data[EPISODE][starts].tolist()]
+    usual = torch.stack([_way(rows - rows[:1], spread) for rows in ways]).median()
+    own = torch.stack([_way(rows, spread) for rows in (torch.stack(visited) - observed[starts]).unbind(1)]).median()
     recorded = recorded[:: -(-len(recorded) // _ROWS)] / spread
     last = torch.cat(visited[2 * steps // 3 :: 5]) / spread
     nearest = torch.cdist(last, recorded).amin(-1) / math.sqrt(recorded.shape[-1])
-    return torch.stack(commands), float(nearest.quantile(0.95))
+    return torch.stack(commands), float(nearest.quantile(0.95)), float(own / usual) if usual > 0 else 1.0
+
+
+def _way(moved: Tensor, spread: Tensor) -> Tensor:
+    """The farthest that rows ``[T, obs]`` of differences are from 0, in standard deviations."""
+    return (moved / spread).nan_to_num().norm(dim=-1).max()
 
 
 def _first(data: TensorDictBase) -> Tensor:
