@@ -128,13 +128,10 @@ def follow_recordings(
 
 
 def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
-    """Measures how far executed states lie from the current plan, per part of the state.
+    """Measures how far executed states lie from the current plan, per part of the state, in its units.
 
-    Of rollouts that follow a recording the steps count that it has, not the standing at its end.
-
-    Returns:
-        dict: root mean square distance per step ``1 .. interval`` after a plan, in the units of the part; empty for
-        rollouts ``[T]`` without the entry ``plan``.
+    These are root mean square distances per step ``1 .. interval`` after a plan; none of rollouts ``[T]`` without the
+    entry ``plan``. Of rollouts that follow a recording the steps count that it has, not the standing at its end.
     """
     errors: dict[str, list[Tensor]] = {name: [] for name in task.state_slices}
     for episode in episodes:
@@ -163,10 +160,8 @@ def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *
 def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:
     """Measures how far visited states are from the nearest demonstrated one, and demonstrated ones, in spreads.
 
-    Every second demonstration is compared with the others, so that both figures are distances to strangers.
-
-    Returns:
-        dict: median and 95 % quantile of the distances; empty if there is a single demonstration.
+    Every second demonstration is compared with the others, so that both figures are distances to strangers: median and
+    95 % quantile. Nothing is measured if there is a single demonstration.
     """
     every = data["episode"] % 2 == 0
     known, held_out = data["state"][every], data["state"][~every]

@@ -27,7 +27,7 @@ _COMMANDS = "the controller decodes no recorded states: it follows plans by the 
 
 
 def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Judges a run on recorded data.
+    """Judges a run on recorded data; a data set that has moved, or is another one, is refused.
 
     Plans are scored on trajectories that the planner has not seen, actions on labels outside the budget, if there are
     any, and on those inside it, a trajectory left out at a time. The whole policy acts in a linear model of how states
@@ -38,9 +38,6 @@ def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, An
         better than standing still), ``relative_action_error`` (1: no better than always giving the mean action),
         ``faults`` in words, and a row per trajectory in ``trajectory``; ``predicted`` and ``true`` actions ``[N, act]``
         outside the budget, if there are any.
-
-    Raises:
-        RunDirectoryError: if the data set has moved, or is another one.
     """
     data = trained.data(config.dataset)
     labelled, _ = trained.hide_labels(data)
@@ -68,13 +65,9 @@ def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, An
 def evaluate_actions(trained: Trained, dataset: str | None = None) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Compares decoded actions with labels outside the budget, for evaluation only, beside rollouts in an environment.
 
-    If the data set is not where it was, and ``dataset`` does not say where it is now, nothing is read.
-
-    Returns:
-        tuple: ``action_errors`` and what they come to, and the actions, as of :func:`evaluate_offline`.
-
-    Raises:
-        RunDirectoryError: if the data set that was named is not that of the training.
+    If the data set is not where it was, and ``dataset`` does not say where it is now, nothing is read; one that was
+    named and is not that of the training is refused. ``action_errors``, what they come to, and the actions are as of
+    :func:`evaluate_offline`.
     """
     try:
         data = trained.data(dataset)

@@ -122,14 +122,9 @@ class InverseDynamics(TensorDictModuleBase):
         return action + state[..., self.targets] if self.targets else action
 
     def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
-        """Sets before training what is known of the inputs: the spread of every step read.
+        """Sets before training what is known of raw states ``[*B, T, d]`` without labels: the spread of every step.
 
-        Args:
-            windows (Tensor): raw states ``[*B, T, d]``; no label is read.
-
-        Keyword Args:
-            updates (int): updates that a network may be trained for before its losses; here none is.
-            progress (callable, optional): called with the number of updates done, and of all.
+        A subclass may train a network for some updates, and calls ``progress`` with those done, and all.
         """
         if self.reader is not None:
             self.reader.fit(self.normalize_state(windows))
@@ -137,9 +132,8 @@ class InverseDynamics(TensorDictModuleBase):
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Predicts actions ``[*B, len(frames), act]`` in normalised units; a subclass says how.
 
-        Args:
-            state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to predict for. Default: all ``T``; offsets beyond the window are clamped.
+        The window of raw states is ``[*B, T, d]``, frames are all ``T`` by default; offsets beyond the window are
+        clamped.
         """
         raise NotImplementedError
 

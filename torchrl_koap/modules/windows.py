@@ -94,11 +94,7 @@ class WindowReader(nn.Module):
         return self.num_past + 1 + self.look_ahead[-1]
 
     def valid_frames(self, num_frames: int) -> range:
-        """Returns the frames that count in the losses: past, successor and look-ahead lie in the window.
-
-        Raises:
-            ValueError: if no frame of so short a window counts.
-        """
+        """Returns the frames that count in the losses: past, successor and look-ahead lie in the window."""
         ahead = self.min_offset if self.clamped else self.look_ahead[-1]
         frames = range(self.num_past, num_frames - ahead)
         if not frames:
@@ -115,13 +111,9 @@ class WindowReader(nn.Module):
         return (torch.arange(frames.start, frames.stop, device=device)[:, None] + offsets).clamp(0, num_frames - 1)
 
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Reads a window of states ``[*B, T, d]`` for all or some of its frames.
+        """Reads a window of states ``[*B, T, d]`` for all or some of its frames: ``[*B, len(frames), F, d]``.
 
-        Returns:
-            Tensor: ``[*B, len(frames), F, d]``; offsets beyond the window are clamped to it.
-
-        Raises:
-            ValueError: if the states have another number of columns.
+        Offsets beyond the window are clamped to it. States of another number of columns are refused.
         """
         if state.shape[-1] != self.state_dim:
             raise ValueError(f"expected states with {self.state_dim} columns, got shape {list(state.shape)}")

@@ -110,10 +110,7 @@ def picture(name: str, **facts: Any) -> Callable[[Draw], Draw]:
     """Registers the decorated function as the one that draws a picture; ``facts`` are the other entries of `Picture`.
 
     Of the source, ``.safetensors`` comes as a dictionary of arrays, ``.json`` as what it holds, ``.csv`` as a list of
-    rows. The function stays as it is.
-
-    Raises:
-        ValueError: if there is a picture of that name already.
+    rows. The function stays as it is. A name that is taken is refused.
     """
 
     def register(draw: Draw) -> Draw:

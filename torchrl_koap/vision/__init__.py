@@ -4,7 +4,7 @@
 from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
 from torchrl_koap.vision.encoder import FrozenImageEncoder
 from torchrl_koap.vision.observer import Observer
-from torchrl_koap.vision.projection import Projection, load_encoder, projection_of
+from torchrl_koap.vision.projection import Projection, load_encoder
 
 __all__ = [
     "Backbone",
@@ -14,5 +14,4 @@ __all__ = [
     "WeightsError",
     "load_backbone",
     "load_encoder",
-    "projection_of",
 ]

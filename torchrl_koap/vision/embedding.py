@@ -106,8 +106,7 @@ def embed_recordings(
         progress (callable, optional): called with the number of frames that are done, and that of all.
 
     Raises:
-        DataError: if there are no frames, or some are missing, damaged or unlike the others; camera, trajectory and
-            frame are named.
+        DataError: if frames are missing, damaged or unlike the others; camera, trajectory and frame are named.
         ValueError: for an unknown camera, or more components than frames or features.
         WeightsError: if weights are missing or others than those of the projection.
     """

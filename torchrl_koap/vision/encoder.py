@@ -35,8 +35,7 @@ class FrozenImageEncoder(ObservationTransform):
             :class:`~torchrl_koap.vision.Projection`. Default: none, the features are the embedding.
         size (int, or sequence of int): height and width of the recorded frames. Frames of another size are resized,
             with a warning at the first one.
-        in_key (str): entry with the frames, uint8 ``[*B, H, W, 3]``.
-        out_key (str): entry of the embeddings, float32 ``[*B, d]``.
+        in_key, out_key (str): frames, uint8 ``[*B, H, W, 3]``, and embeddings, float32 ``[*B, d]``.
 
     Raises:
         WeightsError: if there are no weights.

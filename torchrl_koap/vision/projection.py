@@ -122,19 +122,7 @@ class Projection(nn.Module):
 
 
 def projection_of(task: str) -> Path:
-    """Returns the file of a task's projection that comes with the package.
-
-    Returns:
-        Path: the file.
-
-    Raises:
-        ValueError: if none was fitted for the task.
-
-    Examples:
-        >>> from torchrl_koap.vision import projection_of
-        >>> projection_of("scooping").name
-        'scooping.safetensors'
-    """
+    """Returns the file of a task's projection that comes with the package; a task without one is refused."""
     path = SCOOPING.with_stem(task)
     if not path.is_file():
         known = ", ".join(sorted(each.stem for each in SCOOPING.parent.glob("*.safetensors")))

@@ -86,11 +86,7 @@ class Agent:
         return result
 
     def latency(self) -> dict[str, float]:
-        """Time per action of the last 10,000 steps in ms: ``p50``, ``p99``, ``max``, and the number of ``steps``.
-
-        Raises:
-            RuntimeError: if it has not acted yet.
-        """
+        """Time per action of the last 10,000 steps in ms: ``p50``, ``p99``, ``max``, and the number of ``steps``."""
         if not self.latencies:
             raise RuntimeError("the agent has not acted yet: there is no latency to tell")
         times = np.array(self.latencies) * 1e3

@@ -82,9 +82,8 @@ class AsynchronousAgent(Agent):
     def reset(self, observation: object = None) -> None:
         """Forgets everything: the next observation begins an episode.
 
-        Args:
-            observation (array or Tensor, optional): the first observation, ``[obs]`` or ``[n, obs]``: the first plan is
-                made from it now. Default: it is made in the first :meth:`act`, which waits for it.
+        From the first observation, ``[obs]`` or ``[n, obs]``, the first plan is made now; without one it is made in the
+        first :meth:`act`, which waits for it.
         """
         super().reset()
         if observation is not None:

@@ -61,11 +61,7 @@ class Execution:
             raise ValueError(f"limits must be a number >= 0, or infinity, got {self.limits}")
 
     def replaced(self, **asked: Any) -> Execution:
-        """The same with what was asked for; ``None`` leaves a field as it is.
-
-        Raises:
-            ValueError: for an unknown field, which suggests the nearest, or as for the class.
-        """
+        """The same with what was asked for; ``None`` leaves a field as it is, and an unknown one is refused."""
         for name in asked:
             lookup(asdict(self), name, "option of an execution")
         return replace(self, **{name: value for name, value in asked.items() if value is not None})

@@ -46,16 +46,10 @@ class Follower(nn.Module):
         self.blend, self.action_rule = blend, action_rule
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
-        """The actions of the next steps.
+        """The actions of the next steps ``[*B, steps, act]``, raw units.
 
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, the present one last, raw units.
-            states (Tensor): their states ``[*B, history, d]``.
-            plan (Tensor): planned states ``[*B, H, d]``, the next one first.
-            steps (int): number of actions; those after the first are as if every planned state was reached.
-
-        Returns:
-            Tensor: ``[*B, steps, act]``, raw units.
+        Of observations ``[*B, history, obs]``, the present one last, states are ``[*B, history, d]``; planned ones
+        ``[*B, H, d]``, the next one first. Actions after the first are as if every planned state was reached.
         """
         raise NotImplementedError
 

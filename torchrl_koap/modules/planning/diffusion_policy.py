@@ -70,13 +70,8 @@ class DiffusionPolicy(ConditionalSampler):
     def fit_normalizers(self, windows: Tensor, actions: Tensor) -> None:
         """Takes the statistics of condition and actions from data; call it before a loss is built on the policy.
 
-        Args:
-            windows (Tensor): raw states ``[*N, history + horizon, d]``; no label is needed for them.
-            actions (Tensor): labelled raw actions ``[*M, act]``. All steps of a chunk share their statistics.
-
-        Raises:
-            ValueError: for windows or actions of another shape, no actions, or actions that are not finite: they
-                must be those of the label budget.
+        Raw states are windows ``[*N, history + horizon, d]``; no label is needed for them. Labelled raw actions ``[*M,
+        act]`` must be finite and those of the label budget; all steps of a chunk share their statistics.
         """
         if actions.ndim < 2 or actions.shape[-1] != self.action_dim:
             raise ValueError(f"actions must be [*M, {self.action_dim}] (action_dim), got {list(actions.shape)}")

@@ -95,11 +95,7 @@ class NoiseSchedule(nn.Module):
         return signal[..., None, None] * sample + amplitude[..., None, None] * noise
 
     def noise_levels(self, num_steps: int) -> list[NoiseLevel]:
-        """Lists the stops of a solver, one more than steps, evenly spaced from the noisiest level to no noise.
-
-        Raises:
-            ValueError: if the number of steps is out of range.
-        """
+        """Lists the stops of a solver, one more than steps, evenly spaced from the noisiest level to no noise."""
         if not 1 <= num_steps <= NUM_TRAIN_STEPS:
             raise ValueError(f"num_steps must lie in 1..{NUM_TRAIN_STEPS}, the steps of training, got {num_steps}")
         times = [round(NUM_TRAIN_STEPS * (num_steps - step) / num_steps) - 1 for step in range(num_steps)]

@@ -131,15 +131,9 @@ class StatePlanner(ConditionalSampler):
     def fit_normalizers(self, windows: Tensor, *, seen: Tensor | None = None, groups: Tensor | None = None) -> None:
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
 
-        Args:
-            windows (Tensor): raw states ``[*N, history + horizon, d]``, padded as those that are trained on: where ends
-                stand still in training alone, their plans are far out of the range of the network.
-
-        Keyword Args:
-            seen (Tensor, optional): the windows as training augments them, which the forecast is fitted to. Default:
-                as they are.
-            groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
-                (:meth:`LinearForecast.fit`).
+        Raw states are windows ``[*N, history + horizon, d]``, padded as those that are trained on: where ends stand
+        still in training alone, their plans are far out of the range of the network. The forecast is fitted to the
+        windows as training augments them, if they are ``seen``, by trajectories (``groups [*N]``).
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
         example = self.plan_normalizer.scale
