@@ -12,7 +12,7 @@ from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks.aligning import BASE_HALF, DISTANCE_TOLERANCE, ROTATION_TOLERANCE
-from torchrl_koap.tasks.modes import place_among
+from torchrl_koap.tasks.modes import index_among
 
 INSIDE_REACH = 0.051  # m; the rod is inside the tray if nearer to its centre than this
 # name, direction from the centre, colour
@@ -26,7 +26,7 @@ WALLS = (
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
     """Returns the number of the mode ``[*B]``: 0 if the tray was last pushed from inside, 1 from outside."""
-    return place_among(((0,), (1,)), mode)
+    return index_among(((0,), (1,)), mode)
 
 
 class AligningEnv(ManipulationEnv):

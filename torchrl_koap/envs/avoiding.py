@@ -12,7 +12,7 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import PANDA, scene
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_REACH, ROW_Y
-from torchrl_koap.tasks.modes import place_among
+from torchrl_koap.tasks.modes import index_among
 
 # flags of every mode: one gap of the two, three and four of the rows
 _FLAGS = [[gap in gaps for gap in range(9)] for gaps in itertools.product((0, 1), (2, 3, 4), (5, 6, 7, 8))]
@@ -20,7 +20,7 @@ _FLAGS = [[gap in gaps for gap in range(9)] for gaps in itertools.product((0, 1)
 
 def mode_index(flags: torch.Tensor) -> torch.Tensor:
     """Returns the number of the mode, ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x."""
-    return place_among(_FLAGS, flags)
+    return index_among(_FLAGS, flags)
 
 
 class AvoidingEnv(ManipulationEnv):

@@ -12,7 +12,7 @@ from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks.columns import tan_yaw
-from torchrl_koap.tasks.modes import place_among
+from torchrl_koap.tasks.modes import index_among
 from torchrl_koap.tasks.sorting import (
     BIN_HALF,
     BIN_RANGE,
@@ -38,7 +38,7 @@ def box_colours(num_boxes: int) -> np.ndarray:
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
     """Returns the number of the order in which the colours arrived, in lexicographic order (red before blue)."""
-    return place_among(arrival_orders(mode.shape[-1]), mode)
+    return index_among(arrival_orders(mode.shape[-1]), mode)
 
 
 class SortingEnv(ManipulationEnv):

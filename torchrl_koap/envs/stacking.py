@@ -15,7 +15,7 @@ from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import tan_yaw
-from torchrl_koap.tasks.modes import place_among
+from torchrl_koap.tasks.modes import index_among
 from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
 
 OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them
@@ -27,7 +27,7 @@ GRIPPER_BOUND = 0.08  # m
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
     """Returns the number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5."""
-    return place_among(ORDERS, mode)
+    return index_among(ORDERS, mode)
 
 
 def first_box(mode: torch.Tensor) -> torch.Tensor:

@@ -52,7 +52,7 @@ class Modes:
         return ", ".join(reversed(words))
 
 
-def place_among(leaves: Sequence[Sequence[int]], leaf: Tensor) -> Tensor:
+def index_among(leaves: Sequence[Sequence[int]], leaf: Tensor) -> Tensor:
     """Returns which of the leaves of all modes a leaf ``mode`` ``[*B, entries]`` is, int64 ``[*B]``; -1: none of them.
 
     Raises:
