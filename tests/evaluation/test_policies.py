@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The oracle controller: the tool goes where the plan says, whatever the batch, and only in a simulation."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

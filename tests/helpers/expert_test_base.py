@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """First attempts of a scripted expert, and what every expert has to do; a test file per expert subclasses the base."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
