@@ -17,8 +17,8 @@ def test_scores_take_a_twentieth_of_the_training(steps, batch_size, every):
     assert every == steps or forward_passes[0] <= 0.05 * forward_passes[1]
 
 
-@pytest.mark.parametrize(("columns", "robot", "share"), [(9, (3, 4), 0.5), (5, (0, 1, 2), None), (4, (0, 1), None)])
-def test_the_robot_counts_half_of_the_loss_or_more(columns, robot, share):
+@pytest.mark.parametrize(("columns", "robot", "share"), [(9, (3, 4), 1 / 3), (5, (0, 1, 2), None), (6, (0, 1), None)])
+def test_the_robot_counts_a_third_of_the_loss_or_more(columns, robot, share):
     paths = [np.random.default_rng(seed).normal(size=(20, columns)).cumsum(0) for seed in range(3)]
     _, task = make_demonstrations(paths, [path[1:, :2] for path in paths], control_hz=10, robot=robot)
     weights = column_weights(task)

@@ -124,15 +124,15 @@ def learn_planner(
 
 
 def column_weights(task: Task) -> Tensor | None:
-    """Weights ``[d]`` of the state columns in a planner's loss: those of the robot, which are executed, count half.
+    """Weights ``[d]`` of the state columns in a planner's loss: those of the robot, which are executed, count a third.
 
-    None, all columns alike, where the robot has half of them or more, and in tasks with an environment.
+    None, all columns alike, where the robot has a third of them or more, and in tasks with an environment.
     """
     columns, robot = task.state_dim, len(task.robot)
-    if task.env is not None or not 0 < 2 * robot < columns:
+    if task.env is not None or not 0 < 3 * robot < columns:
         return None
-    weights = torch.full([columns], 0.5 / (columns - robot))
-    weights[list(task.robot)] = 0.5 / robot
+    weights = torch.full([columns], 2 / (columns - robot))
+    weights[list(task.robot)] = 1 / robot
     return weights
 
 
