@@ -22,7 +22,7 @@ from scipy.stats import t as student
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import controller_view, cut_windows, make_window_buffer
+from torchrl_koap.data import controller_view, cut_windows, make_window_buffer, open_dataset
 from torchrl_koap.evaluation.active_labelling import rank_trajectories, variance_reduction
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, Normalizer
@@ -31,7 +31,6 @@ from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.tasks import WINDOW, Task, get_task
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
-from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.loop import train_phase
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller
@@ -124,7 +123,7 @@ def main() -> None:
     arguments = parser.parse_args()
     set_up_torch(arguments.threads, "cpu")
     task = get_task(arguments.task)
-    data = load_demonstrations(arguments.dataset, task)
+    data = open_dataset(arguments.dataset, task=task)[0]
     data = controller_view(data, task.controller_columns("robot"))
     began = time.perf_counter()
     controller = train_unlabelled(data, task, arguments.preset, arguments.updates)

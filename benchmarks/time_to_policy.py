@@ -22,7 +22,7 @@ from tyro.conf import Positional
 
 from torchrl_koap import EvalConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, evaluate, train
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training import resolve
+from torchrl_koap.training.defaults import resolve
 
 RESULTS = Path(__file__).resolve().parent / "results" / "time_to_policy.csv"
 KEYS = ("task", "method", "labels", "network", "held_out", "learning_rate", "updates", "seed")

@@ -32,7 +32,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import step_mdp
 
 from torchrl_koap import fit
-from torchrl_koap.data import controller_view, make_demonstrations, select_state
+from torchrl_koap.data import controller_view, make_demonstrations, open_dataset, select_state
+from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.action_errors import first_actions
 from torchrl_koap.lookup import lookup
@@ -41,7 +42,6 @@ from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
-from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 
 RESULTS = Path(__file__).parent / "results"
 KEYS = ("dataset", "regime", "labels", "seed", "method")
@@ -75,8 +75,7 @@ def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
 
 def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
     """Flat data with what the robot's controller could read as ``state``, and the unit of its actions."""
-    task = find_task_of(dataset)
-    data = load_demonstrations(dataset, task)
+    data, task = open_dataset(dataset)
     if task.source == "stacking":  # joints, gripper, tool; the gripper's action has no unit and is left out
         data = data.copy().set("state", data["state"][:, :11]).set("action", data["action"][:, :7])
     else:
@@ -277,7 +276,7 @@ def main(
     for name, known in ((name, METHODS) for name in methods):
         lookup(known, name, "method")
     regimes = [lookup(OBSERVED, name, "observation setting") for name in observed]
-    source = find_task_of(str(dataset))
+    source = find_task_of(dataset)
     if rollouts and source.name != "avoiding":
         raise ValueError(f"{dataset} holds demonstrations of {source.name}: Avoiding's alone need no objects")
     warnings.filterwarnings("ignore", category=UserWarning)

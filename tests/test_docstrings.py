@@ -26,7 +26,7 @@ def test_exported_functions_of_several_arguments_tell_them():
         if name in names and len(arguments) > 1:
             found += 1
             assert "Args:" in text, f"{file}: the docstring of {name} lacks Args"
-    assert found > 30
+    assert found > 20
 
 
 def test_exported_classes_have_an_example():
@@ -37,7 +37,7 @@ def test_exported_classes_have_an_example():
         if name in names and not plain:
             found += 1
             assert ">>> " in text, f"{file}: class {name} has no example"
-    assert found > 60
+    assert found > 50
 
 
 def exported():
@@ -62,7 +62,7 @@ def test_exported_functions_have_an_example():
         if name in names:
             found += 1
             assert ">>> " in text, f"{file}: function {name} has no example"
-    assert found > 40
+    assert found > 30
 
 
 def test_what_is_raised_is_told():
@@ -74,7 +74,7 @@ def test_what_is_raised_is_told():
         if name in names and any(map(raised, makers)):
             found += 1
             assert "Raises:" in text, f"{file}: {name} raises {set().union(*map(raised, makers))}, and does not say so"
-    assert found > 30
+    assert found > 20
 
 
 def test_exported_functions_tell_what_they_return():
@@ -83,4 +83,4 @@ def test_exported_functions_tell_what_they_return():
         if name in names and node.returns is not None and ast.unparse(node.returns) != "None":
             found += 1
             assert "Returns:" in text or "Yields:" in text, f"{file}: function {name} does not say what it returns"
-    assert found > 40
+    assert found > 30

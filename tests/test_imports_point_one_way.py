@@ -23,7 +23,7 @@ MAY_IMPORT = {
     "envs": {*BASE, "tasks", "data", "vision", "envs"},
     "modules": {"keys", "lookup", "modules"},
     "objectives": {"keys", "lookup", "modules", "objectives"},
-    "runs": {*BASE, "tasks", "modules", "runs"},
+    "runs": {*BASE, "tasks", "data", "modules", "runs"},
     "training": TRAINING,
     "evaluation": {*TRAINING, "envs", "evaluation"},
     "reports": {*TRAINING, "envs", "evaluation", "reports"},

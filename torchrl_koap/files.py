@@ -5,20 +5,25 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
 import errno
 import hashlib
+import json
+import math
 import os
 import shutil
 import stat
 import tempfile
-import types
-import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import filelock
 
 _NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
+_UNIONS = (Union, UnionType)
+_LARGEST_INTEGER = 2**63 - 1  # that JSON may hold
 LARGEST = 1 << 28  # bytes of a file that is read as a whole: hundreds of times what any of them has
 
 
@@ -43,26 +48,13 @@ class DataError(ValueError):
 
 
 def some(names: Sequence[str], most: int = 5) -> str:
-    """Joins names for a message, the first few of them.
-
-    Args:
-        names (sequence of str): the names.
-        most (int): how many are named.
-
-    Examples:
-        >>> from torchrl_koap.files import some
-        >>> some(["a.csv", "b.csv", "c.csv"], 2)
-        'a.csv, b.csv and 1 more'
-    """
+    """Joins names for a message, the first few of them: ``"a.csv, b.csv and 1 more"``."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def gathered(faults: Iterable[tuple[str, str]]) -> list[str]:
     """Puts faults of many things into sentences, each once with the first of those that it is about.
-
-    Args:
-        faults (iterable of tuple): names of things, and what is wrong with them.
 
     Examples:
         >>> from torchrl_koap.files import gathered
@@ -76,25 +68,14 @@ def gathered(faults: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def option(name: str) -> str:
-    """Says what an option is called, in Python and in the shell.
-
-    Examples:
-        >>> from torchrl_koap.files import option
-        >>> option("control_hz")
-        'control_hz (--control-hz)'
-    """
+    """Says what an option is called, in Python and in the shell: ``"control_hz (--control-hz)"``."""
     return f"{name} (--{name.replace('_', '-')})"
 
 
 def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
     """Refuses what is no plain file (a pipe never ends, nor does a device), and files of more than ``largest`` bytes.
 
-    Args:
-        path (str or Path): the file; a link is followed.
-        largest (int): bytes it may have.
-
-    Raises:
-        OSError: naming the file and what it is.
+    A link is followed. The OSError names the file and what it is.
     """
     about = os.stat(path)
     if not stat.S_ISREG(about.st_mode):
@@ -109,6 +90,24 @@ def read_bytes(path: str | Path) -> bytes:
     return Path(path).read_bytes()
 
 
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Reads a JSON object from a plain file.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+        DataError: if it cannot be read, or holds anything else.
+    """
+    try:
+        content = json.loads(read_bytes(path))
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(path, f"it is no JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise DataError(path, f"it must hold an object, got {type(content).__name__}")
+    return content
+
+
 def sha256_of(path: str | Path) -> str:
     """Computes the checksum of a file of any size, in hexadecimal."""
     check_file(path, largest=1 << 40)
@@ -121,13 +120,9 @@ def sha256_of(path: str | Path) -> str:
 
 @contextlib.contextmanager
 def replacing_file(path: str | Path) -> Iterator[Path]:
-    """Gives a path to write to; the file takes the place of ``path`` when the block ends without an error.
+    """Gives a new, empty file to write to, which takes the place of ``path`` when the block ends without an error.
 
-    Args:
-        path (str or Path): the file to create or replace. Missing parent folders are created.
-
-    Yields:
-        Path: a new, empty file in the same folder.
+    Missing parent folders are created.
 
     Raises:
         OSError: naming the file, if the disk is full or refuses; what was there before is kept.
@@ -182,14 +177,10 @@ class LockedError(RuntimeError):
 def one_at_a_time(path: str | Path, *, busy: str) -> Iterator[None]:
     """Lets one process, or thread, at a time into the block and refuses the others.
 
-    The lock is the system's: it is free again however its process ends.
-
-    Args:
-        path (str or Path): the lock file; it stays. Missing parent folders are created.
-        busy (str): message of the refusal.
+    The lock is the system's: it is free again however its process ends. The lock file stays.
 
     Raises:
-        LockedError: if somebody else is in the block.
+        LockedError: if somebody else is in the block; its message is ``busy``.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -227,50 +218,107 @@ def _umask() -> int:
     return mask
 
 
-_Made = typing.TypeVar("_Made")
+_Made = TypeVar("_Made")
 
 
-def dataclass_from_json(kind: type[_Made], entries: object, what: str) -> _Made:
+def dataclass_from_json(kind: type[_Made], content: object) -> _Made:
     """Builds a dataclass, and those that its fields hold, from what ``json`` read of ``dataclasses.asdict``.
 
-    Args:
-        kind (type): the dataclass.
-        entries (object): what was read; lists become tuples.
-        what (str): what it is; messages begin with it.
+    What is left out keeps its default, lists become tuples, and the number ``"inf"`` infinity.
 
     Raises:
-        ValueError: if the entries are no object, or one of them is unknown or missing.
+        ValueError: naming an option that is unknown, in another section, missing, of another type or out of range.
 
     Examples:
         >>> from torchrl_koap.files import dataclass_from_json
         >>> from torchrl_koap.tasks import Body
-        >>> dataclass_from_json(Body, {"name": "mug", "position": "mug_xy", "half": [0.1, 0.2]}, "body").half
+        >>> dataclass_from_json(Body, {"name": "mug", "position": "mug_xy", "half": [0.1, 0.2]}).half
         (0.1, 0.2)
     """
-    if not isinstance(entries, dict):
-        raise ValueError(f"{what}: wanted an object, got {type(entries).__name__}")
-    fields = {field.name: field for field in dataclasses.fields(typing.cast("typing.Any", kind))}
-    unknown = [name for name in entries if name not in fields]
-    if unknown:
-        raise ValueError(f"{what}: unknown entry {unknown[0]!r}; known: {', '.join(sorted(fields))}")
-    for name, field in fields.items():
-        if name not in entries and field.default is field.default_factory is dataclasses.MISSING:
-            raise ValueError(f"{what}: entry {name!r} is missing")
-    hints = typing.get_type_hints(kind)
-    return kind(**{name: _as_hinted(hints[name], value, f"{what}.{name}") for name, value in entries.items()})
+    return _read(kind, content, "", tuple(_names(kind)))
 
 
-def _as_hinted(hint: typing.Any, value: typing.Any, what: str) -> typing.Any:
-    """A value of JSON as the type hint of its field has it: dataclasses, tuples of them, and mappings to them."""
-    inner = typing.get_args(hint)
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        hint = next((one for one in inner if dataclasses.is_dataclass(one)), None)
-    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and value is not None:
-        return dataclass_from_json(hint, value, what)
-    if isinstance(value, dict):
-        each = inner[1] if typing.get_origin(hint) in (dict, Mapping) else None
-        return {name: _as_hinted(each, entry, what) for name, entry in value.items()}
+def _read(kind: Any, value: Any, place: str, known: tuple[str, ...]) -> Any:
+    """A value of JSON as a type hint has it; ``place`` is its name with that of its section."""
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{place or 'the file'} must be an object, got {_short(value)}")
+        hints, inside = get_type_hints(kind), f"{place}." if place else ""
+        for name in value:
+            if name not in hints:
+                raise ValueError(_unknown(f"{inside}{name}", known))
+        for field in dataclasses.fields(kind):
+            if field.name not in value and field.default is field.default_factory is dataclasses.MISSING:
+                raise ValueError(f"option {inside}{field.name} is missing")
+        return kind(**{name: _read(hints[name], entry, f"{inside}{name}", known) for name, entry in value.items()})
+    value = math.inf if value == "inf" and _fits(math.inf, kind) else value
+    if not _fits(value, kind):
+        raise ValueError(f"{place} must be {_words(kind)}, got {_short(value)}")
+    if get_origin(kind) in _UNIONS:
+        return _read(next(part for part in get_args(kind) if _fits(value, part)), value, place, known)
     if isinstance(value, (list, tuple)):
-        each = inner[0] if typing.get_origin(hint) is tuple else None
-        return tuple(_as_hinted(each, entry, what) for entry in value)
+        return tuple(_read(one, entry, place, known) for one, entry in zip(_each(kind, value), value, strict=True))
+    if isinstance(value, Mapping):
+        inner = (Any, *get_args(kind))[-1]
+        return {name: _read(inner, entry, f"{place}.{name}", known) for name, entry in value.items()}
     return value
+
+
+def _each(kind: Any, value: Sequence[Any]) -> tuple[Any, ...]:
+    """The types of the entries of a tuple."""
+    inner = get_args(kind) or (Any, ...)
+    return inner[:1] * len(value) if inner[-1] is ... else inner
+
+
+def _names(kind: Any, prefix: str = "") -> Iterator[str]:
+    """Every option with its section, ``"planner.steps"``."""
+    for name, inner in get_type_hints(kind).items():
+        if dataclasses.is_dataclass(inner):
+            yield from _names(inner, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def _unknown(name: str, known: tuple[str, ...]) -> str:
+    last = name.rpartition(".")[2]
+    elsewhere = [other for other in known if other.rpartition(".")[2] == last]
+    if elsewhere:
+        sections = [f"section {other.rpartition('.')[0]}" if "." in other else "no section" for other in elsewhere]
+        return f"unknown option {name}: {last} is in {' or '.join(sections)}"
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"unknown option {name}" + (f": did you mean {near[0]}?" if near else "")
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in _UNIONS:
+        return any(_fits(value, part) for part in inner)
+    if origin is Literal:
+        return value in inner
+    if origin is tuple:
+        known = isinstance(value, (list, tuple)) and len(_each(kind, value)) == len(value)
+        return known and all(map(_fits, value, _each(kind, value)))
+    if origin is not None or dataclasses.is_dataclass(kind):
+        return isinstance(value, Mapping)
+    if kind is Path:
+        return isinstance(value, str) and "\0" not in value
+    if kind in (int, float) and type(value) is int:
+        return abs(value) <= _LARGEST_INTEGER
+    return kind is Any or isinstance(value, kind) and (kind is not int or type(value) is int)
+
+
+def _words(kind: Any) -> str:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in _UNIONS or origin is Literal:
+        return " or ".join(map(_words, inner) if origin in _UNIONS else map(repr, inner))
+    if origin is tuple:
+        return f"a list of {_words(inner[0])}"
+    if origin is not None or dataclasses.is_dataclass(kind):
+        return "an object"
+    names = {type(None): "null", Path: "a path", bool: "true or false", str: "text", float: "a number"}
+    return names.get(kind, str(kind.__name__))
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

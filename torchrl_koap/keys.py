@@ -140,7 +140,7 @@ def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDic
     Args:
         data (TensorDictBase): flat data, ``batch_size == [N]``.
         command (slice, optional): columns of the observation that may be NaN, as a whole, because
-            :func:`~torchrl_koap.data.hide_commands` blanked them. Default: none.
+            :func:`~torchrl_koap.data.label_budget.hide_commands` blanked them. Default: none.
 
     Raises:
         LayoutError: with *all* problems: missing keys, wrong dtypes or shapes, non-finite states, labels that are NaN

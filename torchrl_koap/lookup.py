@@ -6,6 +6,7 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib
+import importlib.metadata
 import importlib.util
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -16,13 +17,9 @@ from typing import Any
 def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) -> Any:
     """Returns the entry ``name`` of a table, or ``name`` itself where the table is a plain collection of names.
 
-    Args:
-        table (mapping or collection of str): what there is.
-        name (object): what is asked for; anything that is not a string of the table is unknown.
-        what (str): what the names stand for; the message begins with it.
-
     Raises:
-        ValueError: if the name is unknown. The message suggests the nearest name, or else lists them all.
+        ValueError: if the name is unknown, or no string. The message begins with ``what`` the names stand for, and
+            suggests the nearest or else lists them all.
 
     Examples:
         >>> from torchrl_koap.lookup import lookup
@@ -42,23 +39,11 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
 def resolve(reference: Any, what: str) -> Any:
     """Imports the object that an import string names; anything that is no string is returned as it is.
 
-    Args:
-        reference (str or object): ``"package.module:name"`` or ``"path/to/file.py:name"``, dots in ``name`` reach
-            into a class.
-        what (str): what the object is for; the error begins with it.
-
-    Returns:
-        object: what the string names.
+    Strings are ``"package.module:name"`` or ``"path/to/file.py:name"``; dots in ``name`` reach into a class.
 
     Raises:
-        ValueError: if the string has no colon, the module cannot be imported, or it has no such name.
-
-    Examples:
-        >>> from torchrl_koap.lookup import resolve
-        >>> resolve("math:hypotenuse", "goal of task 'toy'")
-        Traceback (most recent call last):
-        ...
-        ValueError: goal of task 'toy': module 'math' has no 'hypotenuse' (asked for as 'math:hypotenuse')
+        ValueError: if the string has no colon, the module cannot be imported, or it has no such name; the message
+            begins with ``what`` the object is for.
     """
     if not isinstance(reference, str):
         return reference
@@ -84,6 +69,22 @@ def _run_file(path: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def entry_points_of(group: str) -> list[Any]:
+    """Loads what installed packages announce in an entry-point group, such as ``"torchrl_koap.methods"``.
+
+    Raises:
+        ValueError: if one cannot be imported; the message names entry and group.
+    """
+    found = []
+    for entry in importlib.metadata.entry_points(group=group):
+        try:
+            found.append(entry.load())
+        except Exception as error:
+            said = f"entry point {entry.name!r} = {entry.value!r} of {group!r} failed when it was imported"
+            raise ValueError(f"{said}: {type(error).__name__}: {error}") from error
+    return found
 
 
 def exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:

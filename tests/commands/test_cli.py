@@ -188,14 +188,14 @@ def test_two_trainings_that_begin_together(demonstrations, tmp_path, capsys, mon
     """Both found a new folder; while one reads its demonstrations the other one begins, or is through."""
     from torchrl_koap.training import on_disk
 
-    out, load = tmp_path / "run", on_disk.load_demonstrations
+    out, load = tmp_path / "run", on_disk.open_dataset
     command = ("train", "--out", out, "--dataset", demonstrations, *TINY, "--quiet")
 
     def meanwhile(*arguments, **options):
-        monkeypatch.setattr(on_disk, "load_demonstrations", load)
+        monkeypatch.setattr(on_disk, "open_dataset", load)
         assert koap(*command) == 0
         return load(*arguments, **options)
 
-    monkeypatch.setattr(on_disk, "load_demonstrations", meanwhile)
+    monkeypatch.setattr(on_disk, "open_dataset", meanwhile)
     assert "holds a run already" in fails(capsys, *command)
     assert (out / "summary.json").exists()

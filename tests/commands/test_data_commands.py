@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from tiny_runs import koap, write_demonstrations
 
-from torchrl_koap.data import load_ted, save_demonstrations
+from torchrl_koap.data import save_demonstrations
+from torchrl_koap.data.ted import load_ted
 
 
 def test_data_of_an_own_task_are_validated_without_naming_it(arm, capsys):

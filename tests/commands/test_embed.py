@@ -9,7 +9,7 @@ from filmed_data import write_filmed
 from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Trained, load_policy
-from torchrl_koap.data import load_ted
+from torchrl_koap.data.ted import load_ted
 from torchrl_koap.runs.run_directory import copy_run
 from torchrl_koap.runs.weights import CheckpointError
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.data import load_ted, stored_task
+from torchrl_koap.data.ted import load_ted, stored_task
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
 from torchrl_koap.tasks import Action

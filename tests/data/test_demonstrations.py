@@ -10,17 +10,17 @@ import torch
 from torchrl_koap.data import (
     DataError,
     controller_view,
-    load_ted,
     make_demonstrations,
     open_dataset,
-    read_about,
     read_recordings,
     save_demonstrations,
 )
+from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import Action, Task
-from torchrl_koap.training import TrainConfig, resolve
+from torchrl_koap.training import TrainConfig
 from torchrl_koap.training.closed_form import axes_of
+from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.policy_facts import command_ranges, commanded_columns
 
 RANDOM = np.random.default_rng(0)

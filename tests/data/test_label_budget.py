@@ -3,6 +3,7 @@
 
 import json
 import math
+from dataclasses import asdict
 
 import counted_windows
 import numpy as np
@@ -12,14 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import (
-    LabelBudget,
-    flatten_trajectories,
-    hide_commands,
-    make_window_buffer,
-    select_state,
-    subsample_trajectories,
-)
+from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap.data.label_budget import hide_commands, subsample_trajectories
 from torchrl_koap.keys import validate
 from torchrl_koap.modules import Normalizer
 
@@ -88,7 +83,7 @@ def test_the_account_is_right(lengths, unit, amount, seed):
         assert 14 <= report.labelled_transitions <= 14 * expected
         assert not kept[data["step_count"] == 0].any()  # no window has frame 0 as an inner frame
         assert not kept[data["next", "done"].squeeze(-1)].any()
-    assert json.loads(json.dumps(report.as_dict())) == report.as_dict()
+    assert json.loads(json.dumps(asdict(report))) == asdict(report)
 
 
 def test_all_windows_leave_out_the_ends():
@@ -149,15 +144,15 @@ def test_selecting_nothing_names_a_fraction_that_works(total):
     [
         *(({"count": count}, "count .* whole number of at least 1") for count in (0, -1, True, 2.0, "3")),
         *(
-            ({"fraction": fraction}, r"label fraction must be in \(0, 1\]")
+            ({"fraction": fraction}, r"labels: fraction must be in \(0, 1\]")
             for fraction in (0, -0.5, 1.5, math.nan, math.inf, True, "0.1")
         ),
-        ({"count": 1, "unit": "windows"}, "unknown unit 'windows'"),
-        ({"fraction": 0.1, "count": 1}, "a fraction, a count or episodes, got fraction and count"),
+        ({"count": 1, "unit": "windows"}, "unknown unit of labels 'windows'"),
+        ({"fraction": 0.1, "count": 1}, "give one of fraction, count and episodes, got fraction and count"),
         ({"count": 3, "episodes": (1, 2)}, "got count and episodes"),
         ({"episodes": []}, "one or more different numbers"),
         ({"episodes": [1, 1]}, "one or more different numbers"),
-        ({"episodes": (1, 2), "unit": "window"}, "episodes to label are trajectories, got unit 'window'"),
+        ({"episodes": (1, 2), "unit": "window"}, "labels: episodes are trajectories, got unit 'window'"),
     ],
 )
 def test_wrong_options(options, message):

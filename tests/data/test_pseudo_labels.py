@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from toy_policies import EchoController
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.data import LabelBudget, flatten_trajectories, pseudo_labels, select_state
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import LinearInverseDynamics, make_koopman_inverse_dynamics
 
@@ -57,11 +57,12 @@ def expected_window(data, row, window, now):
 
 @pytest.mark.parametrize("now", [0, 1, 4])
 @pytest.mark.parametrize("batch_size", [3, 4096])
-def test_every_unlabelled_step_gets_the_action_of_its_own_window(now, batch_size):
+def test_every_unlabelled_step_gets_the_action_of_its_own_window(now, batch_size, monkeypatch):
+    monkeypatch.setattr(pseudo_labels, "_BATCH", batch_size)
     window = 6
     data = make_data(act=window + 1)
     controller = WindowController(now, window)
-    result = relabel(controller, data, window=window, batch_size=batch_size)
+    result = relabel(controller, data, window=window)
     rows = result["relabelled"].squeeze(-1).nonzero().flatten().tolist()
     assert len(rows) == 24 and {int(data["episode"][row]) for row in rows} == {0, 1, 2}
     for row in rows:
@@ -138,8 +139,6 @@ def test_bad_input_is_explained():
         relabel(WindowController(), data, window=5)
     with pytest.raises(ValueError, match="actions have 7 columns, those of the data 2"):
         relabel(WindowController(), data, window=6)
-    with pytest.raises(ValueError, match="batch_size must be >= 1, got 0"):
-        relabel(WindowController(), data, window=6, batch_size=0)
     model = LinearInverseDynamics(2, 2)
     torch.nn.init.constant_(model.decoder.linear.bias, torch.nan)
     with pytest.raises(ValueError, match="not finite in 24 of 24 steps"):

@@ -8,11 +8,12 @@ from raw_episodes import write_folder, write_raw_episode
 from shared_data import HUMAN
 from tiny_runs import write_demonstrations
 
-from torchrl_koap.data import flatten_trajectories, load_ted, open_dataset, save_demonstrations, save_ted
+from torchrl_koap.data import flatten_trajectories, open_dataset, save_demonstrations, save_ted
+from torchrl_koap.data.sources import find_task_of
+from torchrl_koap.data.ted import load_ted
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.datasets import find_task_of
 
 
 def test_values_are_those_of_the_raw_episodes(tmp_path):
@@ -94,6 +95,13 @@ def test_what_cannot_be_opened(tmp_path):
     (tmp_path / "narrow" / "about.json").write_text(about)
     with pytest.raises(DataError, match="3 observation and 2 action columns, task 'avoiding' has 4 and 2"):
         open_dataset(tmp_path / "narrow", task=get_task("avoiding"))
+
+
+def test_a_call_without_data_names_both_commands():
+    with pytest.raises(
+        ValueError, match="koap demos --task sorting --out DEMOS.*koap train --task sorting --dataset DEMOS"
+    ):
+        find_task_of(None, "sorting")
 
 
 def test_raw_files_are_never_written(tmp_path):

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.data import (
-    LabelBudget,
-    flatten_trajectories,
-    load_ted,
-    make_demonstrations,
-    read_about,
-    save_ted,
-    select_state,
-)
+from torchrl_koap.data import LabelBudget, flatten_trajectories, make_demonstrations, save_ted, select_state
+from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import LayoutError
 from torchrl_koap.tasks import get_task

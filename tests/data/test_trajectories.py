@@ -7,7 +7,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.data import extrapolate_ends, flatten_trajectories, mark_labels, select_state
+from torchrl_koap.data import extrapolate_ends, flatten_trajectories, select_state
+from torchrl_koap.data.trajectories import mark_labels
 from torchrl_koap.keys import validate
 
 
@@ -81,16 +82,15 @@ def flat(lengths, *, seed=0, dtype=torch.float32):
     )
 
 
-@pytest.mark.parametrize("over", [1, 3])
-def test_trajectories_go_on_at_their_last_mean_velocity(over):
+def test_trajectories_go_on_at_their_last_mean_velocity():
     data = flat([6, 4, 9], dtype=torch.float64)
-    extended = extrapolate_ends(data, 5, over=over)
+    extended = extrapolate_ends(data, 5)
     assert torch.unique_consecutive(extended["episode"], return_counts=True)[1].tolist() == [11, 9, 14]
     for episode, length in enumerate([6, 4, 9]):
         before = data["state"][data["episode"] == episode]
         after = extended["state"][extended["episode"] == episode]
         assert torch.equal(after[:length], before)
-        velocity = (before[-1] - before[-1 - over]) / over
+        velocity = (before[-1] - before[-4]) / 3
         for ahead in range(1, 6):
             torch.testing.assert_close(after[length - 1 + ahead], before[-1] + ahead * velocity)
 

@@ -6,7 +6,6 @@ import torch
 from counted_windows import LENGTHS, demonstrations, seen
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_koap.data import D3ILExperienceReplay, LabelBudget, WindowTable, cut_windows, make_window_buffer, save_ted
@@ -93,21 +92,6 @@ def test_labelled_windows_by_the_definition(seed, number, before, after, history
         inner = [start + frame for frame in range(history - 1, window - 1)]
         expected.append(any(first <= row and row + 1 <= last and bool(has_action[row]) for row in inner))
     assert table.labelled.tolist() == expected
-
-
-def test_batches_undergo_the_transform():
-    """It draws after the sampler, from the same generator."""
-
-    def noisy(batch: TensorDict) -> TensorDict:
-        return batch.set("observation", batch["observation"] + torch.randn(batch.shape).unsqueeze(-1))
-
-    data, batches = demonstrations(), []
-    for transform in (noisy, None):
-        torch.manual_seed(0)
-        buffer = make_window_buffer(data, 16, 8, select=["observation"], pad_before=1, transform=transform)
-        batches.append(buffer.sample() if transform else noisy(buffer.sample()))
-    assert torch.equal(batches[0]["observation"], batches[1]["observation"]) and "padded" in batches[0].keys()
-    assert torch.equal(data["observation"], demonstrations()["observation"])
 
 
 def test_wrong_options():

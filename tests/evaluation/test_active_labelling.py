@@ -153,14 +153,14 @@ def test_unasked_no_more_are_suggested_than_are_left(copied_run, monkeypatch):
 
 
 def test_no_hidden_label_has_a_say(copied_run, monkeypatch):
-    load = trained.load_demonstrations
+    load = trained.open_dataset
     first = suggest(copied_run, SuggestConfig(count=6))
 
     def other_labels(*arguments, **options):
-        data = load(*arguments, **options)
-        return data.set("action", torch.randn_like(data["action"]) * 1e3)
+        data, task = load(*arguments, **options)
+        return data.set("action", torch.randn_like(data["action"]) * 1e3), task
 
-    monkeypatch.setattr(trained, "load_demonstrations", other_labels)
+    monkeypatch.setattr(trained, "open_dataset", other_labels)
     assert suggest(copied_run, SuggestConfig(count=6)) == first
     seen, infer = [], active_labelling.infer_steps
     monkeypatch.setattr(

@@ -94,10 +94,6 @@ def apply(part: str, function: Callable) -> Callable:
     return change
 
 
-def set_group(key: str, value: object) -> Callable:
-    return lambda held, about: about["param_groups"][0].update({key: value})
-
-
 def files() -> Iterator[Fault]:
     for kind, damage in DAMAGE.items():
         for name in (*JSON, *WEIGHTS):
@@ -189,17 +185,6 @@ def contents() -> Iterator[Fault]:
             "step true": put("step", True),
             "step negative": put("step", -5),
             "step huge": put("step", 10**9),
-            "groups a number": put("param_groups", 3),
-            "groups null": put("param_groups", None),
-            "groups empty": put("param_groups", []),
-            "groups of numbers": put("param_groups", [3]),
-            "groups of nothing": put("param_groups", [{}]),
-            "rate text": set_group("lr", "fast"),
-            "rate negative": set_group("lr", -1.0),
-            "betas text": set_group("betas", "ab"),
-            "betas one": set_group("betas", [0.9]),
-            "decay text": set_group("weight_decay", "x"),
-            "other parameters": set_group("params", [0, 1]),
             "no optimiser": drop("optimizer."),
             "no first moments": drop(".exp_avg"),
             "moments NaN": apply(".exp_avg_sq", nan),

@@ -155,16 +155,15 @@ def make_template(root: Path) -> Path:
     """A trained run with checkpoints, an evaluation and a log, and data of every kind."""
     import numpy as np
 
-    from torchrl_koap.data import save_ted
+    from torchrl_koap.data import open_dataset, save_ted
     from torchrl_koap.tasks import get_task
-    from torchrl_koap.training.datasets import load_demonstrations
 
     data = write_demonstrations(root / "data")
     run = ("--out", root / "run", "--dataset", data, *TINY, "--quiet")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torchrl_koap.training.loop.CHECKPOINT_EVERY", 10)
         assert koap("train", *run) == 0
-    flat = load_demonstrations(str(data), get_task("avoiding"))
+    flat = open_dataset(data, task=get_task("avoiding"))[0]
     save_ted(flat, root / "ted" / "ted", get_task("avoiding"))
     (root / "arrays").mkdir()
     for index in range(3):

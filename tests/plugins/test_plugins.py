@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.envs import make_env, mode_index_of
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations

@@ -68,16 +68,16 @@ def test_cells_have_folders_of_their_own():
 
 def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypatch):
     """Neither actions nor commands nor which steps have one."""
-    task, load = get_task("avoiding"), on_disk.load_demonstrations
+    task, load = get_task("avoiding"), on_disk.open_dataset
 
     def with_wild_actions(*arguments, **options):
-        data = load(*arguments, **options)
+        data, _ = load(*arguments, **options)
         data["action"] = torch.full_like(data["action"], 1e9)
         data["observation"][:, task.observation[task.command]] = 1e9
         data["next", "observation"][:, task.observation[task.command]] = 1e9
-        return data
+        return data, task
 
-    monkeypatch.setattr(on_disk, "load_demonstrations", with_wild_actions)
+    monkeypatch.setattr(on_disk, "open_dataset", with_wild_actions)
     make(tmp_path / "run", planner_config(tmp_path / "run", demonstrations))
     name = "planner.safetensors"
     assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()

@@ -13,7 +13,7 @@ from torchrl_koap.runs.run_directory import RunDirectoryError, pretrained_folder
 from torchrl_koap.studies import Study, run_study
 from torchrl_koap.studies.study import PRESETS, check_study, complete
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training import resolve
+from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import METHODS
 
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+
 import pytest
 from toy_task import TOY
 
@@ -50,7 +52,7 @@ def test_a_task_may_be_registered_again_but_no_other_of_its_name(tasks):
 def test_a_task_that_somebody_sent_may_name_no_code(field, value):
     entries = Task(**(TOY | {"name": "sent", field: value})).to_json()
     with pytest.raises(ValueError, match=f"task 'sent' names code in {field}"):
-        registry_module.plain_task(entries)
+        registry_module.task_from("sent", entries)
 
 
 class Point:
@@ -60,28 +62,26 @@ class Point:
         self.load = load
 
 
-def test_entry_points_are_asked_once_and_when_a_name_is_unknown(tasks, monkeypatch):
+def test_entry_points_are_asked_when_a_name_is_unknown(tasks, monkeypatch):
     asked = []
 
     def points(group):
         asked.append(group)
         return [Point(lambda: Task(**TOY))]
 
-    monkeypatch.setattr(registry_module, "_loaded", False)
-    monkeypatch.setattr(registry_module, "entry_points", points)
+    monkeypatch.setattr(importlib.metadata, "entry_points", points)
     get_task("avoiding")
     assert not asked
     assert get_task("toy").observation_dim == 7
+    assert get_task("toy") and asked == ["torchrl_koap.tasks"]
     with pytest.raises(ValueError, match="unknown task 'to'"):
         get_task("to")
-    assert asked == ["torchrl_koap.tasks"]
 
 
 def test_a_broken_entry_point_is_named(tasks, monkeypatch):
     def fail():
         raise ImportError("no module named 'my_package'")
 
-    monkeypatch.setattr(registry_module, "_loaded", False)
-    monkeypatch.setattr(registry_module, "entry_points", lambda group: [Point(fail)])
-    with pytest.raises(RuntimeError, match="entry point 'mine' = 'my_package.my_task' .* no module named"):
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [Point(fail)])
+    with pytest.raises(ValueError, match="'mine' = 'my_package.my_task' of 'torchrl_koap.tasks' .*no module named"):
         get_task("toy")

@@ -8,14 +8,12 @@ import torch
 from offline_runs import save_arm, train_arm
 
 from torchrl_koap import PlannerConfig, RunConfig
-from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted
+from torchrl_koap.data import LabelBudget, flatten_trajectories, open_dataset, save_ted
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.datasets import (
     choose_held_out,
-    find_task_of,
     held_out_by,
-    load_demonstrations,
-    without_held_out,
+    split_held_out,
 )
 
 
@@ -36,8 +34,8 @@ def test_where_all_have_labels_some_of_these_are_held_out_and_lose_none():
     data = flat(10)
     chosen = choose_held_out(data, 0.3)
     assert len(chosen) == 3
-    assert len(without_held_out(data, chosen)["episode"].unique()) == 7
-    kept = without_held_out(data, chosen, keep_labelled=True)
+    planned, unseen, kept = split_held_out(data, chosen)
+    assert len(planned["episode"].unique()) == 7 and sorted(unseen["episode"].unique().tolist()) == chosen
     assert len(kept["episode"].unique()) == 10 and kept["has_action"].all()
 
 
@@ -52,7 +50,7 @@ def test_bad_input():
     with pytest.raises(ValueError, match=r"planner.held_out must be in \[0, 1\), got 1.5"):
         choose_held_out(flat(3), 1.5)
     with pytest.raises(ValueError, match="all 3 trajectories that are used are held out"):
-        without_held_out(flat(3), [0, 1, 2])
+        split_held_out(flat(3), [0, 1, 2])
 
 
 def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
@@ -75,7 +73,8 @@ def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
 
 def test_the_planner_does_not_depend_on_what_is_held_out(tmp_path):
     """Nothing of these trajectories reaches it, not even through its statistics."""
-    from torchrl_koap.data import load_ted, save_ted
+    from torchrl_koap.data import save_ted
+    from torchrl_koap.data.ted import load_ted
 
     arm = save_arm(tmp_path / "arm", labelled=8)
     run = train_arm(tmp_path / "run", arm, method="linear")
@@ -93,20 +92,13 @@ TASK = get_task("avoiding")
 
 @pytest.fixture(scope="module")
 def data(demonstrations):
-    return load_demonstrations(str(demonstrations), TASK)
+    return open_dataset(demonstrations, task=TASK)[0]
 
 
 def test_recorded_folders_give_the_same(tmp_path, data):
     save_ted(data, tmp_path / "ted", TASK)
-    again = load_demonstrations(str(tmp_path), TASK)
+    again = open_dataset(tmp_path, task=TASK)[0]
     for key in ("state", "action", "episode", "observation"):
         assert torch.equal(again[key], data[key])
     again["action"][0] = 7.0  # in memory: the file stays as it is
-    assert torch.equal(load_demonstrations(str(tmp_path), TASK)["action"], data["action"])
-
-
-def test_a_call_without_data_names_both_commands():
-    with pytest.raises(
-        ValueError, match="koap demos --task sorting --out DEMOS.*koap train --task sorting --dataset DEMOS"
-    ):
-        find_task_of(None, "sorting")
+    assert torch.equal(open_dataset(tmp_path, task=TASK)[0]["action"], data["action"])

@@ -11,7 +11,8 @@ from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training import METHODS, resolve
+from torchrl_koap.training import METHODS
+from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.networks import build_planner, forecasts
 
 

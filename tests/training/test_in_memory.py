@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig, Trained, fit, train
-from torchrl_koap.data import LabelBudget, cut_windows, load_ted, make_demonstrations, save_demonstrations, select_state
+from torchrl_koap.data import LabelBudget, cut_windows, make_demonstrations, save_demonstrations, select_state
+from torchrl_koap.data.ted import load_ted
 from torchrl_koap.keys import LayoutError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.runs.weights import load_tensors

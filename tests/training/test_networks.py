@@ -7,10 +7,9 @@ from small_controllers import controller_of
 from tensordict import TensorDict
 
 from torchrl_koap import PlannerConfig, TrainConfig
-from torchrl_koap.data import LabelBudget
+from torchrl_koap.data import LabelBudget, open_dataset
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training import resolve
-from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.networks import NETWORKS, build_planner, sizes_of
 
@@ -19,7 +18,7 @@ TASK = get_task("avoiding")
 
 @pytest.fixture(scope="module")
 def data(demonstrations):
-    return load_demonstrations(str(demonstrations), TASK)
+    return open_dataset(demonstrations, task=TASK)[0]
 
 
 @pytest.mark.parametrize("network", NETWORKS)

@@ -11,12 +11,11 @@ from tiny_runs import TINY as TINY_CALL
 from tiny_runs import koap, write_demonstrations
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, Trained, train
-from torchrl_koap.data import LabelBudget, save_demonstrations
+from torchrl_koap.data import LabelBudget, open_dataset, save_demonstrations
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import loop, on_disk
-from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.methods import METHODS
 
 TASK = get_task("avoiding")
@@ -74,7 +73,7 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
     method, unit, demonstrations, planner, tmp_path, monkeypatch
 ):
     budget = LabelBudget(count=2, unit=unit, seed=0)
-    real = load_demonstrations(str(demonstrations), TASK)
+    real = open_dataset(demonstrations, task=TASK)[0]
     outside, inside = (poisoned(real, budget, inside=at, told=METHODS[method].knows_commands) for at in (False, True))
     variants = {"clean": real, "outside": outside, "inside": inside}
     kept = budget.apply(real)[0]["has_action"].squeeze(-1)
@@ -82,9 +81,7 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
     assert torch.equal(variants["outside"]["action"][kept], real["action"][kept])
     assert (variants["outside"]["observation"] > POISON / 2).any()
     for name, data in variants.items():
-        monkeypatch.setattr(
-            "torchrl_koap.training.on_disk.load_demonstrations", lambda *a, data=data, **o: data.clone()
-        )
+        monkeypatch.setattr(on_disk, "open_dataset", lambda *a, data=data, **o: (data.clone(), TASK))
         labels = LabelConfig(count=2, unit=unit)
         train_tiny(tmp_path / name, demonstrations, planner, method, labels=labels)
     assert weights(tmp_path / "outside") == weights(tmp_path / "clean")
@@ -97,8 +94,8 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
 
 def test_no_weight_of_a_planner_depends_on_any_label(demonstrations, planner, tmp_path, monkeypatch):
     budget = LabelBudget(count=2)
-    data = poisoned(poisoned(load_demonstrations(str(demonstrations), TASK), budget), budget, inside=True)
-    monkeypatch.setattr(on_disk, "load_demonstrations", lambda *a, **o: data.clone())
+    data = poisoned(poisoned(open_dataset(demonstrations, task=TASK)[0], budget), budget, inside=True)
+    monkeypatch.setattr(on_disk, "open_dataset", lambda *a, **o: (data.clone(), TASK))
     train(TrainConfig(out=tmp_path / "run", dataset=str(demonstrations), method="linear", **TINY))
     name = "planner.safetensors"
     assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()

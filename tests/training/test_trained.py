@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A training as one file acts as it did, and files that cannot be used are named."""
 
-import json
-import math
 import shutil
 from dataclasses import replace
 
@@ -13,7 +11,6 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, fit, load_policy
 from torchrl_koap.data import make_demonstrations
-from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
 PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
@@ -34,22 +31,6 @@ def own():
     )
     trained = fit(data, task, method="linear", planner={"steps": 2, "width": 8}, progress=False)
     return replace(trained, config=replace(trained.config, execution=ExecutionConfig(replan_interval=3, blend=0.5)))
-
-
-def test_a_run_that_stores_no_range_of_commands_finds_it_in_its_data(copied_run, demonstrations, tmp_path):
-    summary = json.loads((copied_run / "summary.json").read_text())
-    ranges = summary.pop("command_ranges")
-    (copied_run / "summary.json").write_text(json.dumps(summary))
-    with pytest.warns(UserWarning, match="run stores no range of demonstrated commands: they are not limited"):
-        assert load_policy(copied_run).limits is None
-    load_policy(copied_run, limits=math.inf)
-    config = json.loads((copied_run / "config.json").read_text())
-    (copied_run / "config.json").write_text(json.dumps(config | {"dataset": str(tmp_path / "gone")}))
-    assert "command_ranges" not in Trained.load(copied_run).with_ranges().results
-    with pytest.raises(RunDirectoryError, match="is not there"):
-        Trained.load(copied_run).with_ranges(str(tmp_path / "gone too"))
-    assert Trained.load(copied_run).with_ranges(str(demonstrations)).results["command_ranges"] == ranges
-    assert load_policy(copied_run).limits.ends.shape == (2, 2)
 
 
 def test_a_default_of_float64_changes_no_loaded_policy(trained_run, tmp_path):

@@ -8,10 +8,10 @@ from camera_sets import episode
 from camera_sets import write_camera_set as write
 from filmed_data import write_filmed
 
-from torchrl_koap.data import load_ted, read_about, read_recordings, save_demonstrations
+from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
+from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.vision import Observer, Projection, backbones, load_encoder
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
 from torchrl_koap.vision.projection import load_cameras
@@ -39,7 +39,7 @@ def test_embeddings_are_further_columns_that_are_not_the_robot_s(tmp_path):
     assert task.state_names[2:4] == ("top_0", "top_1") and task.state_names[-1] == "wrist_4"
     assert torch.equal(data["observation"][:, :2], before["observation"])
     assert torch.equal(data["action"], before["action"])
-    columns = load_demonstrations(str(tmp_path / "seen"), task)["state"]
+    columns = open_dataset(tmp_path / "seen", task=task)[0]["state"]
     assert columns.shape[1] == 12 and not (tmp_path / "seen" / "unfinished").exists()
     for name, report in reports.items():
         assert report.size == (16, 24) and report.components == 5 and report.rate > 0

@@ -14,11 +14,12 @@ import tyro
 from tensordict import TensorDictBase
 
 from torchrl_koap.commands.options import Command
-from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations, write_recordings
+from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.action_kinds import describe_likely, likely_kinds
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
-from torchrl_koap.data.formats import FORMATS, Recordings
+from torchrl_koap.data.formats import FORMATS, Recordings, write_recordings
 from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
+from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.data.ted import stored_folder
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport
@@ -29,7 +30,6 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.training.datasets import find_task_of
 
 _READING = (
     *("control_hz", "resample", "observations", "episodes"),

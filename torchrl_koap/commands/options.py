@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import math
 import re
 import sys
@@ -25,11 +24,10 @@ from tyro.constructors import (
 )
 
 from torchrl_koap.evaluation.config import EvalConfig
-from torchrl_koap.files import read_bytes
+from torchrl_koap.files import read_json
 from torchrl_koap.lookup import lookup
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
-from torchrl_koap.runs.run_directory import RunDirectoryError
 
 LARGEST = 2**53  # beyond it a number is not even counted exactly
 _MAY_BE_INFINITE = ("limits",)
@@ -110,8 +108,8 @@ def expand(words: Sequence[str]) -> list[str]:
     """Replaces ``--labels NUMBER`` by the option of its kind, and ``--config FILE`` by the options in the file.
 
     Raises:
-        RunDirectoryError: if the file is not there, or holds other things than options.
-        ValueError: if ``--labels`` is no number.
+        FileNotFoundError: if the file is not there.
+        ValueError: if it holds other things than options, or ``--labels`` is no number.
 
     Examples:
         >>> from torchrl_koap.commands.options import expand
@@ -146,13 +144,7 @@ def _kind_of(labels: str) -> str:
 
 def _words_of(path: Path, without: set[str]) -> list[str]:
     """The options in a file as words of a command line."""
-    try:
-        content = json.loads(read_bytes(path).decode())
-    except (ValueError, OSError) as error:
-        raise RunDirectoryError(f"{path} cannot be read: {error}") from error
-    if not isinstance(content, dict):
-        raise RunDirectoryError(f"{path} is no file of options: wanted an object, got {type(content).__name__}")
-    options = {name: value for name, value in content.items() if name not in FACTS and name not in without}
+    options = {name: value for name, value in read_json(path).items() if name not in FACTS and name not in without}
     from_json(TrainConfig, {"out": ""} | options, path)
     return list(_flat(options))
 
@@ -174,12 +166,9 @@ def _flat(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
 
 
 def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
-    """Makes a command of the words of a call; ``--help`` among them prints its options and leaves.
+    """Makes a command, of a dataclass or a union of them that the first word chooses from, of the words of a call.
 
-    Args:
-        kind (type): a dataclass, or a union of those that the first word chooses from.
-        arguments (sequence of str): the words.
-        how: what else :func:`tyro.cli` takes.
+    ``--help`` among them prints its options and leaves. ``how`` is what else :func:`tyro.cli` takes.
 
     Raises:
         SystemExit: with 2 for a wrong call, after a message on stderr; with 0 after a help.
@@ -201,10 +190,6 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
 
 def check_call(kind: Any, arguments: Sequence[str]) -> None:
     """Checks that a call names a command and options that its help lists, with numbers where it says so.
-
-    Args:
-        kind (type): a union of dataclasses that the first word chooses from.
-        arguments (sequence of str): the words.
 
     Raises:
         ValueError: for the first unknown name, with the nearest one of that command, or the first value that is no

@@ -209,12 +209,9 @@ class Export(Command):
 
 
 def _columns(task: Task) -> dict[str, dict[str, str]]:
-    """Name to unit of what an exported policy reads and writes; the parts of our own tasks tell their metres."""
-    parts = {part: range(task.observation_dim)[columns] for part, columns in task.observation.items()}
-    metres = [part.endswith(("_xy", "_xyz", "_position")) for part, columns in parts.items() for _ in columns]
-    units = task.observation_units or ["m" if metre else "" for metre in metres]
+    """Name to unit of what an exported policy reads and writes."""
     return {
-        "observations": dict(zip(task.observation_names, units, strict=True)),
+        "observations": dict(zip(task.observation_names, task.known_units, strict=True)),
         "actions": dict(zip(task.action_names, task.action_units, strict=True)),
     }
 

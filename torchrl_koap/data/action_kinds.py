@@ -24,22 +24,13 @@ FEW, MANY = 20, 20_000  # labels below which nothing is said, and that are looke
 
 @dataclass(frozen=True)
 class LikelyKind:
-    """What an action column looks like by its labels.
+    """What an action column looks like by its labels."""
 
-    Args:
-        kind (str): ``"absolute"``: it lies near a state column; ``"delta"``: it follows the change of one; ``"raw"``:
-            neither.
-        column (int): the state column that it lies nearest to, in units of that column's spread.
-        distance (float): how far from there, on average.
-        follows_column (float): largest correlation with a state column, between 0 and 1.
-        follows_change (float): largest correlation with the change of one.
-    """
-
-    kind: ActionKind
-    column: int
-    distance: float
-    follows_column: float
-    follows_change: float
+    kind: ActionKind  # "absolute": near a state column; "delta": follows the change of one; "raw": neither
+    column: int  # the state column that it lies nearest to, in units of that column's spread
+    distance: float  # from there, on average
+    follows_column: float  # largest correlation with a state column, between 0 and 1
+    follows_change: float  # largest correlation with the change of one
 
 
 @dataclass(frozen=True)
@@ -53,45 +44,20 @@ class _Labels:
 
 
 def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
-    """Guesses the kind of every action from its labels.
+    """Guesses the kind of every action of flat data ``[N]`` from its labels, by the name of the action.
 
-    Args:
-        data (TensorDictBase): flat data ``[N]`` in the storage layout.
-        task (Task): what they are of.
-
-    Returns:
-        dict: by the name of the action; none below 20 labels, and none of an action that never changes.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data import make_demonstrations
-        >>> from torchrl_koap.data.action_kinds import likely_kinds
-        >>> path = np.sin(np.arange(30.0))[:, None]
-        >>> likely_kinds(*make_demonstrations([path], [np.diff(path, axis=0)], control_hz=10))["action_0"].kind
-        'delta'
+    There is none below 20 labels, and none of an action that never changes.
     """
     labels = _labels(data, task)
     return {} if labels is None else _likely(labels, task)
 
 
 def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
-    """Finds actions that contradict their kind.
+    """Finds actions of flat data ``[N]`` that contradict their kind.
 
     Changes look wrong where they lie at the next value of a state column, or follow columns more than their changes;
     or have two values alone; absolute targets where they lie at the change of their column, per frame or per second, or
     far from the column; raw actions where all of them are near columns, or all follow changes.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]`` in the storage layout.
-        task (Task): what they are of.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data import make_demonstrations
-        >>> from torchrl_koap.data.action_kinds import kind_warnings
-        >>> path = np.sin(np.arange(30.0))[:, None]
-        >>> list(kind_warnings(*make_demonstrations([path], [path[1:]], control_hz=10)))[0][:51]
-        'actions lie within 0 of state_0 on average: they lo'
     """
     labels = _labels(data, task)
     if labels is None:

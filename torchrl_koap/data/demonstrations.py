@@ -58,7 +58,8 @@ def save_demonstrations(
         >>> import tempfile
         >>> from pathlib import Path
         >>> import numpy as np
-        >>> from torchrl_koap.data import read_about, save_demonstrations
+        >>> from torchrl_koap.data import save_demonstrations
+        >>> from torchrl_koap.data.ted import read_about
         >>> states = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(5)]
         >>> actions = [np.diff(states[0], axis=0), None, None, None, None]
         >>> with tempfile.TemporaryDirectory() as root:

@@ -8,13 +8,12 @@ tasks repeats the last command. Its differences are the actions, so those column
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import numbers
 from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_HALF_UP, Context, Decimal
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -30,41 +29,19 @@ Unit = Literal["trajectory", "window", "transition"]
 
 @dataclass(frozen=True)
 class LabelReport:
-    """What a label budget spent.
+    """What a label budget spent."""
 
-    Args:
-        unit (str): what was drawn.
-        requested (float or int): the fraction or count that was asked for.
-        selected_units (int): units that were drawn, of ``total_units``.
-        labelled_transitions (int): distinct transitions that keep their action, of ``total_transitions``.
-        trajectories_touched (int): trajectories with at least one label, of ``total_trajectories``.
-        seed (int): seed of the draw.
-        available_units (int): units with a label in the data as they came; those that could be drawn.
-        available_transitions (int): transitions with a label in the data as they came.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
-        >>> _, report = LabelBudget(count=1).apply(flatten_trajectories([torch.rand(6, 2)] * 4, [torch.rand(5, 1)] * 4))
-        >>> report.labelled_transitions, report.total_transitions, report.trajectories_touched
-        (5, 20, 1)
-    """
-
-    unit: str
-    requested: float | int
+    unit: str  # what was drawn
+    requested: float | int  # the fraction or count that was asked for
     selected_units: int
     total_units: int
-    labelled_transitions: int
+    labelled_transitions: int  # distinct transitions that keep their action
     total_transitions: int
-    trajectories_touched: int
+    trajectories_touched: int  # with at least one label
     total_trajectories: int
-    seed: int
-    available_units: int
-    available_transitions: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """The report as a plain dictionary, for JSON."""
-        return dataclasses.asdict(self)
+    seed: int  # of the draw
+    available_units: int  # with a label in the data as they came: those that could be drawn
+    available_transitions: int  # with a label in the data as they came
 
     def __str__(self) -> str:
         share, units = self.labelled_transitions / self.total_transitions, _plural(self.unit)
@@ -123,18 +100,18 @@ class LabelBudget:
     def __post_init__(self):
         given = [name for name in ("fraction", "count", "episodes") if getattr(self, name) is not None]
         if len(given) > 1:
-            raise ValueError(f"labels are a fraction, a count or episodes, got {' and '.join(given)}")
-        lookup(get_args(Unit), self.unit, "unit")
+            raise ValueError(f"labels: give one of fraction, count and episodes, got {' and '.join(given)}")
+        lookup(get_args(Unit), self.unit, "unit of labels")
         if self.fraction is not None and not (_is(self.fraction, numbers.Real) and 0 < self.fraction <= 1):
-            raise ValueError(f"a label fraction must be in (0, 1], got {self.fraction!r}")
+            raise ValueError(f"labels: fraction must be in (0, 1], got {self.fraction!r}")
         if self.count is not None and not (_is(self.count, numbers.Integral) and self.count >= 1):
-            raise ValueError(f"a count of labelled units must be a whole number of at least 1, got {self.count!r}")
+            raise ValueError(f"labels: count must be a whole number of at least 1, got {self.count!r}")
         if self.episodes is not None:
             chosen = tuple(int(episode) for episode in self.episodes)
             if not chosen or len(set(chosen)) < len(chosen):
-                raise ValueError(f"episodes to label must be one or more different numbers, got {list(chosen)}")
+                raise ValueError(f"labels: episodes must be one or more different numbers, got {list(chosen)}")
             if self.unit != "trajectory":
-                raise ValueError(f"episodes to label are trajectories, got unit {self.unit!r}")
+                raise ValueError(f"labels: episodes are trajectories, got unit {self.unit!r}")
             object.__setattr__(self, "episodes", chosen)
 
     def apply(self, data: TensorDictBase, *, command: slice | None = None) -> tuple[TensorDictBase, LabelReport]:
@@ -246,24 +223,10 @@ def _positions(present: np.ndarray, usable: np.ndarray, wanted: tuple[int, ...])
 
 
 def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
-    """Blanks the command columns of every trajectory that has a hidden action.
+    """Blanks the command columns of every trajectory that has a hidden action, in a copy of flat data ``[N]``.
 
     The difference of two commands is the sum of the actions between them, so only trajectories whose actions are all
-    labelled keep theirs. ``state``, which never holds commands, stays as it is.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]``; not changed.
-        command (slice): columns of the observation that repeat the command.
-
-    Returns:
-        TensorDictBase: a copy with NaN in those columns of ``observation`` and ``("next", "observation")``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, hide_commands
-        >>> data = flatten_trajectories([torch.ones(2, 4), torch.ones(2, 4)], [torch.ones(1, 2), torch.ones(1, 2)])
-        >>> hide_commands(LabelBudget(count=1).apply(data)[0], slice(0, 2))["observation"].isnan().sum(-1).sort().values
-        tensor([0, 2])
+    labelled keep theirs. NaN stand in ``observation`` and ``("next", "observation")``; ``state`` never holds commands.
     """
     lengths = trajectory_lengths(data)
     hidden = torch.stack([~part.all() for part in data.get(keys.HAS_ACTION).split(lengths.tolist())])
@@ -279,29 +242,11 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
 def subsample_trajectories(data: TensorDictBase, fraction: float, *, seed: int = 0) -> TensorDictBase:
     """Drops whole trajectories without a label until a share of all trajectories is left.
 
-    Trajectories with a label always stay. Of one seed, a smaller share is part of every larger one.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]`` after the label budget was applied; not changed.
-        fraction (float): share of the trajectories to keep, in ``(0, 1]``.
-
-    Keyword Args:
-        seed (int): seed of the choice.
-
-    Returns:
-        TensorDictBase: flat data in the order of ``data``; ``data`` itself if nothing is dropped.
+    Trajectories with a label always stay. Of one seed, a smaller share is part of every larger one. Data ``[N]`` have
+    the label budget applied; what is left keeps its order.
 
     Raises:
-        ValueError: if the share is out of range, or smaller than that of the trajectories with labels.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, subsample_trajectories
-        >>> data = flatten_trajectories([torch.zeros(5, 2)] * 10, [torch.zeros(4, 1)] * 10)
-        >>> data, _ = LabelBudget(count=2).apply(data)
-        >>> kept = subsample_trajectories(data, 0.5)
-        >>> len(kept["episode"].unique()), int(kept["has_action"].sum())
-        (5, 8)
+        ValueError: if the share is outside (0, 1], or smaller than that of the trajectories with labels.
     """
     if not 0 < fraction <= 1:
         raise ValueError(f"observation fraction must be in (0, 1], got {fraction}")

@@ -14,10 +14,11 @@ from torchrl_koap.data.windows import WindowTable
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 
 RELABELLED = "relabelled"
+_BATCH = 4096  # windows per forward pass
 
 
 @torch.no_grad()
-def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_size: int = 4096) -> TensorDict:
+def relabel(controller: nn.Module, data: TensorDictBase, *, window: int) -> TensorDict:
     """Gives every unlabelled step the action that an inverse dynamics reads off the recorded states.
 
     An action is read at frame ``controller.num_past`` of a window. Over the ends of a trajectory the first state is
@@ -27,18 +28,9 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
         action of step 0 x_0    x_0    x_1    ...
         action of step t x_t-1  x_t    x_t+1  ...
 
-    Args:
-        controller (nn.Module): reads a window of raw states ``[B, T, d]``, its first in-key, and writes actions
-            ``[B, T, act]``, its last out-key; has ``num_past`` and ``num_window_frames``. It runs in evaluation mode.
-        data (TensorDictBase): flat data ``[N]`` with ``state``, as the controller sees it; not changed.
-
-    Keyword Args:
-        window (int): frames per window.
-        batch_size (int): windows per forward pass.
-
-    Returns:
-        TensorDict: a shallow copy in which every step has an action; labelled steps keep theirs bit for bit. The new
-        entry ``relabelled`` ``[N, 1]`` is True where the action is the controller's.
+    Flat data ``[N]`` have ``state`` as the controller sees it, and are not changed. In the shallow copy that is
+    returned every step has an action; labelled steps keep theirs bit for bit. The new entry ``relabelled`` ``[N, 1]``
+    is True where the action is the controller's.
 
     Raises:
         KeyError: if an entry is missing.
@@ -49,12 +41,10 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
             raise KeyError(f"relabelling needs the entry {key!r}; there are {sorted(map(str, data.keys()))}")
     if window < controller.num_window_frames:
         raise ValueError(f"the controller needs windows of {controller.num_window_frames} frames, got {window}")
-    if batch_size < 1:
-        raise ValueError(f"batch_size must be >= 1, got {batch_size}")
     hidden = ~data.get(HAS_ACTION).reshape(-1)
     action = data.get(ACTION).clone()
     if hidden.any():
-        predicted = _predict(controller, data, hidden, window, batch_size)
+        predicted = _predict(controller, data, hidden, window)
         if predicted.shape[-1] != action.shape[-1]:
             raise ValueError(
                 f"the controller's actions have {predicted.shape[-1]} columns, those of the data {action.shape[-1]}"
@@ -67,7 +57,7 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
     return result.set(RELABELLED, hidden.reshape(data.get(HAS_ACTION).shape))
 
 
-def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window: int, batch_size: int) -> Tensor:
+def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window: int) -> Tensor:
     """The controller's actions ``[hidden steps, act]``."""
     now = controller.num_past
     continued = extrapolate_ends(data, window - 1 - now)
@@ -78,7 +68,7 @@ def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window
     controller.eval()  # dropout would make labels of noise
     try:
         actions = []
-        for part in frames.split(batch_size):
+        for part in frames.split(_BATCH):
             states = continued.get(STATE)[part].to(example)  # [B, T, d]
             windows = TensorDict({controller.in_keys[0]: states}, batch_size=states.shape[:-1])
             actions.append(controller(windows).get(controller.out_keys[-1])[:, now].to(frames.device))

@@ -62,12 +62,9 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     frames = [part.double().numpy() for part in state.split(lengths)]
     constants = zip(task.action_names, constant_columns(data.get(keys.ACTION).cpu().numpy()), strict=True)
     _, short_plans = plan_coverage(data, task.control_hz)
-    labels = [
-        steps[known].double().cpu().numpy()
-        for steps, known in zip(
-            data.get(keys.ACTION).split(lengths), data.get(keys.HAS_ACTION).squeeze(-1).split(lengths), strict=True
-        )
-    ]
+    known = data.get(keys.HAS_ACTION).squeeze(-1).split(lengths)
+    actions = zip(data.get(keys.ACTION).split(lengths), known, strict=True)
+    labels = [steps[labelled].double().cpu().numpy() for steps, labelled in actions]
     return [
         *kind_warnings(data, task),
         *_trajectory_warnings(data, task, lengths, called),
@@ -82,7 +79,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *spike_warnings(labels, called, task.action_names),
         *mark_warnings(np.concatenate(labels), task.action_names, "action"),
         *scale_warnings(labels, called, task.action_names, "action"),
-        *_single_labels(data.get(keys.HAS_ACTION).squeeze(-1).split(lengths), called),
+        *_single_labels(known, called),
         *(
             f"action {name!r} is {value:g} in all labels: controllers command that, method dp something near it"
             for name, value in constants
@@ -96,7 +93,7 @@ def _trajectory_warnings(
     data: TensorDictBase, task: Task, lengths: Sequence[int], called: Sequence[str]
 ) -> Iterator[str]:
     first: dict[bytes, str] = {}
-    names, units = task.observation_names, task.observation_units or _metres(task)
+    names, units = task.observation_names, task.known_units
     looked_at = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
     entries = [data.get(key) for key in (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)]
     for name, observed, steps, has_action, last in zip(
@@ -115,12 +112,6 @@ def _trajectory_warnings(
         far = next((column for column in looked_at if farthest[column] > FARTHEST), None)
         if far is not None:
             yield f"{name}: {names[far]} reaches {farthest[far]:.3g} {units[far]}"
-
-
-def _metres(task: Task) -> list[str]:
-    """Metres for the columns that are positions for certain; the others have units of their own."""
-    inside = range(*task.observation[task.position].indices(task.observation_dim))
-    return ["m" if task.env is not None and column in inside else "" for column in range(task.observation_dim)]
 
 
 def _short(lengths: Sequence[int], called: Sequence[str]) -> list[str]:
@@ -241,14 +232,9 @@ def drop_short(recordings: Recordings) -> Recordings:
 
 
 def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | None]:
-    """Says how long a plan and the demonstrations last.
+    """Says how long a plan and the demonstrations of flat data ``[N]`` last, in milliseconds at ``control_hz``.
 
-    Args:
-        data (TensorDictBase): flat data ``[N]``.
-        control_hz (float): frames per second.
-
-    Returns:
-        tuple: both in milliseconds, and a warning where a plan is short against the motion, else None.
+    Second stands a warning where a plan is short against the motion, else None.
     """
     frames = float(trajectory_lengths(data).double().median())
     covers = f"{HORIZON} frames, {1e3 * HORIZON / control_hz:.4g} ms"

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -15,6 +15,7 @@ from torchrl_koap.keys import ACTION, STATE
 
 _DIFFERENCE = 1e-3  # rad, of the numerical Jacobian
 _DAMPING = 1e-4  # m2 / rad2, added to the squared reach of the joints: bounds them where the arm is stretched out
+_OPEN, _OPENING, _LEFT = 0.075, 5, 0.5  # m that count as open; steps that opening takes; share left after each
 EMPTY = 0.05  # m; fingers nearer to each other than that hold nothing: the boxes of Stacking are 0.06 m wide
 
 
@@ -57,9 +58,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
             needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
         moved_by (sequence of int, optional): for every action column the state column that it moves: actions are given
             the way back too, ``a'_{t+i} = a_{t+i} + (rho^{i+1} - rho^i) delta``. Default: no action is touched.
-        key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
-        action_key (NestedKey): actions ``[*B, T, act]``, replaced with ``moved_by``; NaN stays. Defaults to
-            ``"action"``.
+
+    Windows of ``state`` ``[*B, T, d]`` are replaced, with ``moved_by`` also ``action`` ``[*B, T, act]``; NaN stays.
 
     Raises:
         ValueError: for a negative ``sigma``, a ``decay`` outside [0, 1) (0 excluded with ``under_way``), a ``tool``
@@ -85,15 +85,13 @@ class RecoveryAugmentation(TensorDictModuleBase):
         tool: Sequence[int] | None = None,
         kinematics: Callable[[Tensor], Tensor] | None = None,
         moved_by: Sequence[int] | None = None,
-        key: NestedKey = STATE,
-        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         if tool is not None and (columns is None or kinematics is None):
             raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
         if sigma < 0 or not 0 <= decay < 1 or (under_way and not decay):
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), 0 without under_way, got {sigma} and {decay}")
-        self.in_keys = self.out_keys = [key] if moved_by is None else [key, action_key]
+        self.in_keys = self.out_keys = [STATE] if moved_by is None else [STATE, ACTION]
         self.moved_by = None if moved_by is None else list(moved_by)
         self.sigma, self.history, self.decay, self.under_way = sigma, history, decay, under_way
         self.columns = None if columns is None else list(columns)
@@ -102,7 +100,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by shifted ones."""
-        state = tensordict.get(self.in_keys[0])
+        state = tensordict.get(STATE)
         size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
         shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
         shift = 2 * self.sigma * size * self._of_joints(shift, state)
@@ -115,11 +113,11 @@ class RecoveryAugmentation(TensorDictModuleBase):
         if self.moved_by is not None:
             following = _remaining(state, self.history, self.decay, ahead=1, under_way=self.under_way)
             back = shift[..., self.moved_by] * (following - remaining)
-            tensordict.set(self.in_keys[1], tensordict.get(self.in_keys[1]) + back)
+            tensordict.set(ACTION, tensordict.get(ACTION) + back)
         if self.tool is not None and self.sigma:
             moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
             shifted[..., self.tool] = shifted[..., self.tool] + moved
-        return tensordict.set(self.in_keys[0], shifted)
+        return tensordict.set(STATE, shifted)
 
     def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
         """Shifts ``[*B, 1, d]`` whose joints move the tool, if there is one, by its own columns, with least motion."""
@@ -150,63 +148,31 @@ class GripperRecovery(TensorDictModuleBase):
         column (int): state column of the width between the fingers (m).
 
     Keyword Args:
-        share (float): share of the windows it is done to, if their fingers are open. Defaults to ``0.1``.
-        empty (float): widest fingers that hold nothing (m). Defaults to ``0.05``.
-        open_above (float): narrowest fingers that count as open (m). Defaults to ``0.075``.
-        steps (int): control steps that opening takes. Defaults to ``5``.
-        decay (float): ``rho``, share of the way that remains after a control step. Defaults to ``0.5``.
-        history, key: as of :class:`RecoveryAugmentation`.
-
-    Raises:
-        ValueError: for a share or decay outside [0, 1], or an empty hand as wide as an open one.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import GripperRecovery
-        >>> _ = torch.manual_seed(0)
-        >>> augment = GripperRecovery(0, share=1.0)
-        >>> augment(TensorDict({"state": torch.full([1, 8, 1], 0.08)}, [1]))["state"][0, :, 0]
-        tensor([0.0384, 0.0384, 0.0592, 0.0696, 0.0748, 0.0774, 0.0787, 0.0794])
-        >>> augment(TensorDict({"state": torch.full([1, 4, 1], 0.06)}, [1]))["state"][0, :, 0]  # a box is held
-        tensor([0.0600, 0.0600, 0.0600, 0.0600])
+        share (float): share of the windows it is done to, if their fingers are open, in [0, 1].
+        history (int): observed frames of the window.
     """
 
-    def __init__(
-        self,
-        column: int,
-        *,
-        share: float = 0.1,
-        empty: float = EMPTY,
-        open_above: float = 0.075,
-        steps: int = 5,
-        decay: float = 0.5,
-        history: int = 2,
-        key: NestedKey = STATE,
-    ):
+    def __init__(self, column: int, *, share: float = 0.1, history: int = 2):
         super().__init__()
-        if not 0 <= share <= 1 or not 0 <= decay <= 1:
-            raise ValueError(f"share and decay must be in [0, 1], got {share} and {decay}")
-        if not 0 < empty < open_above:
-            raise ValueError(f"empty must be above 0 and below open_above, got {empty} and {open_above}")
-        self.in_keys = self.out_keys = [key]
+        if not 0 <= share <= 1:
+            raise ValueError(f"share must be in [0, 1], got {share}")
+        self.in_keys = self.out_keys = [STATE]
         self.column, self.share, self.history = column, share, history
-        self.empty, self.open_above, self.steps, self.decay = empty, open_above, steps, decay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by ones of which some show fingers that open."""
-        state = tensordict.get(self.in_keys[0])
+        state = tensordict.get(STATE)
         width = state[..., self.column]
         kind = {"dtype": width.dtype, "device": width.device}
         chosen, begin = torch.rand(2, *width.shape[:-1], 1, **kind)
-        looked_at = width[..., : self.history + self.steps]
-        chosen = (chosen < self.share) & (looked_at > self.open_above).all(-1, keepdim=True)
+        looked_at = width[..., : self.history + _OPENING]
+        chosen = (chosen < self.share) & (looked_at > _OPEN).all(-1, keepdim=True)
         ahead = (torch.arange(width.shape[-1], **kind) - (self.history - 1)).clamp_min(0)
         widest = width[..., self.history - 1 : self.history]
-        opening = widest - self.decay**ahead * (widest - self.empty * begin)
+        opening = widest - _LEFT**ahead * (widest - EMPTY * begin)
         state = state.clone()
         state[..., self.column] = torch.where(chosen, torch.minimum(width, opening), width)
-        return tensordict.set(self.in_keys[0], state)
+        return tensordict.set(STATE, state)
 
 
 class NeighborRecovery(TensorDictModuleBase):
@@ -225,32 +191,19 @@ class NeighborRecovery(TensorDictModuleBase):
         share (float): ``s``, farthest share of the way to the neighbour; 0 changes nothing.
 
     Keyword Args:
-        history, decay, key: as of :class:`RecoveryAugmentation`, but for the default of ``decay``, ``0.85``.
-
-    Raises:
-        ValueError: for a negative ``share`` or a ``decay`` outside [0, 1); at a call, for windows that are not a batch
-            of two or more.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import NeighborRecovery
-        >>> windows = torch.tensor([0.0, 1.0, 5.0]).reshape(3, 1, 1).expand(3, 4, 1)
-        >>> moved = NeighborRecovery(1.0)(TensorDict({"state": windows}, [3]))["state"]
-        >>> bool((moved[2, 0] >= 1).all()), bool((moved[2, 0] <= 5).all())  # the third one's neighbour is the second
-        (True, True)
+        history, decay: as of :class:`RecoveryAugmentation`; windows must be a batch of two or more.
     """
 
-    def __init__(self, share: float, *, history: int = 2, decay: float = 0.85, key: NestedKey = STATE):
+    def __init__(self, share: float, *, history: int = 2, decay: float = 0.85):
         super().__init__()
         if not 0 <= share < math.inf or not 0 <= decay < 1:
             raise ValueError(f"share must be >= 0 and decay in [0, 1), got {share} and {decay}")
-        self.in_keys = self.out_keys = [key]
+        self.in_keys = self.out_keys = [STATE]
         self.share, self.history, self.decay = share, history, decay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by displaced ones."""
-        state = tensordict.get(self.in_keys[0])
+        state = tensordict.get(STATE)
         if state.ndim != 3 or len(state) < 2:
             raise ValueError(f"neighbours are looked for in a batch [B, T, d] of two or more, got {list(state.shape)}")
         present = state[:, self.history - 1]
@@ -259,4 +212,4 @@ class NeighborRecovery(TensorDictModuleBase):
         way = present[apart.argmin(-1)] - present
         way = self.share * torch.rand(len(state), 1, dtype=state.dtype, device=state.device) * way
         remaining = _remaining(state, self.history, self.decay)
-        return tensordict.set(self.in_keys[0], state + way[:, None] * remaining)
+        return tensordict.set(STATE, state + way[:, None] * remaining)

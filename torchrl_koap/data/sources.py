@@ -17,7 +17,7 @@ from torchrl_koap.data.trajectories import flatten_trajectories, select_state
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import Task, get_task
 
-_OF_D3IL = "avoiding"  # what D3IL's pickles are of if nobody says so
+DEFAULT_TASK = "avoiding"  # what D3IL's pickles are of if nobody says so
 
 
 def open_dataset(
@@ -54,16 +54,15 @@ def open_dataset(
         (torch.Size([8, 3]), 'arm')
     """
     folder = Path(folder).expanduser()
-    stored = find_stored(folder)
+    task, stored = find_task_of(folder) if task is None else task, _find_stored(folder)
     if stored is not None:
-        task = _fitting(stored, task)
+        name = read_about(stored)["task"]
+        if name not in (task.name, task.source):
+            raise DataError(stored, f"it holds demonstrations of {name!r}, wanted {task.source!r}")
         data = read_steps(stored)
+    elif task.source not in CONVERTERS:
+        raise DataError(folder, f"it holds no data set, and task {task.name!r} is none of D3IL's: `koap convert` it")
     else:
-        task = get_task(_OF_D3IL) if task is None else task
-        if task.source not in CONVERTERS:
-            raise DataError(
-                folder, f"it holds no data set, and task {task.name!r} is none of D3IL's: `koap convert` it"
-            )
         data = flatten_trajectories(*read_raw(CONVERTERS[task.source], folder, progress=progress))
     if data["observation"].shape[-1] != task.observation_dim or data["action"].shape[-1] != task.action_dim:
         raise DataError(
@@ -76,13 +75,31 @@ def open_dataset(
     return select_state(data, task.state_of), task
 
 
-def find_stored(source: str | Path) -> Path | None:
-    """Where a folder holds a data set of this library; None if it may hold D3IL's raw pickles.
+def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
+    """Finds the task of a data set: the one named, else the one that it holds or names; of raw pickles ``"avoiding"``.
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        DataError: if it holds recordings that are to be converted first.
+        ValueError: if none is named, the name is unknown, or the data set holds the definition of another task.
+        DataError: if the data set's task is damaged or names code, or the data are to be converted first.
     """
+    if dataset is None:
+        what = name or DEFAULT_TASK
+        raise ValueError(
+            f"no demonstrations to learn from: record some with `koap demos --task {what} --out DEMOS`, then"
+            f" `koap train --task {what} --dataset DEMOS --out RUN`"
+        )
+    folder = _find_stored(dataset)
+    if folder is None or name is not None and read_about(folder).get("definition") is None:
+        return get_task(name or DEFAULT_TASK)
+    own = stored_task(folder)
+    if name not in (None, own.name):
+        raise ValueError(f"dataset {str(dataset)!r} holds its own task {own.name!r}; --task {name} does not fit it")
+    return own
+
+
+def _find_stored(source: str | Path) -> Path | None:
+    """Where a folder holds a data set of this library; None if it may hold D3IL's raw pickles."""
     form = find_format(source)
     if form == "ted":
         return stored_folder(source)
@@ -100,28 +117,13 @@ def find_stored(source: str | Path) -> Path | None:
     return None
 
 
-def _fitting(stored: Path, task: Task | None) -> Task:
-    """The task that stored data are used for."""
-    name = read_about(stored)["task"]
-    if task is None:
-        return stored_task(stored)
-    if name not in (task.name, task.source):
-        raise DataError(stored, f"it holds demonstrations of {name!r}, wanted {task.source!r}")
-    return task
-
-
-def with_noise(data: TensorDictBase, columns: slice, sigma: float, *, seed: int = 0) -> TensorDictBase:
-    """Demonstrations as a noisy sensor would have recorded them: actions are untouched.
+def with_noise(data: TensorDictBase, columns: slice, sigma: float) -> TensorDictBase:
+    """Returns flat data ``[N]`` as a noisy sensor records them; ``sigma`` is its standard deviation in some columns.
 
     A frame has the same noise as the next observation of a step and as the observation of the step that follows it.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]``; not changed.
-        columns (slice): observation columns that are disturbed.
-        sigma (float): standard deviation of the noise, in the units of the columns.
-        seed (int): seed of the noise.
+    Actions are untouched.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     now, following = data["observation"].clone(), data["next", "observation"].clone()
     last = torch.ones(len(now), dtype=torch.bool)
     last[:-1] = data["episode"][1:] != data["episode"][:-1]

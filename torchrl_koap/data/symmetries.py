@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_koap.keys import ACTION, STATE
@@ -27,7 +27,7 @@ class RandomPlanarTransform(TensorDictModuleBase):
         turn (float): standard deviation of the angle (rad); the scene turns about the first point of the last frame
             observed. Defaults to ``0.3``.
         turned_actions (sequence of int, optional): action columns ``(x, y)`` of a displacement, turned with the scene.
-        history, key, action_key: as of :class:`~torchrl_koap.data.RecoveryAugmentation`.
+        history (int): observed frames of the window. Defaults to ``2``.
 
     Raises:
         ValueError: for a negative shift or turn.
@@ -52,20 +52,18 @@ class RandomPlanarTransform(TensorDictModuleBase):
         turn: float = 0.3,
         history: int = 2,
         turned_actions: Sequence[int] | None = None,
-        key: NestedKey = STATE,
-        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         if shift < 0 or turn < 0:
             raise ValueError(f"shift and turn must be >= 0, got {shift} and {turn}")
-        self.in_keys = self.out_keys = [key] if turned_actions is None else [key, action_key]
+        self.in_keys = self.out_keys = [STATE] if turned_actions is None else [STATE, ACTION]
         self.turned_actions = None if turned_actions is None else list(turned_actions)
         self.points, self.directions = [list(pair) for pair in points], [list(pair) for pair in directions]
         self.shift, self.turn, self.history = shift, turn, history
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by moved ones."""
-        state = tensordict.get(self.in_keys[0])
+        state = tensordict.get(STATE)
         kind = {"dtype": state.dtype, "device": state.device}
         angle = self.turn * torch.randn(state.shape[:-2], **kind)
         cosine, sine = angle.cos(), angle.sin()
@@ -78,10 +76,10 @@ class RandomPlanarTransform(TensorDictModuleBase):
         for pair in self.directions:
             moved[..., pair] = state[..., pair] @ turn
         if self.turned_actions is not None:
-            action = tensordict.get(self.in_keys[1]).clone()
+            action = tensordict.get(ACTION).clone()
             action[..., self.turned_actions] = action[..., self.turned_actions] @ turn
-            tensordict.set(self.in_keys[1], action)
-        return tensordict.set(self.in_keys[0], moved)
+            tensordict.set(ACTION, action)
+        return tensordict.set(STATE, moved)
 
 
 class ObjectPermutation(TensorDictModuleBase):
@@ -89,7 +87,6 @@ class ObjectPermutation(TensorDictModuleBase):
 
     Args:
         groups (sequence): for each kind of object the state columns of each of its instances, all of the same number.
-        key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
 
     Examples:
         >>> import torch
@@ -101,17 +98,17 @@ class ObjectPermutation(TensorDictModuleBase):
         [0.0, 2.0]
     """
 
-    def __init__(self, groups: Sequence[Sequence[Sequence[int]]], *, key: NestedKey = STATE):
+    def __init__(self, groups: Sequence[Sequence[Sequence[int]]]):
         super().__init__()
-        self.in_keys, self.out_keys = [key], [key]
+        self.in_keys = self.out_keys = [STATE]
         self.groups = [[list(columns) for columns in group] for group in groups]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by ones with exchanged columns."""
-        state = tensordict.get(self.in_keys[0])
+        state = tensordict.get(STATE)
         index = torch.arange(state.shape[-1], device=state.device).expand(*state.shape[:-2], -1).clone()
         for group in self.groups:
             columns = torch.tensor(group, device=state.device)  # [instances, columns]
             order = torch.rand(*state.shape[:-2], len(group), device=state.device).argsort(-1)
             index[..., columns.flatten()] = columns[order].flatten(-2)
-        return tensordict.set(self.in_keys[0], state.gather(-1, index.unsqueeze(-2).expand_as(state)))
+        return tensordict.set(STATE, state.gather(-1, index.unsqueeze(-2).expand_as(state)))

@@ -24,9 +24,9 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import DataError, read_bytes, replacing_folder, sha256_of
-from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.tasks.registry import plain_task
+from torchrl_koap.files import DataError, read_json, replacing_folder, sha256_of
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.registry import task_from
 
 FORMAT = 2
 _ABOUT, _STEPS = "about.json", "steps.safetensors"
@@ -52,7 +52,9 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     Examples:
         >>> import tempfile
         >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories, load_ted, read_about, save_ted
+        >>> from torchrl_koap.data import flatten_trajectories, save_ted
+        >>> from torchrl_koap.data.ted import load_ted
+        >>> from torchrl_koap.data.ted import read_about
         >>> from torchrl_koap.tasks import get_task
         >>> data = flatten_trajectories([torch.rand(4, 4), torch.rand(6, 4)], [torch.rand(3, 2), torch.rand(5, 2)])
         >>> with tempfile.TemporaryDirectory() as root:
@@ -72,7 +74,7 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     about = {
         "format": FORMAT,
         "task": task.name,
-        "definition": None if task.import_strings() else task.to_json(),
+        "definition": task.definition(),
         "trajectories": len(lengths),
         "steps": len(data),
         "lengths": lengths,
@@ -102,29 +104,18 @@ def stored_folder(folder: str | Path) -> Path | None:
 def read_about(folder: str | Path) -> dict[str, Any]:
     """Reads the description of a data set.
 
-    Args:
-        folder (str or Path): folder of the data set.
-
-    Returns:
-        dict: ``task``, ``definition`` (None of a task that is only named), ``trajectories``, ``steps``, ``lengths``,
-        ``labelled_steps``, ``notes``, and size and checksum of the steps.
+    It has ``task``, ``definition`` (None of a task that is only named), ``trajectories``, ``steps``, ``lengths``,
+    ``labelled_steps``, ``notes``, and size and checksum of the steps.
 
     Raises:
         DataError: if the folder holds no data set, or one in another format.
-
-    Examples:
-        >>> from torchrl_koap.data import read_about
-        >>> read_about("demos/ted")["labelled_steps"]  # doctest: +SKIP
-        8112
     """
     path = Path(folder) / _ABOUT
     try:
-        about = json.loads(read_bytes(path))
+        about = read_json(path)
     except FileNotFoundError:
         raise DataError(folder, f"it holds no data set ({_ABOUT} is missing)") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(path, str(error)) from error
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
+    if about.get("format") != FORMAT:
         raise DataError(path, f"it is no description of a data set in format {FORMAT}")
     kinds: dict[str, type] = dict.fromkeys(("trajectories", "steps", "labelled_steps", "bytes"), int)
     kinds |= {"task": str, "sha256": str, "lengths": list}
@@ -135,19 +126,15 @@ def read_about(folder: str | Path) -> dict[str, Any]:
 
 
 def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
-    """Reads a data set that :func:`save_ted` wrote, and the task that its data are of.
+    """Reads a data set that :func:`save_ted` wrote.
 
     A task that names code to import is refused: a folder that somebody sent must not decide what is run.
 
-    Args:
-        folder (str or Path): the folder.
-
     Returns:
-        tuple: flat data ``[N]``, and the task that the folder holds, or the registered one that it names.
+        tuple: flat data ``[N]``, and the task that they are of.
 
     Raises:
-        DataError: if files are missing, changed or damaged, or the task names code.
-        ValueError: if the task is only named, and nobody has registered it.
+        DataError: if files are missing, changed or damaged, or the task names code or is not registered.
 
     Examples:
         >>> from torchrl_koap.data import load_ted
@@ -160,30 +147,13 @@ def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
 def stored_task(folder: str | Path) -> Task:
     """Reads the task of a data set: the one that it holds, or the registered one that it names.
 
-    Args:
-        folder (str or Path): folder of the data set.
-
-    Returns:
-        Task: the task.
-
     Raises:
         DataError: if the folder holds no data set, or its task is damaged or names code.
         ValueError: if nobody has registered the task that it names.
-
-    Examples:
-        >>> import tempfile
-        >>> import numpy as np
-        >>> from torchrl_koap.data import save_demonstrations, stored_task
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     folder = save_demonstrations(root + "/arm", [np.zeros((9, 2))], control_hz=30, action_dim=7)
-        ...     stored_task(folder / "ted").action_dim
-        7
     """
     about = read_about(folder)
-    if about.get("definition") is None:
-        return get_task(about["task"])
     try:
-        return plain_task(about["definition"])
+        return task_from(about["task"], about.get("definition"))
     except ValueError as error:
         raise DataError(Path(folder) / _ABOUT, str(error)) from error
 

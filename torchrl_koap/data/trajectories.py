@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from torchrl_koap import keys
+
+_VELOCITY = 3  # steps whose mean is the last velocity
 
 
 def flatten_trajectories(
@@ -18,7 +20,6 @@ def flatten_trajectories(
     *,
     action_dim: int | None = None,
     dtype: torch.dtype = torch.float32,
-    first: int = 0,
 ) -> TensorDict:
     """Lays recorded trajectories one after the other in the storage layout.
 
@@ -34,7 +35,6 @@ def flatten_trajectories(
     Keyword Args:
         action_dim (int, optional): size of an action; needed where no trajectory has one.
         dtype (torch.dtype): floating type of the entries.
-        first (int): number of the first trajectory.
 
     Returns:
         TensorDict: flat data ``[sum(T_i - 1)]``.
@@ -58,9 +58,9 @@ def flatten_trajectories(
     if given is None and action_dim is None:
         raise ValueError("no trajectory has actions: action_dim is needed")
     width = (1, *given.shape)[-1] if action_dim is None else action_dim
-    for index, (frames, steps) in enumerate(zip(observations, actions, strict=True), first):
+    for index, (frames, steps) in enumerate(zip(observations, actions, strict=True)):
         if frames.ndim == 2 and steps is None:
-            actions[index - first] = steps = torch.full((max(len(frames) - 1, 0), width), torch.nan, dtype=dtype)
+            actions[index] = steps = torch.full((max(len(frames) - 1, 0), width), torch.nan, dtype=dtype)
         if frames.ndim != 2 or steps is None or steps.ndim != 2 or len(frames) < 2 or len(steps) != len(frames) - 1:
             raise ValueError(
                 f"trajectory {index}: wanted observations [T, obs] and actions [T - 1, act] with T >= 2,"
@@ -85,7 +85,7 @@ def flatten_trajectories(
             keys.OBSERVATION: torch.cat([frames[:-1] for frames in observations]).to(dtype),
             keys.ACTION: torch.cat(actions).to(dtype),
             keys.HAS_ACTION: ~torch.cat([steps.isnan().all(-1, keepdim=True) for steps in actions]),
-            keys.EPISODE: torch.arange(first, first + len(lengths)).repeat_interleave(torch.tensor(lengths)),
+            keys.EPISODE: torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths)),
             keys.STEP_COUNT: torch.cat([torch.arange(length) for length in lengths]),
             "next": {
                 "observation": torch.cat([frames[1:] for frames in observations]).to(dtype),
@@ -99,26 +99,12 @@ def flatten_trajectories(
 
 
 def mark_labels(data: TensorDictBase, *, action_dim: int | None = None) -> TensorDictBase:
-    """Adds ``has_action [N, 1]``: where ``action`` is there, and not NaN throughout a row.
+    """Adds ``has_action [N, 1]`` to flat data: where ``action`` is there, and not NaN throughout a row.
 
-    Args:
-        data (TensorDictBase): flat data ``[N]``, with or without ``action [N, act]``; not changed.
-
-    Keyword Args:
-        action_dim (int, optional): size of an action, needed where ``action`` is missing: NaN actions are added.
-
-    Returns:
-        TensorDictBase: a shallow copy of ``data`` with both entries.
+    A shallow copy is returned. Where ``action`` is missing, NaN actions of ``action_dim`` columns are added.
 
     Raises:
         ValueError: if there is no ``action`` and no ``action_dim``.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import mark_labels
-        >>> mark_labels(TensorDict({"action": torch.tensor([[1.0], [torch.nan]])}, [2]))["has_action"].flatten()
-        tensor([ True, False])
     """
     data, action = data.copy(), data.get(keys.ACTION, None)
     if action is None:
@@ -129,43 +115,8 @@ def mark_labels(data: TensorDictBase, *, action_dim: int | None = None) -> Tenso
 
 
 def trajectory_lengths(data: TensorDictBase) -> torch.Tensor:
-    """Number of steps of every trajectory, in the order in which they are stored.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]`` with ``episode``.
-
-    Returns:
-        Tensor: int64 ``[number of trajectories]``.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import trajectory_lengths
-        >>> trajectory_lengths(TensorDict({"episode": torch.tensor([4, 4, 4, 9])}, [4]))
-        tensor([3, 1])
-    """
+    """Number of steps of every trajectory of flat data, int64 ``[trajectories]``, in the order of the data."""
     return torch.unique_consecutive(data.get(keys.EPISODE), return_counts=True)[1]
-
-
-def select_trajectories(data: TensorDictBase, episodes: Sequence[int]) -> TensorDictBase:
-    """Selects the steps of some trajectories.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]``.
-        episodes (sequence of int): numbers of the trajectories.
-
-    Returns:
-        TensorDictBase: flat data ``[M]``, in the order of ``data``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories, select_trajectories
-        >>> data = flatten_trajectories([torch.zeros(5, 2)] * 3, [torch.zeros(4, 1)] * 3)
-        >>> select_trajectories(data, [0, 2])["episode"].unique()
-        tensor([0, 2])
-    """
-    episode = data[keys.EPISODE]
-    return data[torch.isin(episode, torch.as_tensor(list(episodes), device=episode.device))]
 
 
 def select_state(
@@ -227,19 +178,15 @@ def controller_view(data: TensorDictBase, columns: Sequence[int], *, targets: Se
     return view.set(keys.STATE, state[..., list(columns)])
 
 
-def extrapolate_ends(data: TensorDictBase, frames: int, *, key: NestedKey = keys.STATE, over: int = 3) -> TensorDict:
+def extrapolate_ends(data: TensorDictBase, frames: int) -> TensorDict:
     """Continues every trajectory at its last mean velocity, so that a plan made near the end has a future.
 
     Args:
-        data (TensorDictBase): flat data ``[N]`` with states ``[N, d]`` and ``episode``.
+        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``.
         frames (int): frames to append to each trajectory.
 
-    Keyword Args:
-        key (NestedKey): states. Defaults to ``"state"``.
-        over (int): steps whose mean is the velocity. Defaults to ``3``.
-
     Returns:
-        TensorDict: ``key`` and ``episode``, flat ``[N + trajectories * frames]``.
+        TensorDict: ``state`` and ``episode``, flat ``[N + trajectories * frames]``.
 
     Examples:
         >>> import torch
@@ -251,11 +198,11 @@ def extrapolate_ends(data: TensorDictBase, frames: int, *, key: NestedKey = keys
     """
     lengths = trajectory_lengths(data).tolist()
     states, episodes = [], []
-    for state, episode in zip(data.get(key).split(lengths), data.get(keys.EPISODE).split(lengths), strict=True):
-        steps = min(over, len(state) - 1)
+    for state, episode in zip(data.get(keys.STATE).split(lengths), data.get(keys.EPISODE).split(lengths), strict=True):
+        steps = min(_VELOCITY, len(state) - 1)
         velocity = (state[-1] - state[-1 - steps]) / max(steps, 1)
         ahead = torch.arange(1, frames + 1, dtype=state.dtype, device=state.device)[:, None]
         states.append(torch.cat([state, state[-1] + ahead * velocity]))
         episodes.append(episode[:1].expand(len(state) + frames))
     states = torch.cat(states)
-    return TensorDict({key: states, keys.EPISODE: torch.cat(episodes)}, batch_size=[len(states)])
+    return TensorDict({keys.STATE: states, keys.EPISODE: torch.cat(episodes)}, batch_size=[len(states)])

@@ -22,21 +22,9 @@ from torchrl_koap.keys import PADDED
 
 
 class WindowUnit(SampleUnit):
-    """Turns numbers of windows ``[B]`` into storage indices ``[B, T]``.
+    """Turns numbers of windows ``[B]`` into storage indices ``[B, T]``, by :meth:`WindowTable.frames`.
 
-    Args:
-        frames (callable): from numbers to indices and bool ``[B, T]``, which of them are padded
-            (:meth:`WindowTable.frames`).
-        padded (bool): hand the latter out as the entry ``padded`` of the sample's info.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import WindowTable, WindowUnit, flatten_trajectories
-        >>> table = WindowTable.build(flatten_trajectories([torch.rand(6, 2)], [torch.rand(5, 1)]), 3, pad_before=1)
-        >>> index, info = WindowUnit(table.frames, padded=True).expand(torch.tensor([0, 3]), {}, None)
-        >>> index, info["padded"].any(-1)
-        (tensor([[0, 0, 1],
-                [2, 3, 4]]), tensor([ True, False]))
+    With ``padded`` bool ``[B, T]``, which of them are padded, is the entry ``padded`` of the sample's info.
     """
 
     def __init__(self, frames: Callable[[Tensor], tuple[Tensor, Tensor]], *, padded: bool = False):

@@ -11,7 +11,7 @@ place is taken by the first or last step::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -61,15 +61,11 @@ class WindowTable:
     def build(
         cls, data: TensorDictBase, window: int, *, history: int = 2, pad_before: int = 0, pad_after: int = 0
     ) -> WindowTable:
-        """Tabulates the windows of flat data.
+        """Tabulates the windows of ``window`` frames of flat data ``[N]``.
 
-        Args:
-            data (TensorDictBase): flat data ``[N]`` with ``episode``; ``step_count`` and ``has_action`` are used if
-                they are there.
-            window (int): frames per window.
-            history (int): frames up to and including "now", ``1 .. window - 1``; tells which frames' labels count.
-            pad_before (int): frames by which a window may begin before its trajectory (the first frame is repeated).
-            pad_after (int): frames by which a window may end after its trajectory (the last frame is repeated).
+        The data have ``episode``; ``step_count`` and ``has_action`` are used if they are there. Windows may begin
+        before their trajectory by ``pad_before`` frames and end behind it by ``pad_after``, which repeat its first and
+        last step. Of labels those of frames from ``history - 1`` on count, ``1 <= history < window``.
 
         Raises:
             ValueError: if an argument is out of range, or a trajectory is too short.
@@ -167,7 +163,6 @@ def make_window_buffer(
     labelled_share: float | None = None,
     pad_before: int = 0,
     pad_after: int = 0,
-    transform: Callable[[TensorDictBase], TensorDictBase] | None = None,
 ) -> ReplayBuffer:
     """Makes a replay buffer of windows over flat data.
 
@@ -179,7 +174,6 @@ def make_window_buffer(
         select (sequence of keys, optional): the entries to return; the fewer the faster. Default: all.
         labelled_share (float, optional): see :class:`WindowSampler`.
         pad_before, pad_after (int): see :meth:`WindowTable.build`.
-        transform (callable, optional): what every batch undergoes, such as an augmentation.
 
     Returns:
         ReplayBuffer: samples are tensordicts ``[batch_size, window]``. With padding, a
@@ -219,7 +213,6 @@ def make_window_buffer(
         sample_unit=WindowUnit(table.frames, padded=padded),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
-        transform=transform,
     )
 
 

@@ -70,7 +70,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     check_options(config)
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
-    trained = Trained.load(writable_folder(run, config.out)).with_ranges(config.dataset)
+    trained = Trained.load(writable_folder(run, config.out))
     directory, task = RunDirectory(trained.folder), trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)

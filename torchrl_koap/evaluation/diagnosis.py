@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.rollouts import device_of, roll_out
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, StatePlanner

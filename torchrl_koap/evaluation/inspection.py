@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import controller_view, trajectory_lengths
+from torchrl_koap.data import controller_view
+from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.closed_loop import find_environment
 from torchrl_koap.evaluation.config import RolloutConfig, check_rollouts
 from torchrl_koap.evaluation.diagnosis import (
@@ -33,7 +34,6 @@ from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.datasets import label_budget
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
 
@@ -165,7 +165,7 @@ def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) ->
         return {"note": f"method {trained.config.method!r} has no latent actions to look into"}
     labelled = torch.zeros(len(data), dtype=torch.bool)
     if config.dataset is None:
-        labelled = label_budget(trained.config).apply(data)[0]["has_action"].squeeze(-1)
+        labelled = trained.config.labels.budget(trained.config.run.seed).apply(data)[0]["has_action"].squeeze(-1)
     columns = trained.columns
     parts = {
         name: [place for place, column in enumerate(columns) if part.start <= column < part.stop]

@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import cut_windows, trajectory_lengths
+from torchrl_koap.data import cut_windows
+from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, unit_circle_sides
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics

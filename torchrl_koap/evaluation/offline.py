@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import controller_view, select_trajectories
+from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.loop_on_labels import check_loop
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.training.datasets import split_held_out
 
 if TYPE_CHECKING:
     from torchrl_koap.evaluation.config import EvalConfig
@@ -95,7 +96,7 @@ def _plans(trained: Trained, data: TensorDictBase, **options: Any) -> dict[str, 
         return {"note": f"method {trained.config.method!r} samples actions: it makes no plans"}
     if not trained.held_out:
         return {"note": "no trajectory was held out from the planner (--planner.held-out; two trajectories at least)"}
-    unseen = select_trajectories(data, trained.held_out)
+    _, unseen, _ = split_held_out(data, trained.held_out)
     return {"trajectories": len(trained.held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.evaluation.statistics import expected_entropy
-from torchrl_koap.files import read_bytes
-from torchrl_koap.tasks import Modes, Task, task_from_config
+from torchrl_koap.files import read_json
+from torchrl_koap.tasks import Modes, Task
+from torchrl_koap.tasks.registry import task_from
 
 
 def number(value: Any) -> float | int | None:
@@ -59,7 +59,7 @@ class RunFacts:
             files[key], wrong = _read(path) if path.exists() else ({}, "")
             damaged += [wrong] if wrong else []
         try:
-            task = task_from_config(files["config"])
+            task = task_from(files["config"]["task"], files["config"].get("task_definition"))
         except (ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
             task = None
         return cls(folder, task, damaged=tuple(damaged), **files)
@@ -133,9 +133,6 @@ class RunFacts:
 def _read(path: Path) -> tuple[dict[str, Any], str]:
     """Returns the content of a JSON file, empty if it is damaged, and what was wrong."""
     try:
-        content = json.loads(read_bytes(path))
-    except (OSError, ValueError, RecursionError) as error:
-        return {}, f"{path} is damaged: {error}"
-    if not isinstance(content, dict):
-        return {}, f"{path} is damaged: wanted an object, got {type(content).__name__}"
-    return content, ""
+        return read_json(path), ""
+    except (OSError, ValueError) as error:
+        return {}, str(error)

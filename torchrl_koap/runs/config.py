@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.data import LabelBudget
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.device import PRECISIONS, check_machine
@@ -17,7 +18,6 @@ from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import HISTORY
 
 COLUMNS = ("robot", "all")
-UNITS = ("trajectory", "window", "transition")
 
 
 @dataclass(frozen=True)
@@ -47,16 +47,13 @@ class LabelConfig:
     trajectories: float = 1.0
 
     def __post_init__(self):
-        lookup(UNITS, self.unit, "unit of labels")
-        _check("labels", self, fraction=(0, 1, False, True), count=(1, None), trajectories=(0, 1, False, True))
-        asked = [name for name in ("fraction", "count") if getattr(self, name) is not None]
-        asked += ["episodes"] if self.episodes else []
-        if len(asked) > 1:
-            raise ValueError(f"labels: give one of fraction, count and episodes, got {' and '.join(asked)}")
-        if self.episodes and self.unit != "trajectory":
-            raise ValueError(f"labels.episodes are trajectories of your own choice: no labels.unit {self.unit!r}")
-        if len(set(self.episodes)) < len(self.episodes):
-            raise ValueError(f"labels.episodes must be different numbers, got {list(self.episodes)}")
+        self.budget()
+        _check("labels", self, trajectories=(0, 1, False, True))
+
+    def budget(self, seed: int = 0) -> LabelBudget:
+        """Makes the budget that draws and hides."""
+        drawn: dict[str, Any] = {"episodes": self.episodes or None, "unit": self.unit}
+        return LabelBudget(fraction=self.fraction, count=self.count, seed=seed, **drawn)
 
 
 @dataclass(frozen=True)

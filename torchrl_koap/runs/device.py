@@ -20,10 +20,6 @@ _BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat1
 def find_precision(precision: str, device: str | torch.device = "cpu") -> str:
     """Says what "auto" means on a device: "bfloat16" where it has units for it, else "float32".
 
-    Args:
-        precision (str): "float32", "bfloat16" or "auto".
-        device (str or torch.device, optional): where the training runs. Default: "cpu".
-
     Raises:
         ValueError: for another precision.
 

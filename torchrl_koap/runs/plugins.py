@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
-import importlib.util
 import os
 import sys
 from collections.abc import Sequence
@@ -50,21 +48,3 @@ def _load(name: str) -> None:
             places = dict.fromkeys(path or os.getcwd() for path in [os.getcwd(), *sys.path])
             raise PluginError(f"there is no plugin {name!r}; looked for it in {', '.join(places)}") from error
         raise PluginError(f"plugin {name!r} failed when it was imported: {type(error).__name__}: {error}") from error
-
-
-def load_entry_points(group: str) -> None:
-    """Imports what installed packages announce in an entry-point group, such as ``"torchrl_koap.methods"``.
-
-    The value of an entry is a module, or an object in one; importing it registers what it holds.
-
-    Raises:
-        PluginError: if an entry cannot be imported; the message names the entry and the group.
-    """
-    for entry in importlib.metadata.entry_points(group=group):
-        try:
-            entry.load()
-        except Exception as error:
-            raise PluginError(
-                f"entry point {entry.name!r} of group {group!r} ({entry.value}) failed when it was imported:"
-                f" {type(error).__name__}: {error}"
-            ) from error

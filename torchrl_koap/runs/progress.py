@@ -89,8 +89,13 @@ def without_progress_bars() -> Iterator[None]:
 
 
 def count_up_to(bar: tqdm) -> Callable[..., None]:
-    """A function that moves a bar to the number it is called with first, whatever else it is told."""
-    return lambda done, *rest: bar.update(done - bar.n) and None
+    """A function that moves a bar to the number it is called with first, of as many as it is told."""
+
+    def move(done: int, total: int | None = None, *rest: Any) -> None:
+        bar.total = bar.total if total is None else total
+        bar.update(done - bar.n)
+
+    return move
 
 
 def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:

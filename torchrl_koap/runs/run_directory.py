@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.files import LockedError, check_file, one_at_a_time, read_bytes, replacing_file
+from torchrl_koap.files import DataError, LockedError, check_file, one_at_a_time, read_json, replacing_file
 from torchrl_koap.lookup import lookup
 
 PREFIX = "pretrained:"
@@ -53,14 +53,9 @@ class RunDirectory:
         if not path.exists():
             raise RunDirectoryError(f"{path} is missing: is {self.path} the folder of a finished `koap train`?")
         try:
-            content = json.loads(read_bytes(path).decode())
-        except (ValueError, RecursionError) as error:
-            raise RunDirectoryError(f"{path} is damaged: {error}") from error
-        except OSError as error:
-            raise RunDirectoryError(f"{path} cannot be read: {error}") from error
-        if not isinstance(content, dict):
-            raise RunDirectoryError(f"{path} is damaged: expected an object, got {type(content).__name__}")
-        return content
+            return read_json(path)
+        except DataError as error:
+            raise RunDirectoryError(f"{path} is damaged: {error.problems[0]}") from error
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``: the values (losses, learning rate, speed) after a step of a phase.

@@ -32,15 +32,9 @@ def save_weights(path: str | Path, module: nn.Module, about: Mapping[str, Any]) 
 
 
 def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any]) -> dict[str, Any]:
-    """Loads weights into a module of the same architecture.
+    """Loads weights into a module of the same architecture; returns the facts in the header.
 
-    Args:
-        path (str or Path): the file.
-        module (nn.Module): receives the weights.
-        expected (mapping): facts that its header must hold: the task, and the options that build the module.
-
-    Returns:
-        dict: the facts in the header.
+    ``expected`` are facts that it must hold: the task, and the options that build the module.
 
     Raises:
         CheckpointError: if the file is missing or damaged, belongs to another task or other options, lacks entries (a

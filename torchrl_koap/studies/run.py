@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import flatten_trajectories, save_ted, subsample_trajectories
+from torchrl_koap.data import flatten_trajectories, open_dataset, save_ted
+from torchrl_koap.data.label_budget import subsample_trajectories
 from torchrl_koap.runs.config_files import changed_options, from_json, to_json
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
@@ -23,7 +24,6 @@ from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
 from torchrl_koap.studies.table import CELL_COLUMNS, write_csv
 from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.training.datasets import label_budget, load_demonstrations
 
 _FILE = "study.json"
 # what a later call may add to; all else must be as it was
@@ -148,7 +148,7 @@ def _first_look(study: Study, task: Task) -> TensorDictBase | None:
     """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
     folder = study.dataset_folder(task.name)
     if study.given_dataset(task.name) is not None or (folder / "ted").exists():
-        return load_demonstrations(str(folder), task)
+        return open_dataset(folder, task=task)[0]
     if task.env is None:
         raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name --datasets")
     if study.label_unit != "trajectory":
@@ -168,7 +168,7 @@ def _record(study: Study, cells: Sequence[Cell], name: str) -> None:
     with progress_bar(episodes, "demonstrations", unit="episode") as bar:
         data, _ = record_demonstrations(name, episodes, 0, progress=count_up_to(bar))
     save_ted(data, folder / "ted", get_task(task.source))
-    _check_labels(study, cells, name, load_demonstrations(str(folder), task))
+    _check_labels(study, cells, name, open_dataset(folder, task=task)[0])
 
 
 def _check_labels(study: Study, cells: Sequence[Cell], task: str, data: TensorDictBase | None) -> None:
@@ -178,7 +178,7 @@ def _check_labels(study: Study, cells: Sequence[Cell], task: str, data: TensorDi
     # windows of another seed lie in another number of trajectories
     wanted = {(cell.labels, cell.demonstrations, cell.seed): cell for cell in cells if cell.task == task}
     for cell in wanted.values():
-        labelled, _ = label_budget(study.train_config(cell)).apply(data)
+        labelled, _ = study.train_config(cell).labels.budget(cell.seed).apply(data)
         subsample_trajectories(labelled, cell.demonstrations)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.data.sources import DEFAULT_TASK, find_task_of
 from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.closed_loop import find_environment
 from torchrl_koap.evaluation.config import check_options
@@ -20,14 +21,12 @@ from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.studies.cells import NOISE_STEP, Cell
 from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.trained import build_networks
 from torchrl_koap.vision import Observer
 from torchrl_koap.vision.projection import cameras_of
 
-DEFAULT_TASK = "avoiding"
 PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
 # options of a Study by name, those of its sections in mappings of their own
 USUAL: dict[str, Any] = {

@@ -4,7 +4,7 @@
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.columns import Columns
 from torchrl_koap.tasks.modes import Modes
-from torchrl_koap.tasks.registry import TASKS, get_task, register_task, task_from_config
+from torchrl_koap.tasks.registry import TASKS, get_task, register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Defaults, Task
 
@@ -32,5 +32,4 @@ __all__ = [
     "scooping",
     "sorting",
     "stacking",
-    "task_from_config",
 ]

@@ -142,6 +142,13 @@ class Columns:
         return tuple(name for part, kind in self.state_parts.items() for name in self._feature_names(part, kind))
 
     @property
+    def known_units(self) -> tuple[str, ...]:
+        """Unit of every observation column; where a task says none, metres of parts that are called positions."""
+        parts = {part: range(self.observation_dim)[columns] for part, columns in self.observation.items()}
+        metres = [part.endswith(("_xy", "_xyz", "_position")) for part, columns in parts.items() for _ in columns]
+        return self.observation_units or tuple("m" if metre else "" for metre in metres)
+
+    @property
     def state_units(self) -> tuple[str, ...]:
         """Unit of every state column: that of its observation column where the part is unchanged, else ``""``."""
         given = self.observation_units or ("",) * self.observation_dim

@@ -3,16 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from importlib.metadata import entry_points
-from typing import Any
-
-from torchrl_koap.lookup import lookup
+from torchrl_koap.lookup import entry_points_of, lookup
 from torchrl_koap.tasks.task import Task
 
 GROUP = "torchrl_koap.tasks"
 TASKS: dict[str, Task] = {}
-_loaded = False
 
 
 def register_task(task: Task) -> Task:
@@ -64,56 +59,27 @@ def get_task(name: Task | str) -> Task:
     if isinstance(name, Task):
         return name
     if not (isinstance(name, str) and name in TASKS):
-        load_entry_points()
+        for found in entry_points_of(GROUP):
+            if isinstance(found, Task):
+                register_task(found)
     return lookup(TASKS, name, "task")
 
 
-def task_from_config(config: Mapping[str, Any]) -> Task:
-    """Finds the task of a run by the content of its ``config.json``.
-
-    Returns:
-        Task: the one that the mapping defines, else the registered one of that name.
-
-    Raises:
-        ValueError: if the task that it defines is damaged or names code, or nobody has registered it.
-
-    Examples:
-        >>> from torchrl_koap.tasks.registry import task_from_config
-        >>> task_from_config({"task": "avoiding"}).state_dim
-        2
-    """
-    definition = config.get("task_definition")
-    return get_task(config["task"]) if definition is None else plain_task(definition)
-
-
-def plain_task(entries: object) -> Task:
-    """Reads the task that a data set or run brings along, as :meth:`Task.to_json` wrote it.
+def task_from(name: str, definition: object) -> Task:
+    """Finds the task of a data set or run: the one that it brings along, as :meth:`Task.to_json` wrote it, or names.
 
     A folder that somebody sent must not decide what is run.
 
     Raises:
-        ValueError: if the entries are damaged, or name code to import.
+        ValueError: if the definition is damaged or names code, or there is none and nobody has registered the name.
     """
+    if definition is None:
+        return get_task(name)
     try:
-        task = Task.from_json(entries)
+        task = Task.from_json(definition)
         code = task.import_strings()
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise ValueError(f"the task is damaged: {error}") from error
     if code:
         raise ValueError(f"task {task.name!r} names code in {', '.join(code)}; register it by --plugin instead")
     return task
-
-
-def load_entry_points() -> None:
-    """Imports what installed packages name in the entry-point group ``torchrl_koap.tasks``, once."""
-    global _loaded
-    if _loaded:
-        return
-    _loaded = True
-    for point in entry_points(group=GROUP):
-        try:
-            found = point.load()
-        except Exception as error:
-            raise RuntimeError(f"entry point {point.name!r} = {point.value!r} of {GROUP!r} failed: {error}") from error
-        if isinstance(found, Task):
-            register_task(found)

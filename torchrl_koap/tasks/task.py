@@ -312,6 +312,10 @@ class Task(Columns):
         """
         return {name: _plain(value, name) for name, value in asdict(self).items()}
 
+    def definition(self) -> dict[str, Any] | None:
+        """Returns the task as data sets and runs keep it; None if it names code, so that its name has to do."""
+        return None if self.import_strings() else self.to_json()
+
     @classmethod
     def from_json(cls, entries: object) -> Task:
         """Reads the task that :meth:`to_json` wrote.
@@ -319,7 +323,7 @@ class Task(Columns):
         Raises:
             ValueError: for an unknown or missing entry, or facts that do not fit each other.
         """
-        return dataclass_from_json(cls, entries, "task")
+        return dataclass_from_json(cls, entries)
 
 
 def _plain(value: Any, place: str) -> Any:

@@ -10,10 +10,7 @@ _MODULES = {
     "Phase": "torchrl_koap.training.method",
     "Trained": "torchrl_koap.training.trained",
     "fit": "torchrl_koap.training.in_memory",
-    "get_method": "torchrl_koap.training.methods",
-    "load_demonstrations": "torchrl_koap.training.datasets",
     "register_method": "torchrl_koap.training.methods",
-    "resolve": "torchrl_koap.training.defaults",
     "train": "torchrl_koap.training.on_disk",
     "TrainConfig": "torchrl_koap.runs.config",
 }

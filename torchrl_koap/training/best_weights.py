@@ -24,16 +24,6 @@ class BestWeights(nn.Module):
         loss (LossModule): a loss of ``network`` with ``target_network_params``.
         score (callable): ``score(network)`` on held-out trajectories; smaller is better.
         every (int): updates between two scores.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
-        >>> from torchrl_koap.objectives import PlannerLoss
-        >>> from torchrl_koap.training.best_weights import BestWeights
-        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
-        >>> best = BestWeights(PlannerLoss(planner), lambda network: 0.5, every=100)
-        >>> best.check(100), best.step.item()
-        ({'held_out_score': 0.5, 'best_held_out_score': 0.5, 'kept_update': 100}, 100)
     """
 
     best: torch.Tensor

@@ -36,14 +36,6 @@ def axes_of(task: Task, columns: Sequence[int]) -> dict[str, Any]:
     """Finds the column of those read that each action moves; for a robot that came with data alone, the likely one.
 
     ``axes`` are empty where nothing is known or likely; ``guessed`` tells a likely one from a known one.
-
-    Examples:
-        >>> from torchrl_koap.tasks import Action, Task, get_task
-        >>> from torchrl_koap.training.closed_form import axes_of
-        >>> parts, actions = {"goal": 2, "q": 2}, {"a": Action("rad"), "b": Action("rad")}
-        >>> arm = Task(name="arm", observation_parts=parts, actions=actions, position="q", robot=(2, 3))
-        >>> axes_of(arm, (2, 3)), axes_of(get_task("avoiding"), (0, 1))
-        ({'axes': [0, 1], 'guessed': True}, {'axes': [0, 1], 'guessed': False})
     """
     known = task.moved_columns()
     if known:

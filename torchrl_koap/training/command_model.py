@@ -14,6 +14,7 @@ from torchrl_koap.modules import CommandDecoder
 from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
+from torchrl_koap.training.policy_facts import check_commanded
 
 LABEL_COMMAND = "label_command"  # last commands at labelled steps [N, J], NaN elsewhere
 SHARE = 16  # updates for each of another controller's, up to UPDATES
@@ -26,25 +27,11 @@ def build_decoder(task: Task) -> CommandDecoder:
     Raises:
         ValueError: if its observation does not repeat the last command, no action is a change of it, or nothing tells
             the others.
-
-    Examples:
-        >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.training.command_model import build_decoder
-        >>> build_decoder(get_task("stacking_unobserved_joints")).commands
-        [0, 1, 2, 3, 4, 5, 6]
     """
-    if task.command is None:
-        raise ValueError(
-            f"task {task.name!r} cannot have its commands regressed: its observation has no part that repeats the last"
-            " one (Task.command)"
-        )
-    actions, gripper = list(task.delta_actions), gripper_columns(task)
-    if not actions:
+    actions = list(task.delta_actions)
+    if task.command is not None and not actions:
         raise ValueError(f"task {task.name!r} needs no commands regressed: its actions are commands, not their changes")
-    rest = set(range(task.action_dim)) - set(actions) - {gripper[0] if gripper else None}
-    if rest:
-        names = ", ".join(task.action_names[column] for column in sorted(rest))
-        raise ValueError(f"task {task.name!r} cannot have its commands regressed: nothing tells the actions {names}")
+    check_commanded(task, "cannot have its commands regressed", actions, gripper_columns(task))
     repeated = list(range(task.observation_dim))[task.command_columns]
     commands, pairs = [repeated[i] for i in actions], task.relative_columns()
     features = RelativePositionFeatures(pairs) if pairs else None
@@ -82,10 +69,9 @@ def fit_decoder(decoder: CommandDecoder, data: TensorDictBase, *, updates: int =
     Commands are those of :data:`LABEL_COMMAND` where it is there (:func:`with_label_commands`), else those of the
     observation, which the budget leaves in trajectories that are labelled throughout.
 
-    Returns:
-        dict: ``labels_used``; ``commands_told``, how many of them told a command that the budget blanks because it is
-        the sum of actions some of which are hidden; and ``fit_error``: root mean square over the labels used, in the
-        unit of the commands.
+    Returned are ``labels_used``; ``commands_told``, how many of them told a command that the budget blanks because it
+    is the sum of actions some of which are hidden; and ``fit_error``: root mean square over the labels used, in the
+    unit of the commands.
 
     Raises:
         ValueError: if no labelled step has a known command.

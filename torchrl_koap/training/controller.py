@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,11 +14,10 @@ from torchrl_koap.data import controller_view, cut_windows, extrapolate_ends, ma
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
-from torchrl_koap.runs.progress import progress_bar, show_losses
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
-from torchrl_koap.training.loop import moving_average, train_phase
+from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import LABELLED_SHARES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
@@ -31,14 +29,14 @@ _KEYS = ["state", "action", "has_action"]
 
 
 def learn_controller(
-    task: Task, config: TrainConfig, data: TensorDictBase, *, run: RunDirectory | None = None, logger: Any = None
+    task: Task, config: TrainConfig, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any]]:
     """Builds and trains what turns states into actions, from flat data ``[N]`` after the label budget was applied.
 
-    Metrics and checkpoints go to the run, if there is one. Beside the module stand, for the summary, the last losses
-    ``controller``, ``controller_updates``, what a closed form found ``decoder_fit`` and the ``command_ranges``.
+    Beside the module stand, for the summary, the last losses ``controller``, ``controller_updates``, what a closed form
+    found ``decoder_fit`` and the ``command_ranges``.
     """
-    method, loop = get_method(config.method), _Loop(config, run, logger)
+    method, before = get_method(config.method), loop.updates
     ranges = command_ranges(task, data)  # of labels, not of what a teacher says
     if method.teacher:
         data = _relabelled(task, config, get_method(method.teacher), data, loop)
@@ -52,35 +50,10 @@ def learn_controller(
         module, losses = _train_sampler(task, config, method, data, loop)
     return module, {
         "controller": losses,
-        "controller_updates": loop.updates,
+        "controller_updates": loop.updates - before,
         "decoder_fit": fit,
         "command_ranges": ranges,
     }
-
-
-@dataclass
-class _Loop:
-    """Runs phases with the options of a run, and counts their updates."""
-
-    config: TrainConfig
-    run: RunDirectory | None
-    logger: Any
-    updates: int = 0
-
-    def __call__(self, name: str, loss: nn.Module, sample: Callable, *, num_steps: int, **settings) -> dict[str, float]:
-        self.updates += num_steps
-        with progress_bar(num_steps, name, smoothing=0.05, mininterval=0.5) as bar:
-            return train_phase(
-                name,
-                loss,
-                sample,
-                num_steps=num_steps,
-                run=self.run,
-                logger=self.logger,
-                resume=self.config.run.resume,
-                progress=show_losses(bar),
-                **settings,
-            )
 
 
 def _view(task: Task, config: TrainConfig, data: TensorDictBase) -> TensorDictBase:
@@ -89,7 +62,7 @@ def _view(task: Task, config: TrainConfig, data: TensorDictBase) -> TensorDictBa
 
 
 def _train_network(
-    task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: _Loop
+    task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
     """A controller's phases, and its closed form if it has one."""
     data, budget = _view(task, config, data), config.controller.steps
@@ -101,12 +74,7 @@ def _train_network(
         windows = windows[windows["has_action"].squeeze(-1).any(-1)]
     losses: dict[str, float] = {}
     with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        controller.prepare(windows["state"], updates=budget if method.phases else 0, progress=progress)
+        controller.prepare(windows["state"], updates=budget if method.phases else 0, progress=count_up_to(bar))
     for phase in method.phases if budget else ():
         buffer = make_window_buffer(
             data, window, BATCH_SIZE, select=_KEYS, pad_before=history, labelled_share=LABELLED_SHARES[phase.windows]
@@ -128,7 +96,7 @@ def _train_network(
 
 
 def _train_sampler(
-    task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: _Loop
+    task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, float]]:
     """A network that samples actions, with the updates that a planner would have."""
     (phase,) = method.phases
@@ -165,7 +133,7 @@ def _train_sampler(
     return sampler, losses
 
 
-def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDictBase, loop: _Loop) -> TensorDictBase:
+def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDictBase, loop: Phases) -> TensorDictBase:
     """The data with the teacher's actions where there is no label."""
     phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
     controller, _, _ = _train_network(task, config, replace(teacher, phases=phases), data, loop)

@@ -30,26 +30,12 @@ Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 def resolve(config: TrainConfig, task: Task) -> TrainConfig:
     """Looks every name up and fills every default in, in one pass; plugins must have been imported.
 
-    Args:
-        config (TrainConfig): what is asked for.
-        task (Task): the task, registered or not.
-
-    Returns:
-        TrainConfig: of its options none is None but ``planner.source`` and the two ways to draw labels that are not
-        used.
+    Of the options that are returned none is None but ``planner.source`` and the two ways to draw labels that are not
+    used.
 
     Raises:
         ValueError: for unknown names, and options that exclude each other.
         RunDirectoryError: if ``planner.source`` is no run.
-
-    Examples:
-        >>> from torchrl_koap import ControllerConfig, TrainConfig
-        >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.training import resolve
-        >>> config = TrainConfig(out="run", method="linear", controller=ControllerConfig(columns="all"))
-        >>> config = resolve(config, get_task("avoiding"))
-        >>> config.planner.steps, config.planner.network, config.controller.columns, config.execution.strategy
-        (5000, 'unet', 'all', 'feedback')
     """
     method = get_method(config.method or task.defaults.method)
     labels = config.labels

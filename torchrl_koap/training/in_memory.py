@@ -17,15 +17,17 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap import keys
-from torchrl_koap.data import mark_labels, select_state, select_trajectories
+from torchrl_koap.data import select_state
+from torchrl_koap.data.trajectories import mark_labels
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.runs.progress import without_progress_bars
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training.controller import learn_controller
-from torchrl_koap.training.datasets import choose_held_out, without_held_out
+from torchrl_koap.training.datasets import choose_held_out, split_held_out
 from torchrl_koap.training.defaults import resolve
+from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import sizes_of
 from torchrl_koap.training.planner import learn_planner
@@ -115,17 +117,16 @@ def fit(
     held_out = choose_held_out(data, config.planner.held_out, seed=seed)
     if not data[keys.HAS_ACTION].any():
         raise ValueError(f"none of the {len(data)} steps has an action: there are no labels to learn from")
-    data, results = data.to(device), dict[str, Any]()
+    seen, unseen, data = split_held_out(data.to(device), held_out)
+    results = dict[str, Any]()
     plans = get_method(config.method).plans
     if shared is not None and not plans:
         raise ValueError(f"planner: method {config.method!r} samples actions and has no planner")
     with _seeded(seed, device, progress):
         if plans and shared is None and planner is not False:
-            seen, unseen = without_held_out(data, held_out), select_trajectories(data, held_out) if held_out else None
-            shared, results["planner"] = learn_planner(task, config, seen, held_out=unseen)
+            shared, results["planner"] = learn_planner(task, config, seen, Phases(), held_out=unseen)
         torch.manual_seed(seed)
-        data = without_held_out(data, held_out, keep_labelled=True)
-        module, found = learn_controller(task, config, data)
+        module, found = learn_controller(task, config, data, Phases())
     return Trained(
         task, config, None if shared is None else shared.eval(), module.eval(), results | found, tuple(held_out)
     )

@@ -8,6 +8,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
+from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError
 from torchrl_koap.training.best_weights import BestWeights
@@ -27,13 +29,7 @@ SETTLED = 100  # updates before which the second moment says little
 
 
 def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
-    """Share of the peak learning rate at an update, from 0 on: linear warm-up, then half a cosine to 0.
-
-    Examples:
-        >>> from torchrl_koap.training.loop import warmup_cosine
-        >>> [round(warmup_cosine(step, 100, 10), 2) for step in (0, 9, 50, 99)]
-        [0.1, 0.98, 0.5, 0.0]
-    """
+    """Share of the peak learning rate at an update, from 0 on: linear warm-up, then half a cosine to 0."""
     return min(1.0, (step + 1) / max(warmup, 1)) * 0.5 * (1 + math.cos(math.pi * step / num_steps))
 
 
@@ -83,13 +79,11 @@ def train_phase(
         learning_rate (float): peak of :func:`warmup_cosine`.
         weight_decay (float): decoupled weight decay.
         warmup (int): updates of warm-up.
-        decay (bool): let the learning rate fall to 0 after the warm-up; otherwise it stays. Defaults to True.
+        decay (bool): let the learning rate fall to 0 after the warm-up; otherwise it stays.
         target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
         best (BestWeights, optional): scores the averages, keeps the best and ends the training early.
-        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
-        logger (optional): a TorchRL logger; scalars are named ``phase/term``, a row every ``log_every`` updates.
-        checkpoint_every (int, optional): updates per checkpoint. Default: 500.
-        resume (bool): go on from the checkpoint of this phase, if there is one, on a CPU bit for bit.
+        run, logger, resume: as of :class:`Phases`. On a CPU a training goes on bit for bit.
+        log_every, checkpoint_every (int): updates per row of the log, and per checkpoint (default: 500).
         replay (bool): on CUDA, record an update once as a graph and replay it. The loss must take the same path for
             every batch, as denoising losses do. Defaults to False.
         progress (callable, optional): called with the number of updates done and the last logged values.
@@ -182,6 +176,29 @@ def train_phase(
     return values
 
 
+@dataclass
+class Phases:
+    """Runs the phases of a training with what they share, a bar for each, and counts their updates.
+
+    Args:
+        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
+        logger (optional): a TorchRL logger.
+        resume (bool): go on from the checkpoints of the run.
+    """
+
+    run: RunDirectory | None = None
+    logger: Any = None
+    resume: bool = False
+    updates: int = 0
+
+    def __call__(self, name: str, loss: nn.Module, sample: Callable, *, num_steps: int, **options) -> dict[str, float]:
+        """Runs :func:`train_phase`."""
+        self.updates += num_steps
+        shared = {"run": self.run, "logger": self.logger, "resume": self.resume}
+        with progress_bar(num_steps, name, smoothing=0.05, mininterval=0.5) as bar:
+            return train_phase(name, loss, sample, num_steps=num_steps, progress=show_losses(bar), **shared, **options)
+
+
 @contextlib.contextmanager
 def _interrupts_let_through() -> Iterator[None]:
     """Ctrl-C stays Ctrl-C: a loss's ``with params.to_module(network)`` makes a tensordict error of it."""
@@ -206,19 +223,6 @@ def limit_outlier(optimizer: torch.optim.AdamW) -> Tensor | None:
     Call it between ``backward`` and ``step``. What is typical is read off the optimizer's second moment, so that a
     training that is resumed goes on the same. Returns the factor ``[]`` that the gradient was multiplied by, 1 for any
     ordinary one; None while the optimizer has seen too few.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.training.loop import limit_outlier
-        >>> x = torch.nn.Parameter(torch.zeros(2))
-        >>> optimizer = torch.optim.AdamW([x], lr=1e-3)
-        >>> for _ in range(200):
-        ...     x.grad = torch.tensor([0.6, 0.8])
-        ...     _ = limit_outlier(optimizer)
-        ...     optimizer.step()
-        >>> x.grad = torch.tensor([0.0, 1000.0])
-        >>> round(limit_outlier(optimizer).item(), 4), round(x.grad.norm().item(), 2)
-        (0.005, 5.0)
     """
     group = optimizer.param_groups[0]
     parameters = [parameter for parameter in group["params"] if parameter.grad is not None]

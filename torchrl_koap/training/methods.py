@@ -28,7 +28,7 @@ from functools import partial
 from torch import nn
 from torchrl.objectives import LossModule
 
-from torchrl_koap.lookup import lookup
+from torchrl_koap.lookup import entry_points_of, lookup
 from torchrl_koap.modules import (
     PRESETS,
     LinearInverseDynamics,
@@ -41,7 +41,6 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
 )
 from torchrl_koap.objectives import ActionLoss, DiffusionPolicyLoss, KOAPLoss, QuantizedDynamicsLoss, VariationalLoss
-from torchrl_koap.runs.plugins import load_entry_points
 from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, fit_decoder
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.networks import build_sampler
@@ -208,26 +207,7 @@ for _method in (
 
 
 def get_method(name: str) -> Method:
-    """Looks a method up.
-
-    Args:
-        name (str): a name in :data:`METHODS`.
-
-    Returns:
-        Method: the entry of :data:`METHODS`.
-
-    Raises:
-        ValueError: if there is no such method; the message suggests the nearest name.
-
-    Examples:
-        >>> from torchrl_koap.training.methods import get_method
-        >>> get_method("koap").closed_form, get_method("koap_sgd").closed_form
-        (True, False)
-        >>> get_method("kaop")
-        Traceback (most recent call last):
-        ...
-        ValueError: unknown method 'kaop'; did you mean 'koap'?
-    """
+    """Looks a method up; the ValueError for an unknown name suggests the nearest."""
     if name not in METHODS:
-        load_entry_points(GROUP)
+        entry_points_of(GROUP)
     return lookup(METHODS, name, "method")

@@ -24,28 +24,12 @@ NETWORKS: dict[str, dict[str, Any]] = {
 
 
 def build_planner(task: Task, section: PlannerConfig) -> StatePlanner:
-    """Builds a planner of states without statistics.
-
-    Args:
-        task (Task): the task.
-        section (PlannerConfig): network, width and frames, nothing left open.
-
-    Raises:
-        ValueError: for an unknown network.
-    """
+    """Builds a planner of states without statistics, of a section with nothing left open."""
     return StatePlanner(forecast=forecasts(task), **_diffusion(task, section, task.state_dim))
 
 
 def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
-    """Builds a Diffusion Policy with the network of :func:`build_planner`, without statistics.
-
-    Args:
-        task (Task): the task.
-        section (PlannerConfig): as for :func:`build_planner`.
-
-    Raises:
-        ValueError: for an unknown network.
-    """
+    """Builds a Diffusion Policy with the network of :func:`build_planner`, without statistics."""
     return DiffusionPolicy(action_dim=task.action_dim, **_diffusion(task, section, task.action_dim))
 
 
@@ -76,16 +60,9 @@ def build_controller(
 ) -> nn.Module:
     """Builds a controller, with statistics of the data if these are given.
 
-    Args:
-        task (Task): the task.
-        method (Method): the method.
-        section (ControllerConfig): preset and columns, nothing left open.
-        labelled (TensorDictBase, optional): flat data ``[N]`` as the controller sees them, after the label budget was
-            applied. State statistics come from all of it (of the labelled steps for a method that sees no others),
-            action statistics from the labelled steps alone.
-
-    Raises:
-        ValueError: for an unknown preset or columns.
+    Preset and columns of the section must be known. The data are flat ``[N]`` as the controller sees them, after the
+    label budget was applied: state statistics come from all of it (of the labelled steps for a method that sees no
+    others), action statistics from the labelled steps alone.
     """
     modes = lookup(PRESETS, section.preset, "preset")["normalization"]
     columns = task.controller_columns(section.columns)

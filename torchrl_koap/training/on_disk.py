@@ -6,14 +6,17 @@ from __future__ import annotations
 import time
 import warnings
 from contextlib import ExitStack
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import LabelReport, WindowTable, select_trajectories, subsample_trajectories
+from torchrl_koap.data import WindowTable, open_dataset
+from torchrl_koap.data.label_budget import LabelReport, subsample_trajectories
 from torchrl_koap.data.quality import plan_coverage
+from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import to_json, versions
@@ -23,19 +26,18 @@ from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, p
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
 from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory
 from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
-from torchrl_koap.tasks import WINDOW, Task, task_from_config
+from torchrl_koap.tasks import WINDOW, Task
+from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.command_model import with_label_commands
 from torchrl_koap.training.controller import learn_controller
 from torchrl_koap.training.datasets import (
     choose_held_out,
-    find_task_of,
     fingerprint,
     held_out_by,
-    label_budget,
-    load_demonstrations,
-    without_held_out,
+    split_held_out,
 )
 from torchrl_koap.training.defaults import resolve
+from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_planner
 from torchrl_koap.training.planner import learn_planner
@@ -94,15 +96,13 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         used, held_out, report = _read_data(task, config, planner_only)
         content = to_json(config) | {"data": fingerprint(used), "versions": versions()}
         check_data(run, content)
-        if not task.import_strings():
-            content["task_definition"] = task.to_json()  # plain facts, such as those that come with data
+        if (definition := task.definition()) is not None:
+            content["task_definition"] = definition
         if held_out:
             content["held_out_episodes"] = held_out
         if not planner_only:  # trajectories that are too short are found now rather than after the planner was trained
             WindowTable.build(used, frames[0], pad_before=frames[1])
-        for_planner = without_held_out(used, held_out)
-        unseen = select_trajectories(used, held_out) if held_out else None
-        data = used if planner_only else without_held_out(used, held_out, keep_labelled=True)
+        for_planner, unseen, data = split_held_out(used, held_out)
         if not mine:
             held.enter_context(run.locked("koap train"))
             check_resume(run, config)  # another one may have begun here in the meantime
@@ -118,19 +118,19 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             projection.save(run.path / CAMERAS / f"{name}.safetensors")
         began = time.perf_counter()
         with open_logger(config.run.logger, config.out) as logger:
+            loop, planner, losses = Phases(run, logger, config.run.resume), None, dict[str, float]()
             torch.manual_seed(config.run.seed)
-            planner, losses = None, dict[str, float]()
             if get_method(config.method).plans:
-                planner, losses = _planner(run, task, config, for_planner, unseen, logger)
+                planner, losses = _planner(run, task, config, for_planner, unseen, loop)
             planned = time.perf_counter()
             if planner_only:
                 found = {"planner": losses}
                 return Trained(task, config, planner, None, found, tuple(held_out), run.path, cameras)
             torch.manual_seed(config.run.seed)  # the controller does not depend on where the planner is from
-            controller, results = learn_controller(task, config, data, run=run, logger=logger)
+            controller, results = learn_controller(task, config, data, loop)
             save_weights(run.path / "controller.safetensors", controller, facts_of("controller", task, config))
         summary = {
-            "labels": report.as_dict(),
+            "labels": asdict(report),
             "plan_covers": covers,
             "trajectories_used": len(data["episode"].unique()),
             "planner_parameters": 0 if planner is None else sum(p.numel() for p in planner.parameters()),
@@ -164,7 +164,8 @@ def _frames(task: Task, config: TrainConfig) -> tuple[int, int]:
 def _facts_of_source(task: Task, config: TrainConfig) -> dict[str, Any]:
     """What the planner that is taken over was trained for: this task, or another one of the same columns and rate."""
     facts = facts_of("planner", task, config)
-    theirs = task_from_config(RunDirectory(config.planner.source).read_json("config.json"))
+    source = RunDirectory(config.planner.source).read_json("config.json")
+    theirs = task_from(source["task"], source.get("task_definition"))
     same = ("state_names", "state_units", "observation_origin", "control_hz", "env")
     if all(getattr(theirs, name) == getattr(task, name) for name in same):
         facts["task"] = theirs.name
@@ -176,7 +177,7 @@ def _read_data(
 ) -> tuple[TensorDictBase, list[int], LabelReport | None]:
     """The trajectories that are used, those that the planner does not see, a report of the labels seen."""
     with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:  # read in a moment, but for thousands
-        data = load_demonstrations(config.dataset, task, progress=count_up_to(bar))
+        data, _ = open_dataset(config.dataset, task=task, progress=count_up_to(bar))
     planner, share, seed = config.planner, config.labels.trajectories, config.run.seed
     if planner_only:
         # all cells of a curve share it, whichever labels they draw: only labels that there are count as such here
@@ -184,7 +185,7 @@ def _read_data(
         data["action"] = torch.full_like(data["action"], torch.nan)
         data["has_action"] = torch.zeros_like(data["has_action"])
         return subsample_trajectories(data, share).to(config.run.device), held_out, None
-    labelled, report = label_budget(config).apply(data, command=task.command_columns)
+    labelled, report = config.labels.budget(seed).apply(data, command=task.command_columns)
     if get_method(config.method).knows_commands:
         labelled = with_label_commands(labelled, data, task.command_columns)
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
@@ -210,7 +211,7 @@ def _planner(
     config: TrainConfig,
     data: TensorDictBase,
     held_out: TensorDictBase | None,
-    logger: Any,
+    loop: Phases,
 ) -> tuple[StatePlanner, dict[str, float]]:
     """The planner: trained, taken over from another run, or loaded where that is done."""
     path, facts = run.path / "planner.safetensors", facts_of("planner", task, config)
@@ -222,6 +223,6 @@ def _planner(
         planner, losses = build_planner(task, config.planner).to(config.run.device), dict[str, float]()
         load_weights(config.planner.source / "planner.safetensors", planner, _facts_of_source(task, config))
     else:
-        planner, losses = learn_planner(task, config, data, held_out=held_out, run=run, logger=logger)
+        planner, losses = learn_planner(task, config, data, loop, held_out=held_out)
     save_weights(path, planner, facts)
     return planner, losses

@@ -15,8 +15,6 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from torchrl_koap.data import (
-    GripperRecovery,
-    NeighborRecovery,
     ObjectPermutation,
     RandomPlanarTransform,
     RecoveryAugmentation,
@@ -24,18 +22,17 @@ from torchrl_koap.data import (
     extrapolate_ends,
     make_window_buffer,
 )
+from torchrl_koap.data.recovery import GripperRecovery, NeighborRecovery
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.config import PlannerConfig, TrainConfig
 from torchrl_koap.runs.device import DTYPES
-from torchrl_koap.runs.progress import progress_bar, show_losses
-from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, Task
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.best_weights import BestWeights
-from torchrl_koap.training.loop import moving_average, train_phase
+from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner
 
 SITUATIONS, SAMPLES = 128, 4  # held out, and plans in each, that weights are chosen by
@@ -48,28 +45,17 @@ def learn_planner(
     task: Task,
     config: TrainConfig,
     data: TensorDictBase,
+    loop: Phases,
     *,
     held_out: TensorDictBase | None = None,
-    run: RunDirectory | None = None,
-    logger: Any = None,
 ) -> tuple[StatePlanner, dict[str, float]]:
-    """Builds and trains a planner.
+    """Builds and trains a planner on flat data ``[N]`` with the whole ``state``; no action is looked at.
 
-    Args:
-        task (Task): the task of the data.
-        config (TrainConfig): nothing left open.
-        data (TensorDictBase): flat data ``[N]`` with the whole ``state``; no action is looked at.
-
-    Keyword Args:
-        held_out (TensorDictBase, optional): trajectories that the weights are chosen by, laid out like ``data``.
-        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
-        logger (optional): a TorchRL logger.
+    Its weights are chosen by trajectories that are held out, where there are some. Beside it, which has the average of
+    its parameters, stand its last losses.
 
     Warns:
         UserWarning: if trajectories are to be held out and there is only one.
-
-    Returns:
-        tuple: the planner, which has the average of its parameters, and its last losses.
     """
     section = config.planner
     if section.held_out and held_out is None:
@@ -100,22 +86,17 @@ def learn_planner(
     best = None
     if held_out is not None:
         best = BestWeights(loss, plan_score(planner, held_out, task), check_interval(section, planner.num_steps))
-    with progress_bar(section.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
-        values = train_phase(
-            "planner",
-            loss,
-            draw,
-            num_steps=section.steps,
-            learning_rate=section.learning_rate,
-            weight_decay=WEIGHT_DECAY,
-            target_update=moving_average(loss, section.steps),
-            best=best,
-            run=run,
-            logger=logger,
-            resume=config.run.resume,
-            replay=True,
-            progress=show_losses(bar),
-        )
+    values = loop(
+        "planner",
+        loss,
+        draw,
+        num_steps=section.steps,
+        learning_rate=section.learning_rate,
+        weight_decay=WEIGHT_DECAY,
+        target_update=moving_average(loss, section.steps),
+        best=best,
+        replay=True,
+    )
     loss.target_network_params.to_module(planner)
     if best is not None:
         planner.load_state_dict(best.network.state_dict())
@@ -137,11 +118,9 @@ def column_weights(task: Task) -> Tensor | None:
 
 
 def check_interval(section: PlannerConfig, solver_steps: int) -> int:
-    """Updates between two scores, so that scores take 5 % of the time; an update costs three forward passes.
+    """Updates between two scores, so that scores take 5 % of the time.
 
-    Args:
-        section (PlannerConfig): nothing left open.
-        solver_steps (int): forward passes of a plan.
+    An update costs three forward passes, a plan ``solver_steps``.
     """
     updates = SITUATIONS * SAMPLES * solver_steps / (3 * section.batch_size)
     return min(max(section.steps // CHECKS, math.ceil(updates / COST)), section.steps)
@@ -150,10 +129,7 @@ def check_interval(section: PlannerConfig, solver_steps: int) -> int:
 def plan_score(planner: StatePlanner, data: TensorDictBase, task: Task) -> Callable[[StatePlanner], float]:
     """Makes the score of planners on trajectories: the energy score as a share of that of standing still.
 
-    Args:
-        planner (StatePlanner): a planner with the same frames.
-        data (TensorDictBase): flat data ``[N]`` with ``state``, which it does not learn from.
-        task (Task): names the units of the columns.
+    Flat data ``[N]`` with ``state`` are those that no planner learns from; planners have the frames of the one given.
     """
     length = planner.history + planner.horizon
     states = cut_windows(data, length, select=["state"], pad_before=planner.history - 1)["state"]
@@ -169,12 +145,8 @@ def plan_score(planner: StatePlanner, data: TensorDictBase, task: Task) -> Calla
 def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:
     """Makes what windows undergo before a planner, or a network that samples actions, learns from them.
 
-    Args:
-        task (Task): the task of the windows.
-
-    Keyword Args:
-        actions (bool): the windows hold actions, which have to fit the states afterwards. Scenes are then moved, and
-            the robot displaced, only where every action names the state column that it moves.
+    ``actions`` of the windows have to fit the states afterwards. Scenes are then moved, and the robot displaced, only
+    where every action names the state column that it moves.
     """
     moved_by = list(task.moved_columns()) if actions else None
     steps = []

@@ -27,13 +27,6 @@ def policy_facts(
     ``columns`` of the state are those that the controller reads (default: all), ``ranges`` those of
     :func:`command_ranges`. A ``gripper`` is its action column and the state column of its width: its number is read off
     planned widths, where the task has no rule for actions of its own.
-
-    Examples:
-        >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.training.policy_facts import policy_facts
-        >>> facts = policy_facts(get_task("avoiding"))
-        >>> facts["changes"], facts["commanded"]["commands"], facts["max_steps"]
-        ((0, 1), [0, 1], 250)
     """
     rule = task.action_rule
     if rule is None and gripper is not None:
@@ -66,6 +59,20 @@ def commanded_columns(task: Task) -> dict[str, list[int]] | None:
     return {"states": moved, "commands": commands, "actions": actions}
 
 
+def check_commanded(task: Task, what: str, told: Sequence[int], gripper: Sequence[int] | None) -> None:
+    """Refuses a task whose observation does not repeat the last command, or with actions that nothing tells.
+
+    ``what`` says what it cannot do then; ``told`` are the actions that are known, besides that of the gripper.
+    """
+    if task.command is None:
+        lacks = "its observation has no part that repeats the last command (Task.command)"
+        raise ValueError(f"task {task.name!r} {what}: {lacks}")
+    rest = set(range(task.action_dim)) - set(told) - {gripper[0] if gripper else None}
+    if rest:
+        names = ", ".join(task.action_names[column] for column in sorted(rest))
+        raise ValueError(f"task {task.name!r} {what}: nothing tells the actions {names}")
+
+
 def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]:
     """Finds the range of the demonstrated commands.
 
@@ -74,16 +81,6 @@ def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]
 
     Of flat data ``[N]`` after the label budget was applied, the least and greatest number of every action column are
     returned, None for a gripper's and for one that never changes.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.training.policy_facts import command_ranges
-        >>> action, seen = torch.tensor([[0.5, 0.0], [9.0, 9.0]]), torch.tensor([[True], [False]])
-        >>> data = TensorDict({"action": action, "has_action": seen, "state": torch.zeros(2, 2)}, [2])
-        >>> command_ranges(get_task("avoiding"), data)
-        [[-0.5, 0.5], [-0.5, 0.5]]
     """
     labelled, meanings = data[ACTION][data[HAS_ACTION].squeeze(-1)], list(task.actions.values())
     ranges: list[list[float] | None] = [None] * len(meanings)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.policy_facts import commanded_columns
+from torchrl_koap.training.policy_facts import check_commanded, commanded_columns
 
 AHEAD = 12  # control steps that are predicted, in the fit and where labelled steps are left out
 PENALTY = 1e-5  # relative; larger ones shrink momentum, and plans are lost
@@ -30,28 +30,14 @@ def tracked_columns(task: Task) -> dict[str, Any]:
 
     Raises:
         ValueError: if its observation does not repeat the last command, or it is not known what the actions move.
-
-    Examples:
-        >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.training.response import tracked_columns
-        >>> tracked_columns(get_task("avoiding"))
-        {'states': [0, 1], 'commands': [0, 1], 'actions': [0, 1], 'absolute': False}
     """
-    if task.command is None:
-        raise ValueError(
-            f"task {task.name!r} cannot follow plans by prediction: its observation has no part that repeats the last"
-            " command (Task.command)"
-        )
-    columns = commanded_columns(task)
+    columns, what = commanded_columns(task), "cannot follow plans by prediction"
+    check_commanded(task, what, range(task.action_dim) if columns is None else columns["actions"], task.gripper)
     if columns is None:
         raise ValueError(
-            f"task {task.name!r} cannot follow plans by prediction: its {task.action_dim} actions, the commands"
-            f" ({task.command!r}) and the state columns that they move (Action.column or Task.robot) differ in number"
+            f"task {task.name!r} {what}: its {task.action_dim} actions, the commands ({task.command!r}) and the state"
+            " columns that they move (Action.column or Task.robot) differ in number"
         )
-    rest = set(range(task.action_dim)) - set(columns["actions"]) - {task.gripper[0] if task.gripper else None}
-    if rest:
-        names = ", ".join(task.action_names[column] for column in sorted(rest))
-        raise ValueError(f"task {task.name!r} cannot follow plans by prediction: nothing tells the actions {names}")
     return columns | {"absolute": bool(task.targets)}
 
 
@@ -93,9 +79,8 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
     Where a trajectory has labels on parts of it only, its commands are hidden and the changes alone are known: every
     such stretch then has an unknown offset of its own, which is taken out (fixed effects).
 
-    Returns:
-        dict: ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up
-        to 12 steps, in the unit of the axes; None if there was too little to leave out.
+    Returned are ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up to 12
+    steps, in the unit of the axes; None if there was too little to leave out.
 
     Raises:
         ValueError: if no stretch of labelled steps is long enough.

@@ -3,18 +3,17 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import LabelReport
+from torchrl_koap.data import open_dataset
 from torchrl_koap.data.formats import find_format
+from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.files import some
 from torchrl_koap.modules import CommandDecoder, Execution, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.modules.execution.followers import Follower
@@ -23,14 +22,13 @@ from torchrl_koap.runs.config_files import from_json, read_config, to_json, vers
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryError, find_run
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
-from torchrl_koap.tasks import Task, get_task, task_from_config
-from torchrl_koap.tasks.registry import plain_task
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.command_model import gripper_columns
-from torchrl_koap.training.datasets import label_budget, load_demonstrations
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
-from torchrl_koap.training.policy_facts import command_ranges, policy_facts
+from torchrl_koap.training.policy_facts import policy_facts
 from torchrl_koap.vision import Observer, Projection
 from torchrl_koap.vision.projection import load_cameras
 
@@ -91,7 +89,7 @@ class Trained:
         config, content = read_config(run), run.read_json("config.json")
         load_plugins(config.run.plugins)
         try:
-            task = task_from_config(content)
+            task = task_from(config.task, content.get("task_definition"))
             planner, controller = build_networks(task, config)
         except (KeyError, TypeError, ValueError) as error:
             problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error
@@ -112,8 +110,7 @@ class Trained:
             raise CheckpointError(f"{path} is a policy of format {about.get('version')}, this version reads {VERSION}")
         try:
             config = from_json(TrainConfig, about["config"], path)
-            definition = about["task_definition"]
-            task = get_task(config.task) if definition is None else plain_task(definition)
+            task = task_from(config.task, about["task_definition"])
             planner, controller = build_networks(task, config)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             problem = f"entry {error} is missing" if isinstance(error, KeyError) else error
@@ -152,7 +149,7 @@ class Trained:
             "format": FORMAT,
             "version": VERSION,
             "config": to_json(self.config),
-            "task_definition": None if self.task.import_strings() else self.task.to_json(),
+            "task_definition": self.task.definition(),
             "command_ranges": self.results.get("command_ranges"),
             CAMERAS: {name: projection.about for name, projection in self.cameras.items()},
             "versions": versions(),
@@ -206,12 +203,6 @@ class Trained:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
         gripper = gripper_columns(self.task) if isinstance(self.controller, CommandDecoder) else None
         ranges = self.results.get("command_ranges")
-        if ranges is None and execution.limits != math.inf:
-            warnings.warn(
-                f"{self.folder or 'this training'} stores no range of demonstrated commands: they are not limited;"
-                " `koap eval RUN --dataset DIR` stores it",
-                stacklevel=2,
-            )
         facts = policy_facts(self.task, columns=self.columns, gripper=gripper, ranges=ranges)
         facts["observe"] = Observer.of(self.task, self.cameras)
         if self.method.plans:
@@ -235,24 +226,7 @@ class Trained:
                 f"the data set {where!r} of {self.folder} is not there (moved, or named relative to another working"
                 " directory?): say where it is with --dataset"
             )
-        return load_demonstrations(where, self.task)
-
-    def with_ranges(self, dataset: str | None = None) -> Trained:
-        """Finds the range of the demonstrated commands, and stores it in the folder, if the training did not.
-
-        ``dataset`` is as for :meth:`data`; where the data are not there the range stays unknown.
-        """
-        if self.results.get("command_ranges") is not None or self.folder is None:
-            return self
-        try:
-            labelled, _ = self.hide_labels(self.data(dataset))
-        except RunDirectoryError:
-            if dataset is not None:
-                raise
-            return self
-        results = dict(self.results) | {"command_ranges": command_ranges(self.task, labelled)}
-        RunDirectory(self.folder).write_json("summary.json", results)
-        return replace(self, results=results)
+        return open_dataset(where, task=self.task)[0]
 
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
         """Hides all labels of :meth:`data` that the training did not see: their actions are NaN; the budget reports.
@@ -260,11 +234,12 @@ class Trained:
         Raises:
             RunDirectoryError: if they are not the demonstrations that it was trained on.
         """
-        hidden, report = label_budget(self.config).apply(data, command=self.task.command_columns)
+        budget = self.config.labels.budget(self.config.run.seed)
+        hidden, report = budget.apply(data, command=self.task.command_columns)
         if "labels" not in self.results:
             raise RunDirectoryError(f"{self.folder}: summary.json has no entry 'labels'")
         recorded = self.results["labels"]
-        if {name: report.as_dict().get(name) for name in recorded} != recorded:
+        if {name: vars(report).get(name) for name in recorded} != recorded:
             raise RunDirectoryError(
                 f"the data set at hand is not the one that {self.folder} was trained on: its trajectories or labels"
                 " differ"

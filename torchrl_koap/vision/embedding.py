@@ -17,9 +17,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted, stored_task
+from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted
 from torchrl_koap.data.formats import Recordings
-from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.data.ted import stored_folder, stored_task
 from torchrl_koap.files import DataError, replacing_file
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from recording_writers import WRITERS, columns
 
-from torchrl_koap.data import make_recordings, read_recordings, save_demonstrations, write_recordings
-from torchrl_koap.data.formats import FORMATS
+from torchrl_koap.data import make_recordings, read_recordings, save_demonstrations
+from torchrl_koap.data.formats import FORMATS, write_recordings
 from torchrl_koap.files import DataError
 
 STATES, ACTIONS = ("x", "width", "y"), ("force", "turn")

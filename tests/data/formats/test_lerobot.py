@@ -229,7 +229,7 @@ def test_descriptions_that_are_none(tmp_path):
     root = write(tmp_path / "set")
     for text, message in (
         ("{", "info.json cannot be used: it is no JSON"),
-        ("[1]", "must hold a dictionary, got list"),
+        ("[1]", "must hold an object, got list"),
     ):
         (root / "meta/info.json").write_text(text)
         with pytest.raises(DataError, match=message):

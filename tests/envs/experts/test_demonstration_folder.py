@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from torchrl_koap.data import load_ted, read_about
+from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.envs.experts import demonstration_folder
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations

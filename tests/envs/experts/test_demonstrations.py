@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.experts import demonstrations
 from torchrl_koap.envs.experts.avoiding import AvoidingExpert

@@ -45,12 +45,7 @@ _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.p
 
 @dataclass(frozen=True)
 class RawEpisode:
-    """One recorded demonstration of ``T`` control steps.
-
-    Args:
-        robot (mapping): arrays ``[T, ...]`` by name, as above.
-        objects (mapping): for each object of the scene its arrays ``[T, ...]`` by name.
-    """
+    """One recorded demonstration of ``T`` control steps: arrays ``[T, ...]`` by name, of the robot and each object."""
 
     robot: Mapping[str, np.ndarray]
     objects: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
@@ -58,22 +53,14 @@ class RawEpisode:
 
 @dataclass(frozen=True)
 class Converter:
-    """How the raw episodes of one task become observations and actions.
+    """How the raw episodes of one task become observations and actions."""
 
-    Args:
-        robot (tuple of str): entries of ``robot`` that are read.
-        objects (tuple of str): logged objects whose pose is read, in the order of ``Task.objects``.
-        folder (str): where D3IL keeps the files, seen from its data folder.
-        convert (callable): from a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``,
-            as float64 arrays.
-        unread (tuple of str): objects that may be logged as well and are not read.
-    """
-
-    robot: tuple[str, ...]
-    objects: tuple[str, ...]
-    folder: str
+    robot: tuple[str, ...]  # entries of ``robot`` that are read
+    objects: tuple[str, ...]  # logged objects whose pose is read, in the order of ``Task.objects``
+    folder: str  # where D3IL keeps the files, seen from its data folder
+    # from a raw episode of T rows to observations [T, obs] and actions [T - 1, act], as float64 arrays
     convert: Callable[[RawEpisode], tuple[np.ndarray, np.ndarray]]
-    unread: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()  # objects that may be logged as well
 
 
 def _robot(episode: RawEpisode, name: str) -> np.ndarray:

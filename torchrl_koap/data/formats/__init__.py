@@ -30,21 +30,13 @@ __all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recording
 
 @dataclass(frozen=True)
 class Format:
-    """How recordings in one format are recognised, read and written.
+    """How recordings in one format are recognised, read and written."""
 
-    Args:
-        what (str): the format in words.
-        matches (callable): from a source to whether it is in this format.
-        read (callable): from a source, and some of the options, to :class:`Recordings`.
-        options (tuple of str): which options of :func:`read_recordings` it takes.
-        write (callable, optional): writes recordings into a new folder. Default: this format is not written.
-    """
-
-    what: str
-    matches: Callable[[str], bool]
-    read: Callable[..., Recordings]
-    options: tuple[str, ...] = ()
-    write: Callable[[Recordings, Path], None] | None = None
+    what: str  # in words
+    matches: Callable[[str], bool]  # whether a source is in it
+    read: Callable[..., Recordings]  # of a source, and some of the options
+    options: tuple[str, ...] = ()  # those of read_recordings that it takes
+    write: Callable[[Recordings, Path], None] | None = None  # into a new folder; None where it is not written
 
 
 def _read_stored(
@@ -199,30 +191,13 @@ def find_format(source: str | Path) -> str | None:
 
 
 def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path:
-    """Writes recordings into a new folder.
-
-    Args:
-        recordings (Recordings): what to write.
-        out (str or Path): the folder; it must not exist yet.
-        name (str): a format that is written, ``"npz"`` or ``"lerobot"``.
-
-    Returns:
-        Path: the folder.
+    """Writes recordings into a new folder, in a format that is written: ``"npz"`` or ``"lerobot"``; returns the folder.
 
     Raises:
         ValueError: for a format that is not written; the message suggests the nearest.
         FileExistsError: if there is something of that name.
         DataError: if the format needs a rate, and none is known.
         RuntimeError: if the format's package is not installed; the message names the extra.
-
-    Examples:
-        >>> import tempfile
-        >>> import numpy as np
-        >>> from torchrl_koap.data import make_recordings, read_recordings, write_recordings
-        >>> recordings = make_recordings([np.zeros((5, 3))], [np.ones((5, 2))], control_hz=30.0)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     read_recordings(write_recordings(recordings, f"{folder}/arm", "npz")).control_hz
-        30.0
     """
     write = lookup({key: form.write for key, form in FORMATS.items() if form.write is not None}, name, "format")
     if Path(out).exists():

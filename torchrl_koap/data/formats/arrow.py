@@ -27,11 +27,7 @@ def import_pyarrow() -> Any:
 
 
 def number_type(kind: Any) -> Any:
-    """The type that a column of numbers, or of lists of numbers, is read as; None of anything else.
-
-    Args:
-        kind (pyarrow.DataType): what the file has.
-    """
+    """The type that a column of numbers, or of lists of numbers, is read as; None of anything else."""
     pyarrow = import_pyarrow()
     types = pyarrow.types
     nested = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
@@ -45,11 +41,7 @@ def number_type(kind: Any) -> Any:
 def numbers(column: Any, name: str, *, announced: int = 1, files: Sequence[str] | None = None) -> np.ndarray:
     """A column of a type of :func:`number_type` as float64 ``[rows, width]``; rows that are empty are NaN.
 
-    Args:
-        column (pyarrow.ChunkedArray): the column.
-        name (str): what messages call it.
-        announced (int): width of lists that are all empty.
-        files (sequence of str, optional): of every row its file, for messages.
+    ``announced`` is the width of lists that are all empty; ``files`` say of every row its file, for messages.
     """
     pyarrow, column = import_pyarrow(), column.combine_chunks()
     if not pyarrow.types.is_list(column.type):

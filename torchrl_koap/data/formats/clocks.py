@@ -19,17 +19,11 @@ _LONG = 20  # frames after which a column that rises evenly is taken for a clock
 
 @dataclass(frozen=True)
 class Clock:
-    """Time stamps of recordings.
+    """Time stamps of recordings."""
 
-    Args:
-        name (str): of the column.
-        times (sequence of array): seconds of every trajectory ``[T_i]``.
-        sources (sequence of str): what messages call the trajectories.
-    """
-
-    name: str
-    times: Sequence[np.ndarray]
-    sources: Sequence[str]
+    name: str  # of the column
+    times: Sequence[np.ndarray]  # seconds of every trajectory [T_i]
+    sources: Sequence[str]  # what messages call the trajectories
 
     @cached_property
     def steps(self) -> list[np.ndarray]:

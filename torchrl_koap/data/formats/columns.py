@@ -20,21 +20,13 @@ from torchrl_koap.lookup import lookup
 
 @dataclass(frozen=True)
 class Piece:
-    """What a reader found in one file, demonstration or episode.
+    """What a reader found in one file, demonstration or episode."""
 
-    Args:
-        name (str): what messages call it.
-        states (dict): columns ``[T]`` of everything that is no action, by name.
-        actions (dict, optional): columns ``[T]`` or ``[T - 1]`` of actions, by name; None where there are none.
-        unclear (tuple of str): columns among the states of which the user has to say what they are.
-        cameras (dict): where the frames of every camera lie, one per row.
-    """
-
-    name: str
-    states: dict[str, np.ndarray]
-    actions: dict[str, np.ndarray] | None = None
-    unclear: tuple[str, ...] = ()
-    cameras: dict[str, Clip] = field(default_factory=dict)
+    name: str  # what messages call it
+    states: dict[str, np.ndarray]  # columns [T] of everything that is no action
+    actions: dict[str, np.ndarray] | None = None  # columns [T] or [T - 1]; None where there are none
+    unclear: tuple[str, ...] = ()  # columns among the states of which the user has to say what they are
+    cameras: dict[str, Clip] = field(default_factory=dict)  # where the frames lie, one per row
 
     @property
     def frames(self) -> int:
@@ -59,17 +51,9 @@ def assemble(
 ) -> Recordings:
     """Splits episodes, leaves out what is no state, reads the rate off the time stamps, and checks what is left.
 
-    Args:
-        pieces (sequence of Piece): what was found, in order.
-        source (str): what messages call the whole.
-
-    Keyword Args:
-        declared_hz (float, optional): frames per second that the source declares; time stamps must agree.
-        control_hz, resample, action_kind, state_columns, drop_columns, action_dim: as for
-            :func:`~torchrl_koap.data.read_recordings`.
-        action_names (sequence of str, optional): names of the action columns, where nothing has actions.
-        skipped (sequence of str): entries that the reader left out.
-        no_rate (str): what is said where nothing tells the rate.
+    Options are those of :func:`~torchrl_koap.data.read_recordings`. Messages call the whole ``source``. Of what the
+    reader knows, time stamps must agree with ``declared_hz``; ``action_names`` count where nothing has actions;
+    ``skipped`` was left out already, and ``no_rate`` is said where nothing tells the rate.
 
     Raises:
         DataError: with all faults.

@@ -39,22 +39,16 @@ _COLOURS = {1: "greyscale", 2: "greyscale with alpha", 4: "RGBA"}
 class Clip:
     """Where the frames of one camera in one trajectory lie.
 
-    Args:
-        file (str): a folder of pictures, an array (``*.npy``), an HDF5 file, a parquet file, or a video.
-        numbers (tuple of int): for every row the number of its frame, in the file's own count.
-        entry (str): data set of an HDF5 file, or column of a parquet file.
-        episode (int): episode of a parquet file, which may hold several.
-
     Examples:
         >>> from torchrl_koap.data.formats.frames import Clip
         >>> Clip("run/top.npy", (0, 1, 2, 3)).take([1, 3]).numbers
         (1, 3)
     """
 
-    file: str
-    numbers: tuple[int, ...]
-    entry: str = ""
-    episode: int = 0
+    file: str  # a folder of pictures, an array (*.npy), an HDF5 file, a parquet file, or a video
+    numbers: tuple[int, ...]  # for every row that of its frame, in the file's own count
+    entry: str = ""  # data set of an HDF5 file, or column of a parquet file
+    episode: int = 0  # of a parquet file, which may hold several
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -94,12 +88,7 @@ def stored_clips(notes: Mapping[str, Any]) -> dict[str, list[Clip]]:
 
 
 def fault_of(frame: np.ndarray, size: Sequence[int] | None = None) -> str | None:
-    """Says what is wrong with a picture, and what would do; None if it is uint8 ``[H, W, 3]`` of the size.
-
-    Args:
-        frame (np.ndarray): the picture.
-        size (sequence of int, optional): height and width that it must have.
-    """
+    """Says what is wrong with a picture, and what would do; None if it is uint8 ``[H, W, 3]`` of the size (H, W)."""
     shape = list(frame.shape)
     channels = 1 if len(shape) == 2 else shape[-1] if len(shape) == 3 else 0
     if channels in _COLOURS:
@@ -226,11 +215,7 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 
 def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
-    """Finds the cameras of a table in the folder of its name.
-
-    Args:
-        file (Path): the table.
-        clock (np.ndarray, optional): time of every row in s.
+    """Finds the cameras of a table in the folder of its name; ``clock`` is the time of every row in s.
 
     Raises:
         ValueError: if frames are missing or their times cannot be used; the message names the camera.
@@ -276,11 +261,8 @@ def lerobot_clips(
 ) -> dict[int, dict[str, Clip]]:
     """Says of every episode of a LeRobot data set where the frames of its cameras lie.
 
-    Args:
-        root (str or Path): the data set.
-        info (mapping): its description.
-        cameras (sequence of str): features of frames. One whose videos are nowhere is left out.
-        rows (mapping): of every episode its ``file``, its ``frame_index`` ``[T]`` and perhaps ``timestamp`` ``[T, 1]``.
+    A camera whose videos are nowhere is left out. ``rows`` are of every episode its ``file``, its ``frame_index``
+    ``[T]`` and perhaps ``timestamp`` ``[T, 1]``.
     """
     found: dict[int, dict[str, Clip]] = {number: {} for number in rows}
     for camera in cameras:
@@ -317,10 +299,6 @@ def _video_starts(root: Path, camera: str) -> dict[int, tuple[int, int, float]]:
 
 def check_cameras(pieces: Sequence[Piece], source: str) -> None:
     """Checks that every trajectory has every camera, and a frame per row.
-
-    Args:
-        pieces (sequence of Piece): what was found.
-        source (str): what messages call the whole.
 
     Raises:
         DataError: with all that is missing.

@@ -26,7 +26,7 @@ from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import lerobot_clips
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, some
+from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, read_json, some
 
 PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
 SURROUNDINGS = "observation.environment_state"  # its columns are told by their names, which begin like it
@@ -44,12 +44,9 @@ def is_lerobot(folder: str | Path) -> bool:
 def read_lerobot(
     root: str | Path, *, observations: Sequence[str] | None = None, episodes: Sequence[int] = (), **options: Any
 ) -> Recordings:
-    """Reads a data set in format 2.x or 3.0; rows without actions have no label.
+    """Reads a data set in format 2.x or 3.0, which declares its rate by ``fps``; rows without actions have no label.
 
-    Args:
-        root (str or Path): its folder; it declares its rate by ``fps``.
-        observations, episodes: as for :func:`~torchrl_koap.data.read_recordings`.
-        options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
+    The options are those of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     info = read_info(root)
     known = info["features"]
@@ -122,12 +119,7 @@ def read_info(root: str | Path) -> dict[str, Any]:
     file = Path(root).expanduser() / _INFO
     if not file.is_file():
         raise FileNotFoundError(f"no LeRobot data set in {root}: it has no {_INFO}")
-    try:
-        info = json.loads(read_bytes(file))
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(file, f"it is no JSON: {error}") from error
-    if not isinstance(info, dict):
-        raise DataError(file, f"it must hold a dictionary, got {type(info).__name__}")
+    info = read_json(file)
     features = info.get("features") or {}
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
         raise DataError(file, "its features must be dictionaries by name")

@@ -18,13 +18,11 @@ PREFIX = "minari:"
 
 
 def read_minari(source: str, **options: Any) -> Recordings:
-    """Reads a Minari data set that was downloaded or created before; nothing is fetched.
+    """Reads a Minari data set that was downloaded or created before, such as ``"minari:D4RL/door/human-v2"``.
 
-    Args:
-        source (str): ``minari:`` and the id of the data set, such as ``"minari:D4RL/door/human-v2"``. Dictionary
-            observations are laid side by side in the order of their names, tuples by number; images are skipped.
-        options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the rate is declared by ``render_fps`` of the
-            data set's environment.
+    Nothing is fetched. Dictionary observations are laid side by side in the order of their names, tuples by number;
+    images are skipped. The rate is declared by ``render_fps`` of its environment. The options are those of
+    :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     if importlib.util.find_spec("minari") is None:
         raise RuntimeError("Minari data sets are read with an extra: pip install 'torchrl_koap[minari]'")

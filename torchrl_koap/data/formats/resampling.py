@@ -28,21 +28,15 @@ def resampled(
     *,
     times: Sequence[np.ndarray] | None = None,
 ) -> Recordings:
-    """Brings recordings to a fixed rate.
+    """Brings recordings to a fixed rate, ``control_hz`` frames per second.
 
     States are interpolated linearly. Where a column leaps (a wrapped angle, a quaternion that changes its sign), and in
     columns of at most ten integers (a switch), the nearest frame counts, as of cameras. Changes over one frame are
     summed over the new step; any other action is the current one at its beginning. A step with an unlabelled part has
     no label. A gap of more than two steps, recorded or new, ends a trajectory; ``skipped`` counts these.
 
-    Args:
-        recordings (Recordings): what was read.
-        control_hz (float): frames per second that are wanted.
-        action_kind (str, or sequence of str): as for :func:`~torchrl_koap.data.make_demonstrations`.
-
-    Keyword Args:
-        times (sequence of array, optional): seconds of every frame ``[T_i]``, rising. Default: as
-            ``recordings.control_hz`` says.
+    The kind of action is as for :func:`~torchrl_koap.data.make_demonstrations`; ``times`` are the seconds of every
+    frame ``[T_i]``, rising, where they are not as ``recordings.control_hz`` says.
 
     Raises:
         DataError: with all faults: no rate, more than two new frames in a recorded step, labels of the kind

@@ -42,12 +42,9 @@ def read_robomimic(
 ) -> Recordings:
     """Reads trajectories from an HDF5 file, which declares its rate by ``control_freq`` of ``env_args``.
 
-    Args:
-        file (str or Path): the file.
-        observations (sequence of str, optional): entries of ``obs`` that make up the state, in that order. Default: all
-            that are no images, by name.
-        drop_columns (sequence of str): as for :func:`~torchrl_koap.data.read_recordings`; ``next_obs`` is one, too.
-        options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
+    ``observations`` are the entries of ``obs`` that make up the state, in that order. Default: all that are no images,
+    by name. ``next_obs`` is one of the ``drop_columns``, too. The options are those of
+    :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     if importlib.util.find_spec("h5py") is None:
         raise RuntimeError("HDF5 files are read with an extra: pip install 'torchrl_koap[hdf5]'")

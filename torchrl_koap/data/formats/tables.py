@@ -51,12 +51,10 @@ def is_table_folder(folder: str | Path) -> bool:
 
 
 def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = None, **options: Any) -> Recordings:
-    """Reads a folder of tables, in the order of their names.
+    """Reads a folder of tables, or a single one, in the order of their names.
 
-    Args:
-        folder (str or Path): the folder, or a single table.
-        action_columns: as for :func:`~torchrl_koap.data.read_recordings`; in NumPy archives actions are an entry.
-        options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
+    In NumPy archives actions are an entry and no ``action_columns``. The options are those of
+    :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     folder = Path(folder)
     files = _files(folder)

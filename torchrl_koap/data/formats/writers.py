@@ -79,14 +79,9 @@ class LeRobotWriter:
         self._lengths: list[int] = []
 
     def add(self, states: np.ndarray, actions: np.ndarray | None = None, *, frames: np.ndarray | None = None) -> None:
-        """Writes an episode. LeRobot has an action per row: behind the last frame the one before is repeated.
+        """Writes an episode of states ``[T + 1, d]``, actions ``[T, a]`` and camera frames uint8 ``[T + 1, H, W, 3]``.
 
-        Args:
-            states (np.ndarray): ``[T + 1, d]``.
-            actions (np.ndarray, optional): ``[T, a]``.
-
-        Keyword Args:
-            frames (np.ndarray, optional): uint8 ``[T + 1, H, W, 3]``, where there is a camera.
+        LeRobot has an action per row: behind the last frame the one before is repeated.
         """
         number, numbers = len(self._lengths), np.arange(len(states))
         columns: dict[str, Any] = {STATE: states}
