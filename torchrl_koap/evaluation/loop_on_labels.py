@@ -23,6 +23,7 @@ from torchrl_koap.training.trained import Trained
 STEPS, ROBOTS = 300, 16
 UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of the loop
 FAR = 3.0  # standard deviations of the recorded states from the nearest of them
+AWAY = 1e12  # where states have run away: far from what a network's type can square
 STAYS = 0.2  # of the way of the demonstrations
 _EXPLAINED = 0.5  # of the variance of changes, below which labels do not say how states follow actions
 _DRIFT = 1.0  # standard deviations that recorded actions may end beside their recording
@@ -211,14 +212,14 @@ def _roll(
     agent.reset()
     origin, added = policy.origins or (0.0, 0.0)  # the agent reads and tells the robot's numbers
     for _ in range(steps):
-        if not (now.abs() < 1e30).all():
+        if not (now.abs() < AWAY).all():
             break
         action = agent.act(now + origin).double().cpu() - added
         change = response.step(now, change, action)
         now = now + change
         commands.append(action)
         visited.append(now)
-    if not (now.abs() < 1e30).all():
+    if not (now.abs() < AWAY).all():
         return torch.stack(commands), math.inf, math.inf
     spread, recorded = _spread(data), observed[observed.isfinite().all(-1)]
     ways = [observed[data[EPISODE] == number][1 : steps + 2] for number in data[EPISODE][starts].tolist()]

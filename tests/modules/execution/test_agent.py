@@ -129,6 +129,8 @@ def test_arrays_of_any_kind_are_observations():
         (np.ma.masked_array([0.5, 1.0], mask=[0, 1]), r"columns \[1\] of the observation are NaN"),
         ([0.5, None], r"columns \[1\] of the observation are NaN"),
         (np.array([1e300, 0]), r"columns \[0\] of the observation are NaN or infinite as torch.float32"),
+        (np.array([1e38, 0]), "so far from the demonstrations that no finite action follows"),
+        (torch.ones(2, device="meta"), "must be plain numbers"),
         (np.ones(2, complex), "must be numbers .*, got ndarray"),
         (torch.ones(2, dtype=torch.complex64), "must be plain numbers, got a tensor of torch.complex64"),
         (torch.ones(2).to_sparse(), "must be plain numbers"),
@@ -143,6 +145,12 @@ def test_arrays_of_any_kind_are_observations():
 def test_what_is_no_observation(given, says):
     with pytest.raises(ValueError, match=says):
         ready().act(given)
+
+
+@pytest.mark.parametrize("seed", ["1", None, 1.5, True])
+def test_what_is_no_seed(seed):
+    with pytest.raises(ValueError, match=f"seed must be a whole number, got {seed!r}"):
+        ready(seed=seed)
 
 
 def test_keys_of_the_policy_are_those_that_are_written_and_read():

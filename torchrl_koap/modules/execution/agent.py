@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,8 @@ class Agent:
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
-        ValueError: for observations of another width, batch or number of axes than before, or that are not finite.
+        ValueError: for a seed that is no whole number; for observations of another width, batch or number of axes than
+            before, that are not finite, or from which no finite action follows.
 
     Examples:
         >>> import numpy as np
@@ -52,7 +54,9 @@ class Agent:
     _frames: Tensor | None  # [n, history, obs]
 
     def __init__(self, policy: PlanningPolicy, *, seed: int = 0):
-        self.policy, self.seed = policy, seed
+        if isinstance(seed, bool) or not isinstance(seed, Integral):
+            raise ValueError(f"seed must be a whole number, got {seed!r}")
+        self.policy, self.seed = policy, int(seed)
         example = next(policy.parameters(), torch.empty(0))
         self.device, self.dtype = example.device, example.dtype
         self.latencies: deque[float] = deque(maxlen=KEPT)
@@ -80,6 +84,8 @@ class Agent:
         else:
             self._frames = torch.cat([self._frames[:, 1:], newest], -2)
         action = self.policy.to_robot(self._decide())
+        if not action.isfinite().all():
+            raise ValueError("this observation is so far from the demonstrations that no finite action follows from it")
         action = action[0] if len(self._shape) == 1 else action
         result = action if isinstance(observation, Tensor) else action.cpu().numpy()
         self.latencies.append(time.perf_counter() - began)
@@ -127,7 +133,7 @@ class Agent:
                 raise ValueError(f"this policy was trained without cameras: it takes one vector [obs], got {given}")
             observation = self.policy.observe(observation)
         observed = observed_numbers(observation)
-        if observed.is_complex() or observed.layout != torch.strided:
+        if observed.is_complex() or observed.is_meta or observed.layout != torch.strided:
             raise ValueError(f"an observation must be plain numbers, got a tensor of {observed.dtype}")
         shape = tuple(observed.shape)
         if len(shape) not in (1, 2) or not observed.numel():

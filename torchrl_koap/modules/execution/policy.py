@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -133,7 +134,7 @@ class PlanningPolicy(TensorDictModuleBase):
         Raises:
             ValueError: if it is no positive number.
         """
-        number = isinstance(control_hz, (int, float)) and not isinstance(control_hz, bool)
+        number = isinstance(control_hz, Real) and not isinstance(control_hz, bool)
         if not (number and math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz!r}")
         if self.control_hz is not None and not 0.8 <= control_hz / self.control_hz <= 1.25:
