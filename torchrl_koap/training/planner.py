@@ -105,9 +105,9 @@ def learn_planner(
 
 
 def column_weights(task: Task) -> Tensor | None:
-    """Weights ``[d]`` of the state columns in a planner's loss: those of the robot, which are executed, count a third.
+    """Weights ``[d]`` of the state columns in a planner's loss: those of the robot, which are executed, sum to 1/3.
 
-    None, all columns alike, where the robot has a third of them or more, and in tasks with an environment.
+    None, all columns alike, where the robot has that share anyway, and in tasks with an environment.
     """
     columns, robot = task.state_dim, len(task.robot)
     if task.env is not None or not 0 < 3 * robot < columns:
