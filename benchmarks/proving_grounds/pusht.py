@@ -1,12 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Push-T: a disc pushes a T-shaped block to a target; 206 human demonstrations of Chi et al. 2023 (MIT licence).
 
-Of states, or of the agent's place and frames of 96 x 96 pixels that the simulator draws of the recorded states. Frames
-need the extra ``vision``.
+Of states, of the agent's place and eight corners of the block, or of the agent's place and frames of 96 x 96 pixels.
+The simulator tells corners and draws frames of the recorded states. Frames need the extra ``vision``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from torchrl_koap.data import read_recordings, save_demonstrations
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
 
 DATA = SHARED / "pusht_human_206.npz"
-ENV, PIXELS = "torchrl_koap/PushT-v0", "torchrl_koap/PushTPixels-v0"
+ENV, CORNERS, PIXELS = (f"torchrl_koap/PushT{kind}-v0" for kind in ("", "Corners", "Pixels"))
 STEPS = 300
 AGENT, TARGET = ("agent_x", "agent_y"), ("target_x", "target_y")
 ABSOLUTE: dict[str, Any] = {"action_kind": "absolute", "targets": AGENT, "action_units": "px", "max_steps": STEPS}
@@ -40,17 +41,31 @@ def read_episodes() -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def write_data_set(folder: Path) -> None:
     """Writes the demonstrations, all of them with their actions, as a data set of ``koap train``."""
+    save(folder, six_columns, STATE)
+
+
+def write_corners(folder: Path) -> None:
+    """Writes the same with the block's eight corners (px) in place of its position and angle."""
+    env = make_corners().unwrapped
+    env.reset(seed=0)
+    names = [*AGENT, *(f"corner_{number}_{axis}" for number in range(8) for axis in "xy")]
+
+    def corners(states: np.ndarray) -> np.ndarray:
+        rows = []
+        for state in states:
+            place(env, state)
+            rows.append(join(env.get_obs()))
+        return np.stack(rows)
+
+    save(folder, corners, dict.fromkeys(names, "px"))
+
+
+def save(folder: Path, columns: Callable[[np.ndarray], np.ndarray], units: dict[str, str]) -> None:
+    """Writes the demonstrations with what is made of their states ``[T, 5]``."""
     states, actions = read_episodes()
+    options = {"state_names": list(units), "state_units": list(units.values()), "action_names": TARGET}
     save_demonstrations(
-        folder,
-        [six_columns(state) for state in states],
-        actions,
-        control_hz=10,
-        state_names=list(STATE),
-        state_units=list(STATE.values()),
-        action_names=TARGET,
-        robot=list(AGENT),
-        **ABSOLUTE,
+        folder, list(map(columns, states)), actions, control_hz=10, robot=list(AGENT), **options, **ABSOLUTE
     )
 
 
@@ -76,15 +91,24 @@ def write_pixels(folder: Path) -> None:
 
 def draw(env: Any, state: np.ndarray) -> np.ndarray:
     """Draws a state ``[5]`` as the environment sees it, marks of contacts included, uint8 ``[96, 96, 3]``."""
-    for step in (1e-9, None):  # contacts are found in a step, which must not move anything
-        env.block.angle = float(state[4])  # before the position, which depends on it
-        env.block.position, env.agent.position = tuple(map(float, state[2:4])), tuple(map(float, state[:2]))
-        for body in (env.agent, env.block):
-            body.velocity, body.angular_velocity = (0, 0), 0
-            env.space.reindex_shapes_for_body(body)
-        if step is not None:
-            env.space.step(step)
+    place(env, state)
+    env.space.step(1e-9)  # contacts are found in a step, which must not move anything
+    place(env, state)
     return env.get_obs()["pixels"]
+
+
+def place(env: Any, state: np.ndarray) -> None:
+    """Puts agent and block where a state ``[5]`` says, at rest."""
+    env.block.angle = float(state[4])  # before the position, which depends on it
+    env.block.position, env.agent.position = tuple(map(float, state[2:4])), tuple(map(float, state[:2]))
+    for body in (env.agent, env.block):
+        body.velocity, body.angular_velocity = (0, 0), 0
+        env.space.reindex_shapes_for_body(body)
+
+
+def join(observation: dict[str, np.ndarray]) -> np.ndarray:
+    """The agent's place and the corners of an observation, float32 ``[18]``."""
+    return np.concatenate([observation["agent_pos"], observation["environment_state"]]).astype(np.float32)
 
 
 class SixColumns(gymnasium.ObservationWrapper):
@@ -106,6 +130,15 @@ def make_env(**options: object) -> gymnasium.Env:
     return SixColumns(gymnasium.make("gym_pusht/PushT-v0", obs_type="state", disable_env_checker=True, **options))
 
 
+def make_corners(**options: object) -> gymnasium.Env:
+    """Makes the simulator, which the block's corners and the agent's place come out of."""
+    import gym_pusht  # noqa: F401  # registers it
+
+    options |= {"obs_type": "environment_state_agent_pos", "disable_env_checker": True}
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (18,), np.float32)
+    return gymnasium.wrappers.TransformObservation(gymnasium.make("gym_pusht/PushT-v0", **options), join, box)
+
+
 def make_pixels(**options: object) -> gymnasium.Env:
     """Makes the simulator, which pictures and the agent's place come out of."""
     import gym_pusht  # noqa: F401  # registers it
@@ -115,9 +148,11 @@ def make_pixels(**options: object) -> gymnasium.Env:
 
 
 gymnasium.register(ENV, make_env, max_episode_steps=STEPS, disable_env_checker=True)
+gymnasium.register(CORNERS, make_corners, max_episode_steps=STEPS, disable_env_checker=True)
 gymnasium.register(PIXELS, make_pixels, max_episode_steps=STEPS, disable_env_checker=True)
 INSTALL = 'pip install gym-pusht==0.1.8 "pymunk<7"'
 GROUNDS = {
     "pusht": Ground(write_data_set, "reward", (10,), 150, ENV, STEPS, DATA, "gym_pusht", INSTALL),
+    "pusht_corners": Ground(write_corners, "reward", (10,), 150, CORNERS, STEPS, DATA, "gym_pusht", INSTALL),
     "pusht_pixels": Ground(write_pixels, "reward", (10,), 150, PIXELS, STEPS, DATA, "gym_pusht", INSTALL),
 }
