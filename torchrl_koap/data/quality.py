@@ -34,7 +34,7 @@ SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too l
 
 
 def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -> list[str]:
-    """Finds what is unlikely in demonstrations, a sentence each.
+    """Finds what is unlikely in demonstrations, flat data ``[N]`` with ``state``, a sentence each.
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, are in another
     unit, or reach a place beyond 100 m or rad; state columns that never change, equal another one, leap, hold marks of
@@ -42,19 +42,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     actions of another kind than declared, that never change, leap for one frame or hold marks; labels that stand alone;
     an unlikely rate; plans that are short against the motion.
 
-    Args:
-        data (TensorDictBase): flat data ``[N]`` in the storage layout, with ``state``.
-        task (Task): what they are of.
-        names (sequence of str): what to call each trajectory, such as its file. Default: their numbers.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import make_demonstrations, select_state
-        >>> from torchrl_koap.data.quality import find_warnings
-        >>> path = torch.arange(40.0).reshape(20, 2)
-        >>> data, task = make_demonstrations([path, path], control_hz=10, action_dim=1)
-        >>> find_warnings(select_state(data, (0, 1)), task, ["a.csv", "b.csv"])
-        ['b.csv repeats a.csv: every step is the same']
+    ``names`` are what to call each trajectory, such as its file. Default: their numbers.
     """
     lengths = trajectory_lengths(data).tolist()
     called = [*names, *(f"trajectory {index}" for index in range(len(names), len(lengths)))]

@@ -46,14 +46,8 @@ def write_lerobot(recordings: Recordings, out: Path) -> None:
 class LeRobotWriter:
     """A LeRobot data set that is written episode by episode; :meth:`close` finishes it.
 
-    Args:
-        folder (str or Path): folder to create.
-        fps (float): frames per second.
-        state_names (sequence of str): columns of ``observation.state``.
-        action_names (sequence of str): columns of ``action``; empty where nothing has any.
-        camera (str, optional): feature of the camera frames.
-        embodiment (str, optional): who demonstrates.
-        task (str): what is done, in words.
+    ``state_names`` are the columns of ``observation.state``, ``action_names`` those of ``action``, empty where nothing
+    has any. Frames are the feature ``camera``. ``embodiment`` says who demonstrates, ``task`` what is done, in words.
 
     Raises:
         FileExistsError: if the folder holds anything.
