@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import MultiStepActorWrapper
@@ -114,9 +114,8 @@ class PlanningPolicy(TensorDictModuleBase):
         chunk_key = PLAN if self._decodes else ACTION_CHUNK
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self._written: TensorDictBase | None = None
-        read = [history_key, *([] if planner.noise_key is None else [planner.noise_key])]  # noise may be absent
         self.receding = MultiStepActorWrapper(
-            TensorDictModule(self.plan, in_keys=read, out_keys=[chunk_key]),
+            _Chunk(self.plan, history_key, planner.noise_key, chunk_key),
             replan_interval=execution.replan_interval,
             action_keys=[PLANNED_STATE if self._decodes else action_key],
             chunk_keys=[chunk_key],
@@ -253,6 +252,19 @@ class PlanningPolicy(TensorDictModuleBase):
         observed, plan = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[1])
         age = tensordict.get(self.receding.counter_key).squeeze(-1).long() - 1
         return tensordict.set(self.out_keys[0], self.act(observed, plan, age))
+
+
+class _Chunk(TensorDictModuleBase):
+    """The part that runs only when a plan is due."""
+
+    def __init__(self, plan: Callable, history_key: NestedKey, noise_key: NestedKey | None, chunk_key: NestedKey):
+        super().__init__()
+        self.plan, self.noise_key = plan, noise_key
+        self.in_keys, self.out_keys = [history_key], [chunk_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
 
 
 class _Columns(nn.Module):
