@@ -240,7 +240,7 @@ def dataclass_from_json(kind: type[_Made], content: object) -> _Made:
 
 def _read(kind: Any, value: Any, place: str, known: tuple[str, ...]) -> Any:
     """A value of JSON as a type hint has it; ``place`` is its name with that of its section."""
-    if dataclasses.is_dataclass(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         if not isinstance(value, Mapping):
             raise ValueError(f"{place or 'the file'} must be an object, got {_short(value)}")
         hints, inside = get_type_hints(kind), f"{place}." if place else ""

@@ -80,8 +80,8 @@ def check_loop(
         }
     if not _replay_error(response, data) < _DRIFT:
         return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
-    execution = (execution or ExecutionConfig()).on(trained.execution)
-    free = trained.policy(execution.replaced(limits=math.inf))
+    asked = (execution or ExecutionConfig()).on(trained.execution)
+    free = trained.policy(asked.replaced(limits=math.inf))
     steps = min(STEPS, task.max_steps)
     commands, *where = _roll(free, response, data, steps, seed)
     growth, late = _growth(commands, ends_of(ranges), steps)
@@ -93,7 +93,7 @@ def check_loop(
             grown = _growth(again[0], ends_of(ranges), steps)
             if grown[1] < late:
                 response, (commands, *where), (growth, late) = other, again, grown
-    policy = trained.policy(execution)
+    policy = trained.policy(asked)
     if policy.limits is not None and growth.max() > 1:
         _, *where = _roll(policy, response, data, steps, seed)
     limited = int(policy.limited[0])

@@ -6,7 +6,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -54,7 +53,7 @@ class Agent:
     _frames: Tensor | None  # [n, history, obs]
 
     def __init__(self, policy: PlanningPolicy, *, seed: int = 0):
-        if isinstance(seed, bool) or not isinstance(seed, Integral):
+        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
             raise ValueError(f"seed must be a whole number, got {seed!r}")
         self.policy, self.seed = policy, int(seed)
         example = next(policy.parameters(), torch.empty(0))

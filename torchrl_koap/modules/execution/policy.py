@@ -6,9 +6,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from numbers import Real
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -133,7 +133,7 @@ class PlanningPolicy(TensorDictModuleBase):
         Raises:
             ValueError: if it is no positive number.
         """
-        number = isinstance(control_hz, Real) and not isinstance(control_hz, bool)
+        number = isinstance(control_hz, (int, float, np.number)) and not isinstance(control_hz, bool)
         if not (number and math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz!r}")
         if self.control_hz is not None and not 0.8 <= control_hz / self.control_hz <= 1.25:
