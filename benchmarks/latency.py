@@ -62,7 +62,7 @@ class SlowPlanner(StatePlanner):
 
 def default_policy() -> tuple[PlanningPolicy, int]:
     """A policy for seven joints and their goals, of the size that ``koap train`` gives it, and its observation."""
-    planner = StatePlanner(TemporalUnet(14, 28, channels=(64, 128)), state_dim=14, forecast=True)
+    planner = StatePlanner(TemporalUnet(14, 28, channels=(64, 128)), state_dim=14)
     return make_policy(planner, make_koopman_inverse_dynamics(7, 7), state_of=range(14), columns=range(7)), 14
 
 

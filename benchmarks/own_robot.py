@@ -4,15 +4,14 @@
     python benchmarks/own_robot.py --write
 
 Joints follow delta commands with a lag; 50 demonstrations from random places to random goals, 5 of them with actions.
-The trained policy then drives ten robots to goals that no demonstration had. The forecast is what carries plans over to
-these (``--no-forecast`` shows it). ``--write`` writes ``benchmarks/results/own_robot.csv``.
+The trained policy then drives ten robots to goals that no demonstration had. ``--write`` writes
+``benchmarks/results/own_robot.csv``.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,8 +112,6 @@ def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, A
         action_units="rad",
         robot=NAMES[:JOINTS],
     )
-    if not options.forecast:
-        task = replace(task, defaults=replace(task.defaults, forecast=False))
     save_ted(data, folder / "arm" / "ted", task=task)
     run = folder / "run"
     asked = {"planner": PlannerConfig(steps=options.steps), "run": RunConfig(seed=seed)}
@@ -127,7 +124,6 @@ def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, A
         "demonstrations": DEMONSTRATIONS,
         "labelled": LABELLED,
         "joints": JOINTS,
-        "forecast": "yes" if options.forecast else "no",
         "updates": options.steps,
         "train_seconds": f"{sum(summary['train_seconds'].values()):.0f}",
         "goals_reached": int((away < REACHED).sum()),
@@ -144,7 +140,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=800, help="updates of the planner")
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--no-forecast", dest="forecast", action="store_false")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -19,7 +19,6 @@ from torchrl_koap.runs.config import LabelConfig
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Action, Task
-from torchrl_koap.training import Trained
 
 FEW = EvalConfig(samples=4, threads=1)
 
@@ -36,7 +35,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    arm = save_arm(tmp_path_factory.mktemp("data") / "arm", forecast=False)
+    arm = save_arm(tmp_path_factory.mktemp("data") / "arm")
     return train_arm(tmp_path_factory.mktemp("runs") / "run", arm)
 
 
@@ -55,16 +54,6 @@ def test_a_run_of_seven_joints(run):
     assert result["control_hz"] > 0 and not (run / "rollouts.safetensors").exists()
     # 20 updates make no planner, and it is said
     assert any(fault.startswith("plans are worse than standing still (columns in rad)") for fault in result["faults"])
-
-
-def test_a_forecast_is_the_default_and_carries_over(tmp_path):
-    """To the validation trajectories, whose goals the planner has not seen; after 20 updates already."""
-    arm = save_arm(tmp_path / "arm", count=30, joints=2)
-    run = train_arm(tmp_path / "run", arm, method="linear")
-    assert Trained.load(run).planner.forecast is not None
-    result = evaluate(run, FEW)
-    assert result["relative_plan_error"] < 0.1
-    assert not any(fault.startswith("plans") for fault in result["faults"])
 
 
 def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):

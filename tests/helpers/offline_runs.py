@@ -1,7 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A toy robot without an environment: joints that follow delta commands with a lag, few of them labelled."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +36,6 @@ def save_arm(
     labelled: int = 3,
     joints: int = 7,
     units: str | list[str] = "rad",
-    forecast: bool = True,
 ) -> Path:
     """A data set of which the first trajectories have labels."""
     states, actions = record(count, joints=joints)
@@ -52,7 +50,6 @@ def save_arm(
         action_units=units,
         robot=list(range(joints)),
     )
-    task = replace(task, defaults=replace(task.defaults, forecast=forecast))
     return save_ted(data, folder / "ted", task=task).parent
 
 

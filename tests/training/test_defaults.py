@@ -13,7 +13,6 @@ from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.training import METHODS
 from torchrl_koap.training.defaults import resolve
-from torchrl_koap.training.networks import build_planner, forecasts
 
 
 def resolved(task="avoiding", method=None, **sections):
@@ -85,10 +84,6 @@ class TestThePlanner:
         wide = replace(task, defaults=replace(task.defaults, planner={"network": "unet", "width": 32}))
         wide = resolve(TrainConfig(out="run"), wide).planner
         assert (wide.network, wide.width, wide.batch_size, wide.held_out) == ("unet", 32, 128, 0.1)
-        assert forecasts(task) and build_planner(task, config.planner).forecast is not None
-        assert not forecasts(get_task("avoiding"))
-        plain = replace(task, defaults=replace(task.defaults, forecast=False))
-        assert not forecasts(plain)
 
     def test_that_is_taken_over_is_as_it_was_trained(self, tmp_path):
         theirs = resolved(planner=PlannerConfig(steps=7, width=8))

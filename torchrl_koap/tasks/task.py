@@ -41,8 +41,6 @@ class Defaults:
         recovery (float): typical shift of the recovery augmentation, in the units of the robot's columns.
         neighbor_recovery (float): farthest share of the way to the nearest other window that windows are moved, where
             no column is a position that could be shifted.
-        forecast (bool, optional): plans are deviations from a linear forecast, which carries over to goals that nobody
-            demonstrated. Default: in tasks without an environment.
         planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
             another one that is asked for by name comes with its own.
         controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``.
@@ -60,7 +58,6 @@ class Defaults:
     relative: bool = True
     recovery: float = 0.004
     neighbor_recovery: float = 0.0
-    forecast: bool | None = None
     planner: Mapping[str, Any] = field(default_factory=dict)
     controller: Mapping[str, Any] = field(default_factory=dict)
     execution: Mapping[str, Any] = field(default_factory=dict)

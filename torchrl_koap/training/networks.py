@@ -25,7 +25,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
 
 def build_planner(task: Task, section: PlannerConfig) -> StatePlanner:
     """Builds a planner of states without statistics, of a section with nothing left open."""
-    return StatePlanner(forecast=forecasts(task), **_diffusion(task, section, task.state_dim))
+    return StatePlanner(**_diffusion(task, section, task.state_dim))
 
 
 def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
@@ -74,12 +74,6 @@ def build_controller(
         action = Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"])
     normalizers = {"state_normalizer": state, "action_normalizer": action}
     return method.build(task, columns, normalizers, section.preset)
-
-
-def forecasts(task: Task) -> bool:
-    """Whether plans are deviations from a linear forecast, which carries over to goals that nobody demonstrated."""
-    own = task.defaults.forecast
-    return task.env is None if own is None else own
 
 
 def sizes_of(planner: StatePlanner) -> dict[str, Any]:

@@ -70,12 +70,9 @@ def learn_planner(
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
     extended = extrapolate_ends(data, planner.horizon - 1)
-    windows = cut_windows(extended, length, select=["state", "episode"], pad_before=1)
-    augment = augmentation(task)
-    states, groups = windows["state"][:, unseen:], windows["episode"][:, -1]
-    seen = None if planner.forecast is None else augment(windows.clone())["state"][:, unseen:]
-    planner.fit_normalizers(states, seen=seen, groups=groups)
+    planner.fit_normalizers(cut_windows(extended, length, select=["state"], pad_before=1)["state"][:, unseen:])
     planner.to(config.run.device)
+    augment = augmentation(task)
     buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
     def draw() -> TensorDictBase:
