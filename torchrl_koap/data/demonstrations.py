@@ -180,7 +180,11 @@ def make_demonstrations(
         problems.append(f"{option('max_steps')} must be a positive whole number, got {max_steps!r}")
     commanded = _columns(command, names, "command", problems)
     others = [column for column in range(len(names)) if column not in commanded]
-    own = _moving(recordings, others) if robot is None else _columns(robot, names, "robot", problems)
+    if robot is None:
+        moving = recordings.moving
+        own = [column for column in others if moving[column]] or others
+    else:
+        own = _columns(robot, names, "robot", problems)
     problems += [f"column {names[column]!r} is the robot's and a command" for column in own if column in commanded]
     if commanded and commanded != list(range(min(commanded), min(commanded) + len(commanded))):
         problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
@@ -261,12 +265,6 @@ def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str
         number = sum(part.partition("_")[0] == kind for part in parts)
         parts[f"{kind}_{number + 1}" if number else kind] = tuple(names[column] for column in columns)
     return parts
-
-
-def _moving(recordings: Recordings, columns: list[int]) -> list[int]:
-    """Those of some columns that change within a recording, as a goal does not; all if none does."""
-    moving = np.any([(frames[1:] != frames[:-1]).any(0) for frames in recordings.states], axis=0)
-    return [column for column in columns if moving[column]] or columns
 
 
 def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -> list[int]:

@@ -238,9 +238,8 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
 
 def goal_columns(recordings: Recordings) -> list[str]:
     """Names state columns that are constant in each trajectory and differ between them: goals, or what was varied."""
-    constant = np.all([np.ptp(frames, axis=0) == 0 for frames in recordings.states], axis=0)
     differ = np.ptp([frames[0] for frames in recordings.states], axis=0) > 0
-    return [name for name, goal in zip(recordings.state_names, constant & differ, strict=True) if goal]
+    return [name for name, goal in zip(recordings.state_names, ~recordings.moving & differ, strict=True) if goal]
 
 
 def constant_columns(actions: np.ndarray) -> list[float | None]:

@@ -81,7 +81,7 @@ def train_phase(
         warmup (int): updates of warm-up.
         decay (bool): let the learning rate fall to 0 after the warm-up; otherwise it stays.
         target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
-        best (BestWeights, optional): scores the averages, keeps the best and ends the training early.
+        best (BestWeights, optional): scores the averages, keeps good ones and ends the training early.
         run, logger, resume: as of :class:`Phases`. On a CPU a training goes on bit for bit.
         log_every, checkpoint_every (int): updates per row of the log, and per checkpoint (default: 500).
         replay (bool): on CUDA, record an update once as a graph and replay it. The loss must take the same path for
@@ -117,7 +117,7 @@ def train_phase(
                 raise CheckpointError(f"{checkpoint} is at step {start}, this training has {num_steps}")
         run.rewind_metrics(phase, start)
     values: dict[str, float] = run.last_metrics(phase) if start else {}
-    shown_rate = torch.tensor(learning_rate, device=device)  # a graph reads tensors alone
+    device_rate = torch.tensor(learning_rate, device=device)  # a graph reads tensors alone
 
     def update(batch: TensorDictBase) -> TensorDictBase:
         losses = loss_module(batch)
@@ -143,7 +143,7 @@ def train_phase(
             warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / max(warmup, 1))
         )
         for group in optimizer.param_groups:
-            group["lr"] = shown_rate.fill_(rate) if replay else rate
+            group["lr"] = device_rate.fill_(rate) if replay else rate
         with _interrupts_let_through():
             terms = update(sample())
 

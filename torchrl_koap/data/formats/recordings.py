@@ -66,6 +66,11 @@ class Recordings:
         """Number of transitions with an action."""
         return sum(int(np.isfinite(steps).all(-1).sum()) for steps in self.actions)
 
+    @property
+    def moving(self) -> np.ndarray:
+        """Which state columns change within a recording, as goals do not: bool ``[d]``."""
+        return np.any([(frames[1:] != frames[:-1]).any(0) for frames in self.states], axis=0)
+
 
 def make_recordings(
     states: Sequence[ArrayLike],
