@@ -3,9 +3,11 @@
 
 import numpy as np
 import pytest
+import torch
 
-from torchrl_koap import PlannerConfig, make_demonstrations
+from torchrl_koap import PlannerConfig, fit, make_demonstrations
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training import planner as planner_file
 from torchrl_koap.training.planner import check_interval, column_weights
 
 
@@ -30,3 +32,17 @@ def test_the_robot_counts_a_third_of_the_loss_or_more(columns, robot, share):
 
 def test_columns_of_tasks_with_a_simulator_count_alike():
     assert column_weights(get_task("aligning")) is None
+
+
+def test_a_planner_learns_with_these_weights(monkeypatch):
+    paths = [np.random.default_rng(seed).normal(size=(30, 5)).cumsum(0) for seed in range(3)]
+    data, task = make_demonstrations(paths, [path[1:, :1] for path in paths], control_hz=10, robot=(0,))
+
+    def weights_of_a_planner():
+        planner = fit(data, task, planner={"steps": 3}, controller={"steps": 0}, progress=False).planner
+        return planner.denoiser.last.weight
+
+    with_them = weights_of_a_planner()
+    assert torch.equal(with_them, weights_of_a_planner())
+    monkeypatch.setattr(planner_file, "column_weights", lambda task: None)
+    assert not torch.equal(with_them, weights_of_a_planner())
