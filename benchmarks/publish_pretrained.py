@@ -44,7 +44,7 @@ A policy for the task `{task}` in this library's own simulation, trained on **sc
 | data | {demonstrations} scripted demonstrations (`{recorded}`) |
 | labels | {labels}, method `{method}` |
 | planner | {denoiser}, {updates} updates of {batch} windows, training seed {training_seed} |
-| training time | {train_seconds} s of one shared CPU core |
+| training time | {train_seconds} s of {processor} |
 | weights | matrices of the planner as bytes with a scale per row, the rest float32 |
 
 Roll it out, films and report included:
@@ -152,6 +152,7 @@ def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
         "updates": trained["planner"]["steps"],
         "batch": trained["planner"]["batch_size"],
         "training_seed": config["run"]["seed"],
+        "processor": "a GPU" if trained["run"]["device"].startswith("cuda") else "one shared CPU core",
         "train_seconds": round(seconds["controller" if config["method"] == "dp" else "planner"]),
         "command": "\n    ".join(commands),
     }

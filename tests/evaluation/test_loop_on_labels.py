@@ -58,6 +58,23 @@ def test_a_policy_that_stays_where_it_is(trained):
     assert found["faults"][0].startswith("this policy does not leave the start: on a linear model of the robot")
 
 
+def test_goals_are_no_inputs_of_the_robot():
+    """Three joints follow commands with a lag and less than they are told; goals differ by recording alone."""
+    random, states, actions = np.random.default_rng(0), [], []
+    for _ in range(30):
+        joints, goal, speed, frames, commands = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3), 0, [], []
+        for _ in range(60):
+            frames.append([*joints, *100 * goal])
+            commands.append(0.1 * (goal - joints) + random.normal(0, 0.01, 3))
+            speed = 0.6 * speed + 0.4 * commands[-1]
+            joints = joints + np.tanh(20 * speed) / 20
+        states.append(np.array(frames))
+        actions.append(np.array(commands))
+    data, task = make_demonstrations(states, actions[:5] + [None] * 25, control_hz=30, robot=range(3))
+    found = check_loop(fit(data, task, **SMALL, progress=False), data, data)
+    assert "note" not in found and found["explained"] > 0.8
+
+
 def test_labels_that_say_little_are_named():
     data, task = recordings(noise=1.0)
     noisy = data.copy()

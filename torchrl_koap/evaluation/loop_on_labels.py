@@ -158,17 +158,17 @@ def _fit(data: TensorDictBase, *, by_states: bool = True) -> _Response:
     changes = data["next", OBSERVATION].double() - observed
     rows = (data[HAS_ACTION].squeeze(-1) & ~_first(data)).nonzero().squeeze(-1)
     action = data[ACTION][rows].double()
+    seen, size = observed[rows], changes[rows].std(0, correction=0)
+    moving = size > 1e-9 * seen.abs().amax(0)  # goals move no robot
     scales = tuple(
-        torch.where(size > 0, size, 1.0)
-        for size in (
+        torch.where(scale > 0, scale, 1.0)
+        for scale in (
             action.square().mean(0).sqrt() / _PREFERRED,
-            observed[rows].std(0, correction=0) if by_states else torch.full_like(observed[0], math.inf),
+            torch.where(moving, seen.std(0, correction=0), math.inf) if by_states else torch.full_like(size, math.inf),
             changes[rows].square().mean(0).sqrt(),
         )
     )
-    inputs = _inputs(scales, observed[rows], changes[rows - 1], action)
-    size = changes[rows].std(0, correction=0)
-    moving = size > 1e-9 * observed[rows].abs().amax(0)
+    inputs = _inputs(scales, seen, changes[rows - 1], action)
     wanted = changes[rows]
     fit = ridge(inputs, wanted[:, moving] / size[moving], groups=episode[rows], penalties=[1e-9, 1e-7, 1e-5, 1e-3, 0.1])
     weight, bias = torch.zeros(observed.shape[-1], inputs.shape[-1]).double(), wanted.mean(0)
