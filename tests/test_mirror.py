@@ -13,7 +13,6 @@ COVERED_BY = {
     "commands/doctor.py": "commands/test_cli.py",
     "commands/run_commands.py": "commands/test_eval.py",
     "commands/subcommands.py": "commands/test_cli.py",
-    "envs/base.py": "envs/test_avoiding.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
     "envs/mujoco/scene.py": "envs/mujoco/test_panda.py",

@@ -123,9 +123,6 @@ def test_success_rule(shift, turn, wanted):
         put(env, np.append(tray[:3], sign * tray[3:]))
         success, failure = env._check(np.array([0]))
         assert success.tolist() == [wanted] and failure.tolist() == [False]
-    distance, angle = env.errors()
-    assert distance[0] == pytest.approx(np.linalg.norm(shift), abs=1e-12)
-    assert angle[0] * 180 == pytest.approx(min(abs(turn), 360 - abs(turn)), abs=1e-5)
 
 
 def test_mode_is_that_of_the_last_instant():
@@ -153,10 +150,8 @@ def test_target_is_drawn_at_its_place_from_the_first_picture_on():
     other = CONTEXT + np.array([0.04, 0.02, 0.5])
     for contexts in (np.concatenate([CONTEXT, other]), np.concatenate([other, CONTEXT])):
         env.reset(contexts=contexts)
-        for moment in ("reset", "step", "set_physics"):
+        for moment in ("reset", "step"):
             for index in range(2):
-                if moment == "set_physics":
-                    env.set_physics(index, env.sims.data[index].qpos.copy())
                 position, axis = drawn_target(env, index)
                 x, y, yaw = contexts[index, 1]
                 np.testing.assert_allclose(position, [x, y, 0.0], atol=1e-12, err_msg=moment)

@@ -33,8 +33,8 @@ def test_layout_of_the_batched_environment(name):
     observation, info = env.reset(seed=0)
     assert observation.shape == (env.task.observation_dim,) and observation.dtype == np.float32
     assert env.action_space.shape == (env.task.action_dim,)
-    np.testing.assert_array_equal(env.action_space.low, env.batched.action_spec.low[0])
-    np.testing.assert_array_equal(env.action_space.high, env.batched.action_spec.high[0])
+    np.testing.assert_array_equal(env.action_space.low, env.batched.action_spec.low[0].float())
+    np.testing.assert_array_equal(env.action_space.high, env.batched.action_spec.high[0].float())
     assert env.batched.max_steps == env.task.max_steps
     assert env.metadata["render_fps"] == (33 if name == "Stacking" else 29)
     assert set(info) == {"success", "mode", "mode_index"} | ({"collision"} if name == "Avoiding" else {"context"})

@@ -11,7 +11,8 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import SortingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
-from torchrl_koap.envs.sorting import BIN_X, BIN_Y, box_colours, mode_index
+from torchrl_koap.envs.sorting import BIN_X, BIN_Y, mode_index
+from torchrl_koap.tasks.sorting import box_colours
 
 SENSITIVE = (1, 2)  # episodes in which a change of 1e-8 rad grows to millimetres
 INTO_BOXES = torch.tensor([0.001, 0.010], dtype=torch.float64)

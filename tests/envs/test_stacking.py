@@ -6,7 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from env_test_base import ContextTestBase, act, assert_starts_as_recorded, contexts_of, recordings_of, replay
+from env_test_base import (
+    ContextTestBase,
+    act,
+    assert_starts_as_recorded,
+    contexts_of,
+    recordings_of,
+    replay,
+    start_from,
+)
 
 from torchrl_koap.envs import StackingEnv
 from torchrl_koap.tasks import get_task
@@ -34,7 +42,7 @@ def put_boxes(env, positions, index=0):
     """Starts an episode with the boxes in the air at ``positions`` [3, 3]."""
     qpos = env.sims.data[index].qpos.copy()
     qpos[:21] = np.concatenate([positions, np.tile((1, 0, 0, 0), (3, 1))], axis=1).ravel()
-    env.set_physics(index, qpos)
+    start_from(env, index, qpos=qpos)
 
 
 def test_parity_with_the_original():
@@ -135,9 +143,7 @@ def test_boxes_are_recorded_nearest_first_and_stay_recorded():
     env.reset()
     put_boxes(env, [(0.53, 0.20, 0.011), (0.50, 0.20, 0.072), (0.6, -0.1, 0.011)])
     assert [act(env, STILL_OPEN)["mode"][0].tolist() for _ in range(3)] == [[1, -1, -1], [1, 0, -1], [1, 0, -1]]
-    away = env.sims.data[0].qpos.copy()
-    away[:14] = np.concatenate([[0.4, -0.2, 0.011, 1, 0, 0, 0], [0.4, -0.05, 0.011, 1, 0, 0, 0]])
-    env.sims.set_physics(0, away)
+    env.sims._object_views[0][:14] = [0.4, -0.2, 0.011, 1, 0, 0, 0, 0.4, -0.05, 0.011, 1, 0, 0, 0]
     assert act(env, STILL_OPEN)["mode"][0].tolist() == [1, 0, -1]
 
 

@@ -4,7 +4,7 @@
 from torchrl_koap.envs.aligning import AligningEnv
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.gym import IDS, ManipulationGymEnv, register
+from torchrl_koap.envs.gym import ManipulationGymEnv
 from torchrl_koap.envs.registry import make_env, mode_index_of
 from torchrl_koap.envs.scooping import ScoopingEnv
 from torchrl_koap.envs.sorting import SortingEnv
@@ -21,6 +21,3 @@ __all__ = [
     "make_env",
     "mode_index_of",
 ]
-
-for _name, _task in IDS.items():
-    register(f"torchrl_koap/{_name}", _task)

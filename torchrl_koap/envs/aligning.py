@@ -29,6 +29,14 @@ def mode_index(mode: torch.Tensor) -> torch.Tensor:
     return index_among(((0,), (1,)), mode)
 
 
+def aligned(tray: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Returns whether poses ``[..., 7]`` (m, quaternion) agree: distance, height included, and angle are small."""
+    distance = np.linalg.norm(tray[..., :3] - target[..., :3], axis=-1)
+    same = np.abs((tray[..., 3:] * target[..., 3:]).sum(-1))
+    angle = 2 * np.arccos(np.minimum(same, 1.0)) / np.pi
+    return (distance <= DISTANCE_TOLERANCE) & (angle <= ROTATION_TOLERANCE)
+
+
 class AligningEnv(ManipulationEnv):
     """Aligning of D3IL as a native-batch TorchRL environment on MuJoCo.
 
@@ -39,7 +47,7 @@ class AligningEnv(ManipulationEnv):
                                                 (m), 9-12 tray quaternion, 13-15 target position, 16-19 target
                                                 quaternion; after a reset the commanded xyz is the measured one
     ``action``      [n, 3]    ``dtype``         change of the commanded TCP xyz (m)
-    ``success``     [n, 1]    bool              the tray is in the target pose, see :meth:`errors`
+    ``success``     [n, 1]    bool              the tray is in the target pose, see :func:`aligned`
     ``mode``        [n, 1]    int64             0 pushed from inside, 1 from outside, -1 before the first step
     ``context``     [n, 2, 3] ``dtype``         start of the tray, and target: x, y (m), yaw (rad)
     =============== ========= ================= ===============================================================
@@ -69,9 +77,6 @@ class AligningEnv(ManipulationEnv):
     )
     MODE_VALUES = 2
 
-    def _place(self, rows: np.ndarray) -> np.ndarray:
-        return poses_of(self._contexts[rows, :1], height=0.0)
-
     def _begin(self, rows: np.ndarray) -> None:
         super()._begin(rows)
         for row, pose in zip(rows, self.targets[rows], strict=True):
@@ -87,17 +92,8 @@ class AligningEnv(ManipulationEnv):
         """Target poses [n, 7]: position (m) and quaternion."""
         return poses_of(self._contexts[:, 1], height=0.0)
 
-    def errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the distance of tray and target centres (m), height included, and their angle over pi; both [n]."""
-        tray, target = self.sims.object_poses[:, 0], self.targets
-        distance = np.linalg.norm(tray[:, :3] - target[:, :3], axis=1)
-        same = np.abs((tray[:, 3:] * target[:, 3:]).sum(1))
-        return distance, 2 * np.arccos(np.minimum(same, 1.0)) / np.pi
-
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        distance, rotation = self.errors()
-        aligned = (distance <= DISTANCE_TOLERANCE) & (rotation <= ROTATION_TOLERANCE)
-        return aligned[rows], np.zeros(len(rows), dtype=bool)
+        return aligned(self.sims.object_poses[rows, 0], self.targets[rows]), np.zeros(len(rows), dtype=bool)
 
     def _update_mode(self, rows: np.ndarray) -> None:
         gap = self.sims.tcp_position[rows, :2] - self.sims.object_poses[rows, 0, :2]

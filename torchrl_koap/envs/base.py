@@ -23,8 +23,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_koap import keys
-from torchrl_koap.envs.contexts import check_contexts, draw_contexts
-from torchrl_koap.envs.episode_state import EpisodeState
+from torchrl_koap.envs.contexts import check_contexts, draw_contexts, poses_of
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.mujoco.scene import compile_scene
@@ -32,11 +31,11 @@ from torchrl_koap.envs.mujoco.simulation import SimulationBatch
 from torchrl_koap.tasks import Task, get_task
 
 
-class ManipulationEnv(EpisodeState, EnvBase):
+class ManipulationEnv(EnvBase):
     """Simulates a batch of episodes of a D3IL task, with partial resets and partial steps.
 
     A task declares the class attributes and implements the hooks :meth:`_scene`, :meth:`_command`, :meth:`_observe`,
-    :meth:`_check`, :meth:`_update_mode` and, with objects, :meth:`_place`; ``rows`` are indices of environments.
+    :meth:`_check` and :meth:`_update_mode`; ``rows`` are indices of environments.
 
     A task with objects has *contexts*, where they are when an episode starts (:mod:`torchrl_koap.envs.contexts`): drawn
     at random at every reset, taken from a table in turn, or handed over by ``reset(contexts=...)``.
@@ -75,6 +74,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
 
     TASK: str  # name of the task
     START_JOINTS: tuple[float, ...] = (0.0,) * 7  # after a reset (rad)
+    START_HEIGHT = 0.0  # of the free bodies (m)
     ACTION_BOUND: Any = (-0.012, 0.012)  # least and greatest values of random actions; others are executed too
     MODE_ENTRIES: int | None = 1  # of the leaf ``mode``; None: one per object
     MODE_VALUES: int | None = None  # its entries are -1 (undecided) to this - 1, int64; None: flags, bool
@@ -170,7 +170,12 @@ class ManipulationEnv(EpisodeState, EnvBase):
         raise NotImplementedError
 
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        """Turns actions [len(rows), act] into new commands ``self._commands[rows]``; by default they are changes."""
         self._commands[rows, : action.shape[1]] += action
+
+    @abc.abstractmethod
+    def _observe(self, rows: np.ndarray) -> np.ndarray:
+        """Observation [len(rows), obs] of the present state and command."""
 
     @abc.abstractmethod
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -179,10 +184,6 @@ class ManipulationEnv(EpisodeState, EnvBase):
     @abc.abstractmethod
     def _update_mode(self, rows: np.ndarray) -> None:
         """Updates ``self._mode[rows]`` from the present state."""
-
-    def _place(self, rows: np.ndarray) -> np.ndarray | None:
-        """Poses [len(rows), objects, 7] in which the free bodies start, from ``self._contexts[rows]``."""
-        return None
 
     def _advance(self, rows: np.ndarray) -> None:
         """Runs the physics of one control step under ``self._commands[rows]``."""
@@ -206,7 +207,9 @@ class ManipulationEnv(EpisodeState, EnvBase):
 
     def _start(self, rows: np.ndarray) -> None:
         """Puts the simulations into their first states, those of ``self._contexts[rows]``."""
-        self.sims.reset(rows, np.asarray(self.START_JOINTS), self._place(rows), width=self.RESET_WIDTH)
+        free = [not body.still for body in self.task.bodies]
+        places = poses_of(self._contexts[rows][:, free], self.START_HEIGHT) if any(free) else None
+        self.sims.reset(rows, np.asarray(self.START_JOINTS), places, width=self.RESET_WIDTH)
 
     def _draw_contexts(self, rows: np.ndarray, contexts) -> None:
         if contexts is not None:
@@ -268,15 +271,14 @@ class ManipulationEnv(EpisodeState, EnvBase):
         return action
 
     def _leaves(self) -> TensorDictBase:
-        terminated = self._success | self._collision
-        truncated = self._steps >= self.max_steps
+        terminated, truncated = self._success | self._collision, self._steps >= self.max_steps
         leaves = {
             keys.OBSERVATION: self._tensor(self._observation, self._dtype),
             keys.SUCCESS: self._tensor(self._success[:, None]),
             keys.MODE: self._tensor(self._mode),
             "terminated": self._tensor(terminated[:, None]),
             "truncated": self._tensor(truncated[:, None]),
-            "done": self._tensor((terminated | truncated)[:, None]),
+            "done": self._tensor(self.over[:, None]),
         }
         if self.COLLIDES:
             leaves[keys.COLLISION] = self._tensor(self._collision[:, None])
@@ -291,6 +293,40 @@ class ManipulationEnv(EpisodeState, EnvBase):
     def commands(self) -> np.ndarray:
         """Present commands in float64: TCP position (m) and quaternion [n, 7]; Stacking: joints and gripper [n, 8]."""
         return self._commands.copy()
+
+    def get_state(self, index: int) -> dict:
+        """Returns the full state of one environment, for :meth:`set_state` of any environment of the same task."""
+        rows = {name: array[index].copy() for name, array in self._episode.items()}
+        return {"simulation": self.sims.get_state(index)} | rows
+
+    def set_state(self, index: int, state: dict) -> None:
+        """Restores what :meth:`get_state` returned; the episode then continues bit for bit."""
+        self.sims.set_state(index, state["simulation"])
+        for name, array in self._episode.items():
+            array[index] = state[name]
+
+    def simulate_actions(self, actions: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Simulates action sequences from the present state of the environments ``rows`` and restores it.
+
+        Sequences ``[m, len(rows), k, act]`` lead to observations ``[m, len(rows), k, obs]``. Entry ``k`` is the state
+        after actions 0 to ``k``; :meth:`step` observes it one control step later.
+
+        Raises:
+            ValueError: if the shape is wrong.
+        """
+        if actions.ndim != 4 or actions.shape[1] != len(rows) or actions.shape[3] != self.task.action_dim:
+            wanted = f"[m, {len(rows)}, k, {self.task.action_dim}] [sequences, environments, control steps, action]"
+            raise ValueError(f"actions must be {wanted}, got shape {list(actions.shape)}")
+        present = {row: self.get_state(row) for row in rows}
+        observations = np.empty((*actions.shape[:3], self.task.observation_dim))
+        for sequence, observed in zip(actions, observations, strict=True):
+            for step in range(actions.shape[2]):
+                self._command(rows, sequence[:, step])
+                self._advance(rows)
+                observed[:, step] = self._observe(rows)
+            for row, state in present.items():
+                self.set_state(row, state)
+        return observations
 
     @property
     def over(self) -> np.ndarray:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The tasks as single Gymnasium environments."""
+"""The tasks as single Gymnasium environments, registered by import: ``"torchrl_koap/Avoiding-v0"`` and so on."""
 
 from __future__ import annotations
 
@@ -71,12 +71,14 @@ class ManipulationGymEnv(gymnasium.Env):
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(facts.control_hz)}
         self.task = facts
-        self.batched = make_env(facts, 1, max_steps=facts.max_steps if max_steps is None else max_steps)
+        steps = facts.max_steps if max_steps is None else max_steps
+        self.batched = make_env(facts, 1, max_steps=steps, dtype=torch.float64)
         self._mode_index = mode_index_of(facts)
         self._picture = {"width": width, "height": height, "camera": camera}
-        self._context: np.ndarray | None = None
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
-        low, high = (bound[0].numpy() for bound in (self.batched.action_spec.low, self.batched.action_spec.high))
+        low, high = (
+            bound[0].float().numpy() for bound in (self.batched.action_spec.low, self.batched.action_spec.high)
+        )
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -97,9 +99,7 @@ class ManipulationGymEnv(gymnasium.Env):
         if context is None and not self.task.objects:
             return self._split(self.batched.reset())
         contexts = draw_contexts(self.task, 1, self.np_random) if context is None else np.asarray(context)[None]
-        data = self.batched.reset(contexts=contexts)
-        self._context = contexts[0].astype(np.float64)
-        return self._split(data)
+        return self._split(self.batched.reset(contexts=contexts))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Executes an action and runs one control step (35 ms, Stacking 30 ms)."""
@@ -125,12 +125,9 @@ class ManipulationGymEnv(gymnasium.Env):
         if keys.COLLISION in data.keys():
             info[keys.COLLISION] = data[keys.COLLISION].item()
         if self.task.objects:
-            info[keys.CONTEXT] = self._context.copy()
-        return data[keys.OBSERVATION][0].numpy(), info
+            info[keys.CONTEXT] = data[keys.CONTEXT][0].numpy()
+        return data[keys.OBSERVATION][0].float().numpy(), info
 
 
-def register(env_id: str, task: str) -> None:
-    """Registers a task with Gymnasium, as ``"torchrl_koap/Avoiding-v0"`` is, unless the id is taken."""
-    if env_id not in gymnasium.registry:
-        entry_point = f"{ManipulationGymEnv.__module__}:{ManipulationGymEnv.__name__}"
-        gymnasium.register(env_id, entry_point=entry_point, kwargs={"task": task})
+for _id, _task in IDS.items():
+    gymnasium.register(f"torchrl_koap/{_id}", f"{__name__}:ManipulationGymEnv", kwargs={"task": _task})

@@ -51,32 +51,17 @@ class GymnasiumBatch(EnvBase):
     ``success`` stays True from the step on in which it is reported (:class:`GymnasiumEpisode`). Actions are clipped to
     the environment's box. An environment that raises an error ends its episode as failed (``failed``).
 
-    Where the policy was trained with cameras, the environment's observation is a dictionary: its uint8 pictures are the
-    frames of the cameras of their names (of the only one whatever their name), its numbers side by side the state.
+    Where the policy was trained with cameras (``observe``), the environment's observation is a dictionary: its uint8
+    pictures are the frames of the cameras of their names (of the only one whatever their name), its numbers side by
+    side the state.
 
-    Args:
-        env_id (str): id of the environment, such as ``"my_package:Reach-v0"``, which imports ``my_package`` first.
-        task (Task): the task that the policy was trained on: its numbers of observation and action columns.
-        num_envs (int): number of episodes.
-        env_kwargs (mapping, optional): further arguments of ``gymnasium.make``, such as ``max_episode_steps``.
-        processes (bool): each environment has a process of its own.
-        observe (callable, optional): of a policy with cameras, see :class:`~torchrl_koap.vision.Observer`.
-        success_key (str, optional): the entry of ``info`` of every step that says whether the task is done.
-        max_steps (int, optional): steps after which an episode is truncated. Default: the environment's own limit, or
-            the task's where it has none.
-        record (EpisodeRecord, optional): is told of clipped actions and errors.
+    An episode is truncated after ``max_steps``, by default the environment's own limit, or the task's where it has
+    none. With ``processes`` each environment has a process of its own; ``record`` is told of clipped actions and
+    errors.
 
     Raises:
         ValueError: if there is no such environment, its observations or actions are no flat boxes of the task's
             widths, or ``info`` of a first step has no such success key.
-
-    Examples:
-        >>> from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
-        >>> from torchrl_koap.tasks import Action, Task
-        >>> task = Task(name="swing", observation_parts={"pole": 3}, actions={"torque": Action("N m")}, position="pole")
-        >>> env = GymnasiumBatch("Pendulum-v1", task, 2)
-        >>> env.reset()["observation"].shape, env.max_steps
-        (torch.Size([2, 3]), 200)
     """
 
     def __init__(
@@ -118,9 +103,6 @@ class GymnasiumBatch(EnvBase):
         self._begun_with = list(self._seeds)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         shape, flag = self.batch_size, (num_envs, 1)
-        self._state: dict[str, Any] = {OBSERVATION: torch.zeros(*shape, task.observation_dim)}
-        self._state |= {MODE: torch.zeros(flag, dtype=torch.int64)}
-        self._state |= {name: torch.zeros(flag, dtype=torch.bool) for name in (*_ENDS, SUCCESS, FAILED)}
         self.observation_spec = Composite(
             {
                 OBSERVATION: Unbounded((*shape, task.observation_dim)),
@@ -134,6 +116,7 @@ class GymnasiumBatch(EnvBase):
         self.reward_spec = Unbounded(flag)
         done = Categorical(2, flag, dtype=torch.bool)
         self.done_spec = Composite({name: done.clone() for name in _ENDS}, shape=shape)
+        self._state = {**self.observation_spec.zero().to_dict(), **self.done_spec.zero().to_dict()}
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
         """Seeds the next reset of every environment, so that an episode does not depend on the batch it runs in."""

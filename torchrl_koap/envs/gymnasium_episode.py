@@ -16,27 +16,12 @@ _ROUNDING = 1e-6  # share of an action that float32 may put it beyond its box
 class GymnasiumEpisode(gymnasium.Wrapper):
     """Plays one episode of an environment after each reset, then repeats its last observation.
 
-    A vector environment therefore never resets it. ``info`` holds ``terminated``, ``truncated`` and ``over``; whether
-    the step was ``played`` and its action ``clipped`` to the box; ``success``; and as ``error`` what the environment
-    raised in this step or at the reset, which truncates the episode.
+    A vector environment therefore never resets it; ``index`` is its place there. ``info`` holds ``terminated``,
+    ``truncated`` and ``over``; whether the step was ``played`` and its action ``clipped`` to the box; ``success``; and
+    as ``error`` what the environment raised in this step or at the reset, which truncates the episode.
 
-    Args:
-        env (gymnasium.Env): the environment, of a box of actions.
-        index (int): its place among those side by side.
-        max_steps (int): steps after which an episode is truncated.
-        success_key (str, optional): the entry of the environment's ``info`` that says whether the task is done.
-            Default: ``is_success`` or ``success`` where there is one, else an episode that terminates with a positive
-            reward.
-
-    Examples:
-        >>> import gymnasium
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode
-        >>> env = GymnasiumEpisode(gymnasium.make("Pendulum-v1"), 0, max_steps=200)
-        >>> _ = env.reset(seed=0)
-        >>> info = env.step(np.array([9.0]))[-1]
-        >>> info["clipped"], info["success"], info["over"]
-        (True, False, False)
+    Success is what the entry ``success_key`` of the environment's ``info`` says, by default ``is_success`` or
+    ``success`` where there is one, else an episode that terminates with a positive reward.
     """
 
     def __init__(self, env: gymnasium.Env, index: int, *, max_steps: int, success_key: str | None = None):

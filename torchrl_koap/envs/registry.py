@@ -61,10 +61,7 @@ def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
 def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
     """Returns a function from a number of parallel episodes to the task's environment as policies meet it.
 
-    With ``Task.noise`` the measured end effector is disturbed; ``num_threads`` advance the physics.
-
-    Raises:
-        ValueError: if the task has no environment.
+    With ``Task.noise`` the measured end effector is disturbed. A task without an environment is refused at once.
     """
     if task.env is None:
         make_env(task)  # tells so now rather than at the first rollout
@@ -94,9 +91,5 @@ def mode_index_of(task: Task | str) -> Callable[[torch.Tensor], torch.Tensor]:
     """
     task = get_task(task)
     if task.modes.index is None:
-        return _only_mode
+        return lambda mode: torch.zeros(mode.shape[:-1], dtype=torch.int64, device=mode.device)
     return resolve(task.modes.index, f"modes.index of task {task.name!r}")
-
-
-def _only_mode(mode: torch.Tensor) -> torch.Tensor:
-    return torch.zeros(mode.shape[:-1], dtype=torch.int64, device=mode.device)

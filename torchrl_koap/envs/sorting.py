@@ -9,31 +9,24 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.modes import index_among
 from torchrl_koap.tasks.sorting import (
-    BIN_HALF,
-    BIN_RANGE,
     BIN_WALLS,
     BIN_X,
     BIN_Y,
     BOX_HALF,
     PLATFORM_X,
     arrival_orders,
+    box_colours,
+    in_bins,
     sorting_task,
 )
 
 RED, BLUE = 0, 1
 PLATFORM_TOP = 0.1  # (m)
-START_HEIGHT = 0.05  # m; inside the platform, as in the original: the first steps push the boxes up
 _COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
-
-
-def box_colours(num_boxes: int) -> np.ndarray:
-    """Returns the colours of the boxes in the order of the state, int64 [num_boxes]: red ones, then blue ones."""
-    return np.repeat((RED, BLUE), num_boxes // 2)
 
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
@@ -85,19 +78,17 @@ class SortingEnv(ManipulationEnv):
         0.22457584505012435,
     )
     MODE_ENTRIES, MODE_VALUES = None, 2
+    START_HEIGHT = 0.05  # m; inside the platform, as in the original: the first steps push the boxes up
 
     def __init__(self, *args: Any, num_boxes: int = 4, **options: Any):
         task = sorting_task(num_boxes)
-        self._colours = box_colours(num_boxes)
+        self._colours = np.array(box_colours(num_boxes))
         super().__init__(*args, task=task, **options)
         self._noted = self._episode["noted"]
 
     def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:
         noted = np.full((num_envs, len(self._colours)), -1)  # boxes in order of arrival, by their number in the state
         return super()._episode_arrays(num_envs) | {"noted": noted}
-
-    def _place(self, rows: np.ndarray) -> np.ndarray:
-        return poses_of(self._contexts[rows], height=START_HEIGHT)
 
     def _begin(self, rows: np.ndarray) -> None:
         super()._begin(rows)
@@ -112,9 +103,7 @@ class SortingEnv(ManipulationEnv):
 
     def _inside(self, rows: np.ndarray) -> np.ndarray:
         """Which boxes are in their bins, height not considered, bool [len(rows), num_boxes]."""
-        xy = self.sims.object_poses[rows, :, :2]
-        sideways = np.abs(xy[..., 0] - np.take(BIN_X, self._colours)) < BIN_HALF
-        return sideways & (xy[..., 1] > BIN_RANGE[0]) & (xy[..., 1] < BIN_RANGE[1])
+        return in_bins(torch.from_numpy(self.sims.object_poses[rows, :, :2])).numpy()
 
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._inside(rows).all(-1), np.zeros(len(rows), dtype=bool)

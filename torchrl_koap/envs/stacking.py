@@ -10,13 +10,12 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import add_free_box, scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.modes import index_among
-from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
+from torchrl_koap.tasks.stacking import BOXES, TARGET, TARGET_HALF, ZONE_RADIUS, piled
 
 OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them
 COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
@@ -89,9 +88,6 @@ class StackingEnv(ManipulationEnv):
         super().__init__(*args, task=get_task("stacking_1" if num_boxes == 1 else "stacking"), **options)
         self.num_boxes = num_boxes
 
-    def _place(self, rows: np.ndarray) -> np.ndarray:
-        return poses_of(self._contexts[rows], height=0.0)
-
     def _begin(self, rows: np.ndarray) -> None:
         self._commands[rows, :7] = self.sims.joint_positions[rows]
         self._commands[rows, 7] = self.sims.gripper_width[rows]
@@ -113,21 +109,15 @@ class StackingEnv(ManipulationEnv):
         parts = (self.sims.joint_positions, self.sims.gripper_width[:, None], self.sims.tcp_position)
         return np.concatenate([self._commands[rows], boxes, *(part[rows] for part in parts)], axis=1)
 
-    def _distances(self, rows: np.ndarray) -> np.ndarray:
-        """Horizontal distances of the boxes from the centre of the zone [len(rows), 3] (m)."""
-        return np.linalg.norm(self.sims.object_poses[rows, :, :2] - TARGET, axis=-1)
-
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self.num_boxes < 3:
             success = self._mode[rows, self.num_boxes - 1] >= 0
         else:
-            heights = np.sort(self.sims.object_poses[rows, :, 2], axis=1)
-            piled = (np.diff(heights, axis=1) > HEIGHT_GAP).all(1)
-            success = piled & (self._distances(rows) <= ZONE_RADIUS).all(1)
+            success = piled(torch.from_numpy(self.sims.object_poses[rows, :, :3])).numpy()
         return success, np.zeros(len(rows), dtype=bool)
 
     def _update_mode(self, rows: np.ndarray) -> None:
-        distance = self._distances(rows)
+        distance = np.linalg.norm(self.sims.object_poses[rows, :, :2] - TARGET, axis=-1)
         for letter in range(3):
             distance[(self._mode[rows] == letter).any(1), letter] = np.inf
         nearest = distance.argmin(1)

@@ -105,10 +105,10 @@ class OracleFollower(Follower):
 
     def attach(self, env: EnvBase) -> None:
         """Tells the environment whose episodes are about to begin; it must be one that can be looked ahead in."""
-        from torchrl_koap.envs.episode_state import EpisodeState  # needs a simulator
+        from torchrl_koap.envs.base import ManipulationEnv  # needs a simulator
 
         base = env.base_env if isinstance(env, TransformedEnv) else env
-        if not isinstance(base, EpisodeState):
+        if not isinstance(base, ManipulationEnv):
             raise ValueError(
                 f"strategy 'oracle' needs an environment that simulates actions, {type(base).__name__} does not"
             )

@@ -48,14 +48,21 @@ _CAPTION = (
 )
 
 
+def box_colours(num_boxes: int) -> list[int]:
+    """Returns the colours of the boxes in the order of the state, red ones (0), then blue ones (1)."""
+    return [0] * (num_boxes // 2) + [1] * (num_boxes // 2)
+
+
+def in_bins(boxes: Tensor) -> Tensor:
+    """Says which boxes at ``[*B, boxes, 2]`` (x, y in m) are in the bins of their colours, bool ``[*B, boxes]``."""
+    x, y = boxes.unbind(-1)
+    centre = x.new_tensor(BIN_X)[box_colours(boxes.shape[-2])]
+    return ((x - centre).abs() < BIN_HALF) & (y > BIN_RANGE[0]) & (y < BIN_RANGE[1])
+
+
 def goal_reached(task: Task, state: Tensor) -> Tensor:
     """Says whether every box is in the bin of its colour, bool ``[*B]`` of states ``[*B, d]``."""
-    done = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
-    for box in task.objects:
-        x, y = state[..., task.state_slices[f"{box}_xy"]].unbind(-1)
-        centre = BIN_X[COLOURS.index(box.partition("_")[0])]
-        done &= (x > centre - BIN_HALF) & (x < centre + BIN_HALF) & (y > BIN_RANGE[0]) & (y < BIN_RANGE[1])
-    return done
+    return in_bins(torch.stack([state[..., task.state_slices[f"{box}_xy"]] for box in task.objects], -2)).all(-1)
 
 
 def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
@@ -71,8 +78,7 @@ def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
 @functools.cache
 def arrival_orders(num_boxes: int) -> tuple[tuple[int, ...], ...]:
     """Lists every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes."""
-    each = num_boxes // 2
-    return tuple(sorted(set(itertools.permutations((0,) * each + (1,) * each))))
+    return tuple(sorted(set(itertools.permutations(box_colours(num_boxes)))))
 
 
 def _walls() -> tuple[Shape, ...]:

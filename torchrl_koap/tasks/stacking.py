@@ -27,25 +27,29 @@ _STARTS = (((0.35, 0.45), (-0.25, -0.15)), ((0.35, 0.45), (-0.1, 0.0)), ((0.55, 
 _JOINTS = {f"joint {joint}": Action("rad") for joint in range(1, 8)}
 
 
-def _boxes_of(task: Task, state: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of the boxes ``[*B, 3, 3]``, and whether each is in the zone."""
-    boxes = torch.stack([state[..., task.state_slices[f"{box}_position"]] for box in task.objects], -2)
-    return boxes, (boxes[..., :2] - boxes.new_tensor(TARGET)).norm(dim=-1) <= ZONE_RADIUS
+def _boxes_of(task: Task, state: Tensor) -> Tensor:
+    """Positions of the boxes ``[*B, 3, 3]``."""
+    return torch.stack([state[..., task.state_slices[f"{box}_position"]] for box in task.objects], -2)
+
+
+def _in_zone(boxes: Tensor) -> Tensor:
+    return (boxes[..., :2] - boxes.new_tensor(TARGET)).norm(dim=-1) <= ZONE_RADIUS
+
+
+def piled(boxes: Tensor) -> Tensor:
+    """Says whether boxes at ``[*B, 3, 3]`` (m) are all in the zone, far enough apart in height, bool ``[*B]``."""
+    height = boxes[..., 2].sort(-1).values
+    return _in_zone(boxes).all(-1) & (height.diff(dim=-1).amin(-1) > HEIGHT_GAP)
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``.
-
-    All within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
-    """
-    boxes, near = _boxes_of(task, state)
-    height = boxes[..., 2].sort(-1).values
-    return near.all(-1) & (height.diff(dim=-1).amin(-1) > HEIGHT_GAP)
+    """Says whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``."""
+    return piled(_boxes_of(task, state))
 
 
 def first_box_reached(task: Task, state: Tensor) -> Tensor:
     """Says whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``."""
-    return _boxes_of(task, state)[1].any(-1)
+    return _in_zone(_boxes_of(task, state)).any(-1)
 
 
 _STACKING = register_task(

@@ -22,9 +22,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchrl_koap.envs.aligning import aligned
 from torchrl_koap.envs.experts.push_planning import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
 from torchrl_koap.envs.experts.recording import Expert, ar1_noise
-from torchrl_koap.tasks.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 
 SAFE_HEIGHT = 0.25  # TCP height (m) at which the rod passes over the walls
 PUSH_HEIGHT = (0.150, 0.130)  # inside, outside; the rod's tip is 0.12 m lower
@@ -121,7 +121,7 @@ class _Player:
         self.command, self.tcp = observation[:3], observation[3:6]
         self.pose = np.array([observation[6], observation[7], _yaw(observation[9:13])])
         self.target = np.array([observation[13], observation[14], _yaw(observation[16:])])
-        self.since_success += bool(self.since_success or self._aligned(observation))
+        self.since_success += bool(self.since_success or aligned(observation[6:13], observation[13:]))
         goal, speed = (self.command, 0.0) if self.since_success or self.time < self.pause else self.doing()
         way = goal - self.command
         way *= min(1.0, self.pace * speed / max(np.abs(way).max(), 1e-12))
@@ -131,11 +131,6 @@ class _Player:
         shake = self.wobble[self.time % _HORIZON] * (np.abs(self.action).max() > 0.002)
         self.time += 1
         return self.action + np.append(shake, 0.0)
-
-    def _aligned(self, observation: np.ndarray) -> bool:
-        distance = np.linalg.norm(observation[6:9] - observation[13:16])
-        same = min(abs(float((observation[9:13] * observation[16:]).sum())), 1.0)
-        return distance <= DISTANCE_TOLERANCE and 2 * math.acos(same) / math.pi <= ROTATION_TOLERANCE
 
     def _choose(self, pose: np.ndarray, target: np.ndarray, rod: np.ndarray | None) -> None:
         """Picks the contact with the best plan; a rod [2] already at the tray (its frame) prefers near contacts."""

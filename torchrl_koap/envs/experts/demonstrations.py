@@ -55,21 +55,13 @@ class Take(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordingReport:
-    """What was recorded, and what it took.
-
-    Args:
-        task (Task): the task.
-        seed (int): seed of the recording.
-        logs (sequence of dict): :attr:`Take.log` of each demonstration, in their order.
-        seconds (float): wall-clock time.
-        disturbance (float): share of the demonstrations that was to be disturbed.
-    """
+    """What was recorded, and what it took."""
 
     task: Task
     seed: int
-    logs: Sequence[Mapping[str, Any]]
-    seconds: float = 0.0
-    disturbance: float = 0.0
+    logs: Sequence[Mapping[str, Any]]  # of each demonstration, in their order
+    seconds: float  # of wall-clock time
+    disturbance: float  # share of the demonstrations that was to be disturbed
 
     def each(self, fact: str) -> list[Any]:
         """Returns one fact of every demonstration, such as ``"mode"`` or ``"rows"``."""
@@ -158,30 +150,13 @@ def iterate_takes(
     """Plays demonstrations one after the other, in their order; memory holds no more than a batch of them.
 
     The modes of the task are balanced: with 24 modes, 96 episodes are four of each; a remainder goes to modes that the
-    seed chooses.
-
-    Args:
-        task (Task or str): the task.
-        episodes (int): number of demonstrations.
-        seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
-        num_threads (int): threads that advance the physics.
-        progress (callable, optional): is told the numbers of demonstrations recorded and wanted.
-        batch_size (int): episodes played at once. The demonstrations do not depend on it.
-        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
-            the task.
-        done (collection of int): numbers of demonstrations that are there already and left out.
-
-    Yields:
-        Take: the next demonstration.
+    seed chooses. Same seed, same demonstrations, whatever ``num_threads`` and ``batch_size``. ``progress`` is told the
+    numbers of demonstrations recorded and wanted; those whose numbers are ``done`` are left out. ``disturbance`` is the
+    share of the demonstrations in which the operator is disturbed, by default the task's.
 
     Raises:
         ValueError: if the task is unknown or has no expert, or a number is out of range.
         RecordingError: if an episode fails again and again; it names the expert and the last failure.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.demonstrations import iterate_takes
-        >>> [take.number for take in iterate_takes("avoiding", 4, done=[0, 2])]
-        [1, 3]
     """
     task = get_task(task)
     disturbance = share_disturbed(task, disturbance)

@@ -24,8 +24,7 @@ import numpy as np
 
 from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 from torchrl_koap.envs.experts.sorting_decision import decide, pushing_cost
-from torchrl_koap.envs.sorting import box_colours
-from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X, arrival_orders, sorting_task
+from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X, arrival_orders, box_colours, sorting_task
 
 ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
 _HORIZON = 700  # control steps for which the hand's noise is drawn
@@ -50,7 +49,7 @@ class SortingExpert(Expert):
         num_boxes = np.shape(contexts)[1]
         self.TASK = sorting_task(num_boxes).name
         super().__init__(modes, contexts, seeds)
-        self._colours = box_colours(num_boxes)
+        self._colours = np.array(box_colours(num_boxes))
         self._orders = np.array(arrival_orders(num_boxes))[list(modes)]
         drawn = [_draw(np.random.default_rng(seed), num_boxes) for seed in seeds]
         self._habits = SimpleNamespace(**{name: np.stack([each[name] for each in drawn]) for name in drawn[0]})

@@ -234,25 +234,13 @@ def inverse_kinematics(target, q):
             q[j] = clip(q[j] + TIMESTEP * scale * null[j], Q_MIN[j], Q_MAX[j])
 
 
-@njit(cache=True)
-def _poses(joints, positions, quaternions):
-    axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
-    for row in range(len(joints)):
-        forward_kinematics(joints[row], axes, origins, positions[row], quaternions[row])
-
-
-@njit(cache=True)
-def _follow(joints, poses, iterations):
-    for row in range(len(joints)):
-        for _ in range(iterations):
-            inverse_kinematics(poses[row], joints[row])
-
-
 def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Computes positions [n, 3] (m) and quaternions [n, 4] (w, x, y, z) of the TCP for joint angles [n, 7] (rad)."""
     joints = np.ascontiguousarray(joints, dtype=np.float64)
     positions, quaternions = np.empty((len(joints), 3)), np.empty((len(joints), 4))
-    _poses(joints, positions, quaternions)
+    axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
+    for row in zip(joints, positions, quaternions, strict=True):
+        forward_kinematics(row[0], axes, origins, *row[1:])
     return positions, quaternions
 
 
@@ -263,6 +251,8 @@ def follow_pose(joints: np.ndarray, poses: np.ndarray, substeps: int = 30) -> np
     ``joints`` are the present targets [n, 7] (rad), ``poses`` TCP positions (m) and unit quaternions [n, 7]. In
     ``substeps`` of 30 ms positions some centimetres away are reached, and turns for about three quarters.
     """
-    joints = np.array(joints, dtype=np.float64)
-    _follow(joints, np.ascontiguousarray(poses, dtype=np.float64), substeps)
+    joints, poses = np.array(joints, dtype=np.float64), np.ascontiguousarray(poses, dtype=np.float64)
+    for row, pose in zip(joints, poses, strict=True):
+        for _ in range(substeps):
+            inverse_kinematics(pose, row)
     return joints

@@ -195,28 +195,6 @@ class SimulationBatch(Simulations):
         data.xpos[self._tcp] = state["tcp_position"]
         data.xquat[self._tcp] = state["tcp_quaternion"]
 
-    def set_physics(self, row: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
-        """Puts one simulation into a physics state and forgets the controller's past.
-
-        Raises:
-            ValueError: if a size is wrong or a number is not finite.
-        """
-        data = self.data[row]
-        mujoco.mj_resetData(self.model, data)
-        given = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl, "qacc_warmstart": qacc_warmstart}
-        for name, value in given.items():
-            if value is None:
-                continue
-            array, value = getattr(data, name), np.asarray(value, dtype=np.float64)
-            if value.shape != array.shape or not np.isfinite(value).all():
-                raise ValueError(f"{name!r} must be {array.shape[0]} finite numbers, got shape {list(value.shape)}")
-            array[:] = value
-        data.time = time
-        mujoco.mj_forward(self.model, data)
-        if qacc_warmstart is not None:  # the forward pass has replaced it
-            data.qacc_warmstart[:] = qacc_warmstart
-        self.started[row], self.widths[row] = False, controller.FINGER_OPEN
-
     def logged(self) -> dict[str, np.ndarray]:
         """Returns what D3IL's recorder logs for the last control step (docs/appendix/d3il.md, Recordings).
 

@@ -28,7 +28,7 @@ def test_simulated_actions_come_true(make, task):
     env, data = started(make, task, 4)
     actions = 0.3 * torch.stack([env.action_spec.rand() for _ in range(3)], 1)  # [2, 3, act]
     before = [env.get_state(row) for row in range(2)]
-    simulated = env.simulate_actions(np.stack([np.zeros(actions.shape), actions.numpy()]))[1]
+    simulated = env.simulate_actions(np.stack([np.zeros(actions.shape), actions.numpy()]), np.arange(2))[1]
     for row, state in enumerate(before):
         after = env.get_state(row)
         assert all(np.array_equal(state["simulation"][name], after["simulation"][name]) for name in state["simulation"])
@@ -43,14 +43,14 @@ def test_simulated_actions_come_true(make, task):
 
 def test_some_environments_alone():
     env, _ = started(AvoidingEnv, "avoiding", 2)
-    both = env.simulate_actions(np.full((1, 2, 2, 2), 0.01))
+    both = env.simulate_actions(np.full((1, 2, 2, 2), 0.01), np.arange(2))
     assert np.array_equal(env.simulate_actions(np.full((1, 1, 2, 2), 0.01), np.array([1]))[:, 0], both[:, 1])
 
 
 def test_a_wrong_shape():
     env, _ = started(AvoidingEnv, "avoiding", 0)
     with pytest.raises(ValueError, match=r"actions must be \[m, 2, k, 2\].*got shape \[1, 3, 2, 2\]"):
-        env.simulate_actions(np.zeros((1, 3, 2, 2)))
+        env.simulate_actions(np.zeros((1, 3, 2, 2)), np.arange(2))
 
 
 def test_episodes_that_are_over():
