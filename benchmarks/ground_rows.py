@@ -16,11 +16,11 @@ from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, tidy
 TITLES = {
     "pusht": "Push-T",
     "adroit_door": "Adroit door",
-    "meta_world_button-press": "Meta-World button-press",
     "meta_world_assembly": "Meta-World assembly",
     "meta_world_bin-picking": "Meta-World bin-picking",
     "meta_world_peg-insert-side": "Meta-World peg-insert-side",
     "meta_world_shelf-place": "Meta-World shelf-place",
+    "meta_world_pick-place": "Meta-World pick-place",
     "unitree_g1": "Unitree G1",
 }
 COMPARED = {

@@ -31,7 +31,7 @@ STEPS, DEMONSTRATIONS = 500, 100
 HAND = ["hand_x", "hand_y", "hand_z", "fingers"]
 STATE = [*HAND, *(f"object_{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")), "goal_x", "goal_y", "goal_z"]
 SEEN = [*range(11), 36, 37, 38]  # of the simulator's 39 columns
-INSTALL = "pip install --no-deps --target FOLDER metaworld==3.1.1 mujoco==3.3.0, then run with PYTHONPATH=FOLDER"
+INSTALL = "pip install --no-deps --target FOLDER metaworld==3.0.0 mujoco==3.3.0, then run with PYTHONPATH=FOLDER"
 
 
 class PresentFrame(gymnasium.Wrapper):
