@@ -20,12 +20,10 @@ _OFFERS = {
     "tasks": ("Task", "get_task", "register_task"),
     "training": ("Trained", "fit", "register_method", "train"),
 }
-_LAZY = {name: f"{__name__}.{room}" for room, names in _OFFERS.items() for name in names}
+__getattr__, _lazy = exports(__name__, _OFFERS)
 
-__all__ = ["__version__", *_LAZY]
-
-__getattr__ = exports(__name__, _LAZY)
+__all__ = ["__version__", *_lazy]
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+    return sorted({*globals(), *_lazy})

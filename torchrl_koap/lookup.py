@@ -87,17 +87,18 @@ def entry_points_of(group: str) -> list[Any]:
     return found
 
 
-def exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Makes the ``__getattr__`` of a package whose public names are imported when they are first asked for.
+def exports(package: str, offers: Mapping[str, Collection[str]]) -> tuple[Callable[[str], Any], list[str]]:
+    """Makes ``__getattr__`` and ``__all__`` of a package whose public names are imported when first asked for.
 
     Args:
         package (str): its name.
-        modules (mapping): public name to the module that defines it.
+        offers (mapping): modules, relative to the package, to the public names that they define.
     """
+    modules = {name: f"{package}.{module}" for module, names in offers.items() for name in names}
 
     def get(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return getattr(importlib.import_module(modules[name]), name)
 
-    return get
+    return get, list(modules)

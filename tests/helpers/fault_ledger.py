@@ -12,7 +12,7 @@ import json
 import re
 import shutil
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -248,8 +248,3 @@ def edit_json(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
-
-
-def words_of(command: str, *more: str, base: dict[str, Sequence[str]]) -> tuple[str, ...]:
-    """A call that would do, and more words behind it."""
-    return (command, *base[command], *more)

@@ -299,10 +299,11 @@ def error(module):
 
 
 def test_a_single_batch_does_not_undo_a_training(monkeypatch):
-    spoiled, untouched = trained(batches(poison_at=400), 410, decay=False), trained(batches(), 410, decay=False)
+    monkeypatch.setattr(loop_file, "warmup_cosine", lambda step, num_steps, warmup: min(1.0, (step + 1) / warmup))
+    spoiled, untouched = trained(batches(poison_at=400), 410), trained(batches(), 410)
     assert error(spoiled) < 1.5 * error(untouched)
     monkeypatch.setattr(loop_file, "limit_outlier", lambda optimizer: None)
-    assert error(trained(batches(poison_at=400), 410, decay=False)) > 2 * error(untouched)
+    assert error(trained(batches(poison_at=400), 410)) > 2 * error(untouched)
 
 
 def test_ordinary_batches_leave_the_same_bits(monkeypatch):

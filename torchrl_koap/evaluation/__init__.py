@@ -4,16 +4,11 @@
 from torchrl_koap.lookup import exports
 
 # imported when first asked for: pictures need a reader of run directories, not TorchRL
-_MODULES = {
-    "EvalConfig": "torchrl_koap.evaluation.config",
-    "InspectConfig": "torchrl_koap.evaluation.inspection",
-    "SuggestConfig": "torchrl_koap.evaluation.active_labelling",
-    "evaluate": "torchrl_koap.evaluation.closed_loop",
-    "inspect": "torchrl_koap.evaluation.inspection",
-    "load_policy": "torchrl_koap.evaluation.policies",
-    "rank_trajectories": "torchrl_koap.evaluation.active_labelling",
-    "suggest": "torchrl_koap.evaluation.active_labelling",
+_OFFERS = {
+    "active_labelling": ("SuggestConfig", "rank_trajectories", "suggest"),
+    "closed_loop": ("evaluate",),
+    "config": ("EvalConfig",),
+    "inspection": ("InspectConfig", "inspect"),
+    "policies": ("load_policy",),
 }
-__getattr__ = exports(__name__, _MODULES)
-
-__all__ = list(_MODULES)
+__getattr__, __all__ = exports(__name__, _OFFERS)

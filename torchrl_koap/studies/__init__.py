@@ -4,12 +4,5 @@
 from torchrl_koap.lookup import exports
 
 # imported when first asked for: pictures need a reader of run directories, not TorchRL
-_MODULES = {
-    "Cell": "torchrl_koap.studies.cells",
-    "Machines": "torchrl_koap.studies.launchers",
-    "Study": "torchrl_koap.studies.study",
-    "run_study": "torchrl_koap.studies.run",
-}
-__getattr__ = exports(__name__, _MODULES)
-
-__all__ = list(_MODULES)
+_OFFERS = {"cells": ("Cell",), "launchers": ("Machines",), "run": ("run_study",), "study": ("Study",)}
+__getattr__, __all__ = exports(__name__, _OFFERS)

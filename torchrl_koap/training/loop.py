@@ -54,7 +54,6 @@ def train_phase(
     learning_rate: float,
     weight_decay: float = 0.0,
     warmup: int = 100,
-    decay: bool = True,
     target_update: SoftUpdate | None = None,
     best: BestWeights | None = None,
     run: RunDirectory | None = None,
@@ -79,7 +78,6 @@ def train_phase(
         learning_rate (float): peak of :func:`warmup_cosine`.
         weight_decay (float): decoupled weight decay.
         warmup (int): updates of warm-up.
-        decay (bool): let the learning rate fall to 0 after the warm-up; otherwise it stays.
         target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
         best (BestWeights, optional): scores the averages, keeps good ones and ends the training early.
         run, logger, resume: as of :class:`Phases`. On a CPU a training goes on bit for bit.
@@ -139,9 +137,7 @@ def train_phase(
     for step in range(start, num_steps):
         if best is not None and best.finished(step):
             break
-        rate = learning_rate * (
-            warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / max(warmup, 1))
-        )
+        rate = learning_rate * warmup_cosine(step, num_steps, warmup)
         for group in optimizer.param_groups:
             group["lr"] = device_rate.fill_(rate) if replay else rate
         with _interrupts_let_through():
