@@ -19,8 +19,6 @@ from torchrl_koap.runs import weights
         (("--strategy", "oracel"), "unknown strategy 'oracel'; did you mean 'oracle'?"),
         (("--replan-interval", "15"), "replan_interval must be in 1..14"),
         (("--episodes", "0"), "episodes must be >= 1, got 0"),
-        (("--batch-size", "0"), "batch_size must be >= 1, got 0"),
-        (("--threads", "0"), "threads must be >= 1, got 0"),
     ],
 )
 def test_an_evaluation_that_cannot_be_done_leaves_the_run_alone(options, message, copied_run, capsys):

@@ -24,10 +24,7 @@ from torchrl_koap.runs.run_directory import RunDirectory
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        (["train", "--out", "x", "--lables.fraction", "0.1"], "--labels.fraction"),
-        (["eval", "x", "--episode", "3"], "--episodes"),
         (["train"], "--out"),
-        (["trian"], "train"),
         (["train", "--out", "x", "--device"], "--device"),
     ],
 )

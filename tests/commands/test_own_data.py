@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.data.ted import load_ted, stored_task
+from torchrl_koap.data.ted import load_ted
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
-from torchrl_koap.tasks import Action
 
 TINY = ("--steps", 20, "--planner.batch-size", 8, "--planner.width", 8, "--controller.steps", 20)
 
@@ -29,14 +28,6 @@ def run(arm):
     out = arm.parent / "run"
     assert koap("train", "--dataset", arm, "--out", out, *TINY, "--planner.network", "mlp") == 0
     return out
-
-
-def test_the_task_comes_with_the_data(run):
-    task = stored_task(run.parent / "arm" / "ted")
-    assert task.name == "arm" and task.robot == (0, 1) and task.actions == {"dq1": Action("rad"), "dq2": Action("rad")}
-    config, summary = (json.loads((run / name).read_text()) for name in ("config.json", "summary.json"))
-    assert config["task"] == "arm" and config["labels"]["fraction"] == 1.0
-    assert summary["labels"]["labelled_transitions"] == 58 and summary["labels"]["selected_units"] == 2
 
 
 def test_a_policy_acts_on_the_users_observations(run):

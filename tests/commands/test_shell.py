@@ -13,7 +13,7 @@ from tiny_runs import TINY, write_demonstrations
 
 from torchrl_koap.commands import cli
 from torchrl_koap.commands.options import check_options
-from torchrl_koap.commands.shell import Interrupted, describe_interrupt, ending_like_ctrl_c
+from torchrl_koap.commands.shell import ending_like_ctrl_c
 
 COMMAND = (sys.executable, "-m", "torchrl_koap.commands.cli")
 
@@ -44,11 +44,6 @@ def test_what_is_ignored_stays_ignored():
             os.kill(os.getpid(), signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, earlier)
-
-
-def test_words_of_a_signal():
-    assert describe_interrupt(Interrupted(signal.SIGTERM))[0].startswith("interrupted by SIGTERM; ")
-    assert describe_interrupt(KeyboardInterrupt())[0].startswith("interrupted; ")
 
 
 @pytest.mark.parametrize("words", [["--out", ""], ["--out="], [""]])

@@ -3,9 +3,8 @@
 
 import numpy as np
 import pytest
-from shared_data import SHARED
 
-from torchrl_koap.data import make_demonstrations, read_recordings
+from torchrl_koap.data import make_demonstrations
 from torchrl_koap.data.action_kinds import describe_likely, kind_warnings, likely_kinds
 
 NOISE = np.random.default_rng(0).normal(size=(4, 60, 3))
@@ -134,24 +133,3 @@ def test_targets_that_are_the_robots_columns_need_not_be_named():
 def test_few_labels_say_nothing():
     assert not warnings([PATHS[0][:10]], [TARGETS[0][:9]])
     assert not likely_kinds(*demonstrations([PATHS[0][:10]], [TARGETS[0][:9]]))
-
-
-GROUNDS = SHARED / "proving_grounds"
-
-
-@pytest.mark.skipif(not GROUNDS.is_dir(), reason="no shared/proving_grounds")
-class TestDataOfOthers:
-    def test_joint_targets_of_a_humanoid_are_absolute(self):
-        data, task = make_demonstrations(read_recordings(GROUNDS / "unitree_g1"))
-        assert {each.kind for each in likely_kinds(data, task).values()} == {"absolute"}
-        assert [said.endswith("convert again with --action-kind absolute") for said in kind_warnings(data, task)] == [
-            True
-        ]
-
-    def test_normalised_joint_targets_of_a_hand_are_raw(self):
-        with np.load(GROUNDS / "adroit_door_human_25.npz") as arrays:
-            ends = arrays["episode_ends"][:-1]
-            states, actions = (np.split(arrays[name], ends) for name in ("observations", "actions"))
-        data, task = make_demonstrations(states, actions, control_hz=25)
-        assert {each.kind for each in likely_kinds(data, task).values()} == {"raw"}
-        assert [said[-17:] for said in kind_warnings(data, task)] == ["--action-kind raw"]

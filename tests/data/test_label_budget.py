@@ -86,13 +86,6 @@ def test_the_account_is_right(lengths, unit, amount, seed):
     assert json.loads(json.dumps(asdict(report))) == asdict(report)
 
 
-def test_all_windows_leave_out_the_ends():
-    labelled, report = LabelBudget(fraction=1.0, unit="window").apply(demonstrations((20, 16)))
-    inner = [False] + [True] * 18 + [False] + [False] + [True] * 14 + [False]
-    assert labelled["has_action"].squeeze(-1).tolist() == inner
-    assert report.selected_units == 6
-
-
 @pytest.mark.parametrize("unit", UNITS)
 def test_the_input_is_untouched(unit):
     data = demonstrations()

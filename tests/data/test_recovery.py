@@ -39,11 +39,6 @@ def test_size_of_the_shift():
     assert td["state"][:, 0].square().mean().sqrt().item() == pytest.approx(0.004 * math.sqrt(4 / 3), rel=0.02)
 
 
-def test_no_sigma_changes_nothing():
-    state = torch.randn(4, 16, 2)
-    assert torch.equal(RecoveryAugmentation(0.0)(TensorDict({"state": state.clone()}, [4]))["state"], state)
-
-
 def test_shifted_columns_may_be_chosen():
     state = torch.zeros(50, 16, 4)
     found = RecoveryAugmentation(0.01, columns=(0, 2))(TensorDict({"state": state}, [50]))["state"]
@@ -152,11 +147,6 @@ def test_shares_are_spread_over_the_whole_range():
     torch.manual_seed(0)
     sizes = (moved(windows, 1.0) - windows)[:, 0, 0].abs() / 2
     assert sizes.min() < 0.02 and sizes.max() > 0.98 and abs(sizes.mean() - 0.5) < 0.05
-
-
-def test_nothing_is_moved_without_a_share():
-    windows = torch.randn(5, 16, 3)
-    assert torch.equal(moved(windows, 0.0), windows)
 
 
 @pytest.mark.parametrize("shape", [(16, 3), (1, 16, 3), (2, 2, 16, 3)])

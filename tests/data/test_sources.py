@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from raw_episodes import write_folder, write_raw_episode
-from shared_data import HUMAN
 from tiny_runs import write_demonstrations
 
 from torchrl_koap.data import flatten_trajectories, open_dataset, save_demonstrations, save_ted
@@ -111,15 +110,3 @@ def test_raw_files_are_never_written(tmp_path):
     open_dataset(folder, progress=lambda *done: calls.append(done))
     assert before == {file.name: (file.read_bytes(), file.stat().st_mtime_ns) for file in folder.iterdir()}
     assert calls == [(1, 2)]
-
-
-@pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
-def test_human_demonstrations():
-    data = validate(open_dataset(HUMAN)[0])
-    lengths = data["episode"].unique(return_counts=True)[1]
-    assert len(lengths) == 24 and lengths.min() >= 64 and lengths.max() <= 103
-    # commands are joystick steps: what is commanded next is the command plus the action
-    assert torch.allclose(data["observation"][:, :2] + data["action"], data["next", "observation"][:, :2], atol=1e-6)
-    same = data["episode"][1:] == data["episode"][:-1]
-    assert torch.equal(data["next", "observation"][:-1][same], data["observation"][1:][same])
-    assert data["action"].abs().max() < 0.03

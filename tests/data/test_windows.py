@@ -67,19 +67,6 @@ def test_samples_are_the_stored_rows(padded):
     assert isinstance(buffer, TensorDictReplayBuffer) == padded
 
 
-def test_padded_frames_are_told():
-    buffer = make_window_buffer(demonstrations((5, 9)), 4, 500, pad_before=1, pad_after=2)
-    torch.manual_seed(1)
-    batch = buffer.sample()
-    windows = seen(batch)
-    assert set(windows) == set(by_hand((5, 9), 4, 1, 2))
-    assert (0, (0, 0, 1, 2)) in windows and (1, (7, 8, 8, 8)) in windows
-    for (_, steps), padded in zip(windows, batch["padded"], strict=True):
-        expected = [steps[0] == steps[1] == 0]
-        expected += [steps[frame] == steps[frame - 1] and steps[frame] > 0 for frame in range(1, 4)]
-        assert padded.tolist() == expected
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 8), st.integers(1, 10), st.integers(0, 3), st.integers(0, 5), st.integers(1, 3))
 def test_labelled_windows_by_the_definition(seed, number, before, after, history):

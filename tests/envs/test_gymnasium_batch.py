@@ -134,12 +134,6 @@ def test_arguments_of_the_environment():
     assert GymnasiumBatch("ToyReachOwnKey-v0", TASK).success_key is None
 
 
-def test_processes_of_their_own_give_the_same_numbers():
-    asked = ("ToyReach-v0", TASK, 2)
-    one, several = (run(GymnasiumBatch(*asked, processes=apart), 3, [4, 9]) for apart in (False, True))
-    assert torch.equal(one["observation"], several["observation"]) and torch.equal(one["success"], several["success"])
-
-
 def test_errors_and_clipped_actions_are_recorded_and_the_others_go_on():
     record = EpisodeRecord()
     env = GymnasiumBatch("ToyBreaks-v0", TASK, 3, record=record)

@@ -109,13 +109,6 @@ def test_a_linear_world_is_predicted_by_the_ridge():
     assert rmse(tensors["predicted"], tensors["true"]) == pytest.approx(row["controller"], rel=1e-5)
 
 
-def test_with_a_label_in_every_trajectory_there_is_nothing_to_measure():
-    data = counting()
-    labelled, _ = LabelBudget(fraction=1.0).apply(data)
-    result, tensors = errors_outside_budget(Copy(1), data, labelled, get_task("avoiding"))
-    assert set(result) == {"note"} and not tensors
-
-
 def test_an_action_that_never_changes_is_commanded_right_whatever_is_decoded():
     data = counting()
     data["action"][:, 1] = 7.0

@@ -53,17 +53,6 @@ def test_a_optimal_greedy_choice_equals_brute_force():
     assert [choice.score for choice in found] == pytest.approx([gain for _, gain in wanted])
 
 
-def test_uncertainty_counts_what_was_chosen_before_as_labelled():
-    latent, penalty = latents(), 0.05
-    scale = penalty * latent[KNOWN].square().sum(-1).mean()
-    found = rank_trajectories(latent, EPISODE, KNOWN, penalty=penalty, score=uncertainty, count=3)
-    rows = KNOWN.clone()
-    for choice in found:
-        left = {name: mean_leverage(latent, rows, scale, name == EPISODE) for name in set(EPISODE[~rows].tolist())}
-        assert choice.episode == max(left, key=left.get) and choice.score == pytest.approx(left[choice.episode])
-        rows |= choice.episode == EPISODE
-
-
 @pytest.mark.parametrize(("bias", "tolerance"), [(False, 1e-9), (True, 2e-3)])
 def test_scores_are_the_decoder_s_own_uncertainty(bias, tolerance):
     latent = latents() + (2 if bias else 0)

@@ -18,17 +18,14 @@ from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation import diagnosis, inspection
 from torchrl_koap.evaluation.diagnosis import (
     RECORDED_FUTURE,
-    RecordedPlanner,
     contexts_of,
     coverage,
     follow_recordings,
-    hand_on,
     left_recordings,
     planner_rollout,
     recorded_futures,
     tracking_errors,
 )
-from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.modules import Execution, ExecutionConfig, MLPDenoiser, StatePlanner, make_policy
 from torchrl_koap.reports.inspection_plots import draw_experiments
 from torchrl_koap.reports.run_facts import RunFacts
@@ -103,8 +100,6 @@ def test_distance_from_plan_to_execution_by_hand():
     assert tracking_errors(AVOIDING, [brief, stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
     episodes = [brief, stands, episode(0.4), episode(0.5)]
     assert [left_recordings(AVOIDING, episodes, 4, beyond=limit) for limit in (0.2, 0.35, 0.6)] == [3, 2, 0]
-    half = rate([True, False])
-    assert (half["rate"], half["episodes"]) == (0.5, 2) and 0 < half["low"] < 0.2 < 0.8 < half["high"] < 1
 
 
 def test_states_beside_the_demonstrations_are_far():
@@ -159,18 +154,6 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     monkeypatch.setattr(Trained, "load", lambda run: cold)
     inspection.inspect(copied_run, asked)
     assert [policy.execution.temperature for policy in policies[-2:]] == [0.5, 1]  # recordings are no noise
-
-
-def test_recorded_futures_travel_in_an_entry_of_their_own():
-    futures = torch.arange(2 * 3 * 14 * 2.0).reshape(2, 3, 14, 2)
-    recorded = hand_on(futures)
-    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2))
-    policy = make_policy(planner, EchoController(), state_of=(0, 1), execution=Execution(replan_interval=1, blend=0.0))
-    observed, init = torch.zeros(2, 2, 2), torch.ones(2, 1, dtype=torch.bool)
-    for step in (0, 1, 2, 2):
-        td = TensorDict({"observation_history": observed, "is_init": init, "noise": torch.full((2, 1), torch.nan)}, [2])
-        td = policy(recorded(td))
-        assert torch.equal(td["action"][:, 2:], futures[:, step, 0])
 
 
 def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):

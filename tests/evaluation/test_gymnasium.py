@@ -61,13 +61,6 @@ def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
     assert any("failed because the environment raised an error: seed 11, step 1" in fault for fault in found["faults"])
 
 
-def test_an_unknown_success_key_is_refused_before_the_first_episode(arm_run, capsys):
-    before = (arm_run / "eval.json").read_bytes()
-    assert koap("eval", arm_run, "--env", "toy_gym:ToyReach-v0", "--success-key", "arrived") == 1
-    assert "info of environment 'toy_gym:ToyReach-v0' has no 'arrived', it has is_success" in capsys.readouterr().err
-    assert (arm_run / "eval.json").read_bytes() == before
-
-
 def test_processes_of_their_own_change_no_result(arm_run):
     asked = {"episodes": 3, "env": "toy_gym:ToyReach-v0", "threads": 1}
     one, several = (evaluate(arm_run, EvalConfig(**asked, num_envs=number)) for number in (None, 2))

@@ -30,18 +30,18 @@ def pose(positions, quat):
     return {"pos": np.array(positions, dtype=float), "quat": quat}
 
 
-def made_up(task, rows=5, seed=0, extra=()):
+def made_up(task, rows=5, seed=0):
     """Any episode of a task, with everything that is logged."""
     rng = np.random.default_rng(seed)
     robot = {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
-    names = (*CONVERTERS[get_task(task).source].objects, *extra)
+    names = CONVERTERS[get_task(task).source].objects
     objects = {name: pose(rng.normal(size=(rows, 3)), turned(*rng.uniform(-80, 80, rows))) for name in names}
     return RawEpisode(robot=robot, objects=objects)
 
 
-def write_folder(folder, task, episodes=3, **kwargs):
+def write_folder(folder, task, episodes=3):
     files = [Path(folder) / f"env_{index:03d}_00.pkl" for index in range(episodes)]
     for index, file in enumerate(files):
-        episode = made_up(task, rows=4 + index, seed=index, **kwargs)
+        episode = made_up(task, rows=4 + index, seed=index)
         write_raw_episode(file, episode.robot, episode.objects)
     return files

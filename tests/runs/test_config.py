@@ -10,10 +10,7 @@ from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig
     ("section", "options", "message"),
     [
         (LabelConfig, {"fraction": 0.0}, r"labels: fraction must be in \(0, 1\], got 0.0"),
-        (LabelConfig, {"fraction": float("nan")}, "labels: fraction must be"),
         (LabelConfig, {"trajectories": 0}, "labels.trajectories must be > 0 and <= 1, got 0"),
-        (LabelConfig, {"episodes": (1,), "unit": "window"}, "labels: episodes are trajectories, got unit 'window'"),
-        (LabelConfig, {"episodes": (1, 1)}, "labels: episodes must be one or more different numbers"),
         (PlannerConfig, {"width": 0}, "planner.width must be >= 1, got 0"),
         (PlannerConfig, {"learning_rate": 0.0}, "planner.learning_rate must be > 0, got 0.0"),
         (PlannerConfig, {"frames": 3}, "planner.frames must be >= 1 and <= 2, got 3"),

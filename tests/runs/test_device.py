@@ -29,10 +29,6 @@ def test_auto_is_what_the_processor_has_units_for(units):
     assert find_precision("auto") == ("float32" if units is None else "bfloat16")
 
 
-def test_float32_by_name_is_obeyed(units):
-    assert find_precision("float32") == "float32"
-
-
 def test_bfloat16_by_name_is_obeyed_and_warns_where_it_is_emulated(units):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -16,15 +16,10 @@ from torchrl_koap.training import Trained
 
 
 @pytest.fixture
-def run(trained_run):
-    return trained_run
-
-
-@pytest.fixture
-def policies(run, tmp_path, monkeypatch):
+def policies(trained_run, tmp_path, monkeypatch):
     """A present folder with the trained policies ``avoiding`` and ``aligning``; both are the tiny run."""
     for name in ("avoiding", "aligning"):
-        publish(run, tmp_path / "pretrained" / name, f"# {name}\n")
+        publish(trained_run, tmp_path / "pretrained" / name, f"# {name}\n")
     monkeypatch.chdir(tmp_path)
     return tmp_path / "pretrained"
 
@@ -43,15 +38,15 @@ def test_an_installed_wheel_has_none(tmp_path, monkeypatch):
         find_run("pretrained:aligning")
 
 
-def test_a_published_policy_is_small_and_plans_the_same(run, policies):
+def test_a_published_policy_is_small_and_plans_the_same(trained_run, policies):
     tensors, about = load_tensors(policies / "avoiding" / "controller.safetensors")
     assert about["task"] == "avoiding"
     assert not any(
         tensor.dtype == torch.int8 for tensor in tensors.values()
     )  # frequencies are as the decoder knows them
-    small, whole = ((folder / "planner.safetensors").stat().st_size for folder in (policies / "avoiding", run))
+    small, whole = ((folder / "planner.safetensors").stat().st_size for folder in (policies / "avoiding", trained_run))
     assert small < 0.6 * whole
-    planner, exact = Trained.load(policies / "avoiding").planner, Trained.load(run).planner
+    planner, exact = Trained.load(policies / "avoiding").planner, Trained.load(trained_run).planner
     history, noise = torch.rand(20, 2, 2), torch.randn(20, 14, 2)
     with torch.no_grad():
         gap = (planner.sample(history, noise) - exact.sample(history, noise)).abs().mean()
@@ -61,8 +56,8 @@ def test_a_published_policy_is_small_and_plans_the_same(run, policies):
     assert not (policies / "avoiding" / "checkpoints").exists()
 
 
-def test_a_planner_is_taken_over_by_name(run, policies, capsys):
-    known = ("--task", "avoiding", "--dataset", json.loads((run / "config.json").read_text())["dataset"])
+def test_a_planner_is_taken_over_by_name(trained_run, policies, capsys):
+    known = ("--task", "avoiding", "--dataset", json.loads((trained_run / "config.json").read_text())["dataset"])
     few = ("--labels.count", "1", "--controller.steps", "2", "--quiet", "--threads", "1")
     assert koap("train", "--out", "mine", *known, "--planner.source", "pretrained:avoiding", *few) == 0
     mine, published = (Trained.load(folder).planner.state_dict() for folder in ("mine", policies / "avoiding"))
@@ -71,15 +66,15 @@ def test_a_planner_is_taken_over_by_name(run, policies, capsys):
     assert "did you mean 'avoiding'?" in capsys.readouterr().err and not (policies.parent / "other").exists()
 
 
-def test_places_are_left_out_and_what_is_left_is_sealed(run, demonstrations, tmp_path):
-    folder = publish(run, tmp_path / "mine", "# mine\n")
+def test_places_are_left_out_and_what_is_left_is_sealed(trained_run, demonstrations, tmp_path):
+    folder = publish(trained_run, tmp_path / "mine", "# mine\n")
     config = json.loads((folder / "config.json").read_text())
-    assert (config["out"], config["dataset"]) == (run.name, demonstrations.name)
+    assert (config["out"], config["dataset"]) == (trained_run.name, demonstrations.name)
     assert Trained.load(folder).folder == folder
     (folder / "config.json").write_text(json.dumps(config | {"planner": config["planner"] | {"width": 16}}))
     with pytest.raises(CheckpointError, match="planner.safetensors was trained on planner.width 8, not on 16"):
         Trained.load(folder)
-    assert Trained.load(publish(run, folder, "# again\n")).folder == folder  # over another policy of that name
+    assert Trained.load(publish(trained_run, folder, "# again\n")).folder == folder  # over another policy of that name
 
 
 def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
@@ -110,12 +105,12 @@ def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd
         assert "nothing is written into pretrained:avoiding: name a folder" in capfd.readouterr().err
 
 
-def test_another_run_is_not_overwritten(run, tmp_path):
-    copy_run(run, tmp_path / "mine")
-    config = json.loads((run / "config.json").read_text())
+def test_another_run_is_not_overwritten(trained_run, tmp_path):
+    copy_run(trained_run, tmp_path / "mine")
+    config = json.loads((trained_run / "config.json").read_text())
     (tmp_path / "mine" / "config.json").write_text(json.dumps(config | {"run": config["run"] | {"seed": 9}}))
     with pytest.raises(RunDirectoryError, match="holds another run than"):
-        copy_run(run, tmp_path / "mine")
+        copy_run(trained_run, tmp_path / "mine")
     assert json.loads((tmp_path / "mine" / "config.json").read_text())["run"]["seed"] == 9
 
 

@@ -68,12 +68,6 @@ def test_without_metrics_there_is_nothing_to_read_or_rewind(tmp_path):
     assert not run.path.exists()
 
 
-def test_json_round_trip(run):
-    content = {"task": "avoiding", "planner": {"channels": [8, 16]}, "count": None}
-    run.write_json("config.json", content)
-    assert run.read_json("config.json") == content
-
-
 def test_numbers_that_json_does_not_know_become_null(run):
     run.write_json("summary.json", {"error": float("inf"), "rows": [{"x": float("nan")}, (1.5, -float("inf"))]})
     assert run.read_json("summary.json") == {"error": None, "rows": [{"x": None}, [1.5, None]]}

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
 import math
@@ -15,14 +14,8 @@ import pytest
 import torch
 from toy_task import TOY
 
-import torchrl_koap
 from torchrl_koap.envs import mode_index_of
-from torchrl_koap.tasks import TASKS, Action, Task, aligning, avoiding, get_task, sorting
-
-
-def test_tasks_cannot_be_changed():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        get_task("avoiding").max_steps = 3
+from torchrl_koap.tasks import TASKS, Action, Task, avoiding, get_task, sorting
 
 
 def test_stacking_without_joints_shows_and_commands_what_the_paper_does():
@@ -87,13 +80,12 @@ def test_json_of_another_kind_is_refused():
 
 def test_the_package_loads_no_task_and_a_task_no_simulator():
     code = (
-        "import sys, torchrl_koap; assert torchrl_koap.__version__; assert 'torchrl_koap.tasks' not in sys.modules;"
+        "import sys, torchrl_koap; assert torchrl_koap.__version__;"
+        "assert not {'torch', 'torchrl_koap.tasks'} & set(sys.modules);"
         "torchrl_koap.get_task('stacking').state_dim; print([m for m in ('mujoco', 'gymnasium') if m in sys.modules])"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert found.stdout.strip() == "[]", found.stderr
-    with pytest.raises(AttributeError, match="has no attribute 'register_tusk'"):
-        torchrl_koap.register_tusk  # noqa: B018
 
 
 def passed(mode):
@@ -140,12 +132,6 @@ def test_a_leaf_of_another_task_is_refused():
 def test_a_path_of_avoiding_tells_its_mode():
     path = np.array([[0.55, -0.1], [0.5, 0.08], [0.6, 0.27]])
     assert avoiding.mode_of_path(path) == 18 and avoiding.mode_of_path(path[:2]) == -1
-
-
-def test_the_planar_tolerance_of_aligning_leaves_room_for_the_height():
-    # the tray rests 9.1 mm below the target's centre
-    wanted = math.sqrt(aligning.DISTANCE_TOLERANCE**2 - 0.0091**2)
-    assert aligning.ALIGNED_DISTANCE == pytest.approx(wanted, abs=1e-4)
 
 
 def aligned(distance, degrees):

@@ -8,8 +8,7 @@ import torch
 from offline_runs import save_arm, train_arm
 
 from torchrl_koap import PlannerConfig, RunConfig
-from torchrl_koap.data import LabelBudget, flatten_trajectories, open_dataset, save_ted
-from torchrl_koap.tasks import get_task
+from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted
 from torchrl_koap.training.datasets import (
     choose_held_out,
     held_out_by,
@@ -73,7 +72,6 @@ def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
 
 def test_the_planner_does_not_depend_on_what_is_held_out(tmp_path):
     """Nothing of these trajectories reaches it, not even through its statistics."""
-    from torchrl_koap.data import save_ted
     from torchrl_koap.data.ted import load_ted
 
     arm = save_arm(tmp_path / "arm", labelled=8)
@@ -85,20 +83,3 @@ def test_the_planner_does_not_depend_on_what_is_held_out(tmp_path):
     other = train_arm(tmp_path / "other", arm, method="linear")
     for name in ("planner.safetensors", "controller.safetensors"):
         assert (other / name).read_bytes() == (run / name).read_bytes()
-
-
-TASK = get_task("avoiding")
-
-
-@pytest.fixture(scope="module")
-def data(demonstrations):
-    return open_dataset(demonstrations, task=TASK)[0]
-
-
-def test_recorded_folders_give_the_same(tmp_path, data):
-    save_ted(data, tmp_path / "ted", TASK)
-    again = open_dataset(tmp_path, task=TASK)[0]
-    for key in ("state", "action", "episode", "observation"):
-        assert torch.equal(again[key], data[key])
-    again["action"][0] = 7.0  # in memory: the file stays as it is
-    assert torch.equal(open_dataset(tmp_path, task=TASK)[0]["action"], data["action"])

@@ -19,7 +19,7 @@ def resolved(task="avoiding", method=None, **sections):
     return resolve(TrainConfig(out="run", method=method, **sections), get_task(task))
 
 
-@pytest.mark.parametrize("task", ["avoiding", "stacking", "po_sorting"])
+@pytest.mark.parametrize("task", TASKS)
 def test_nothing_is_left_open_and_a_second_pass_changes_nothing(task):
     for method in METHODS:
         config = resolved(task, method)
@@ -132,8 +132,3 @@ def test_a_method_declares_columns_and_labels_stay_as_asked():
     assert resolved("sorting", "koap_paper").controller.columns == "all"
     assert resolved("sorting").controller.columns == "robot" and resolved("sorting").controller.steps == 500
     assert resolved(labels=LabelConfig(count=3)).labels == LabelConfig(count=3)
-
-
-def test_every_task_s_defaults_are_options():
-    for name in TASKS:
-        resolved(name)

@@ -6,7 +6,6 @@ import torch
 from small_controllers import controller_of, plain_task
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
-from torchrl_koap.modules import SupervisedInverseDynamics
 from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.methods import METHODS
 
@@ -42,12 +41,6 @@ def test_an_entry_holds_together(name):
         assert bool(method.phases) or method.closed_form or method.fit is not None
     if method.sees == "labelled":
         assert {phase.windows for phase in method.phases} == {"labelled"}
-
-
-def test_relabel_is_a_decision_diffuser_with_a_teacher():
-    controller = controller_of("relabel")
-    assert isinstance(controller, SupervisedInverseDynamics) and controller.reader.look_ahead == (1,)
-    assert METHODS["relabel"].teacher == "dd_lookahead"
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

@@ -32,11 +32,6 @@ def test_every_network_plans(network, frames, task):
     assert sizes_of(planner) == {"network": network, "width": 16, "octaves": 2, "frames": frames}
 
 
-def test_unknown_networks_suggest_the_nearest():
-    with pytest.raises(ValueError, match="unknown planner.network 'unnet'; did you mean 'unet'"):
-        build_planner(TASK, PlannerConfig(network="unnet", width=8, frames=2))
-
-
 @pytest.mark.parametrize(
     ("preset", "method"),
     [(preset, name) for name, method in METHODS.items() if method.plans for preset in method.presets],

@@ -179,23 +179,6 @@ def steps_of(run, phase):
     return load_tensors(run / "checkpoints" / f"{phase}.safetensors")[1]["step"]
 
 
-# policies of their own
-
-
-@pytest.fixture(scope="module", params=["dp", "vpt"])
-def policy_run(request, tmp_path_factory, demonstrations, planner):
-    folder = tmp_path_factory.mktemp(request.param) / "run"
-    train_tiny(folder, demonstrations, planner, request.param)
-    return folder
-
-
-def test_a_policy_spends_the_labels_it_was_given(policy_run):
-    summary = RunDirectory(policy_run).read_json("summary.json")
-    assert summary["labels"]["selected_units"] == 2 and summary["planner_parameters"] == 0
-    teacher = METHODS[RunDirectory(policy_run).read_json("config.json")["method"]].teacher
-    assert summary["controller_updates"] == (8 if teacher else 4)
-
-
 def test_a_run_goes_on_after_it_was_moved_together_with_what_it_builds_on(tmp_path):
     """As when the folder of a curve moves to another machine with cells half done."""
     here, there = tmp_path / "here", tmp_path / "there"

@@ -178,19 +178,6 @@ def test_without_a_stretch_nothing_changes():
     assert torch.equal(response.weight, a_system().weight)
 
 
-def test_of_many_stretches_some_are_taken(monkeypatch):
-    seen, errors = [], prediction_errors
-
-    def counted(response, data, weight):
-        seen.append(len(data.known))
-        return errors(response, data, weight)
-
-    monkeypatch.setattr(response_fit, "MOST", 7)
-    monkeypatch.setattr(response_fit, "prediction_errors", counted)
-    fit_predictions(columns().double(), stretches(), coupled=True)
-    assert set(seen) == {7}
-
-
 def test_a_model_that_single_steps_get_wrong_is_put_right(monkeypatch):
     """A sensor that errs by a little makes a regression of single steps forget momentum; predictions do not."""
     data, answers = recordings(episodes=8, noise=0.003), []

@@ -79,19 +79,6 @@ def test_a_robot_that_nobody_registered(own, tmp_path):
     np.testing.assert_array_equal(actions(again.policy(), PATH[:, :3]), actions(own.policy(), PATH[:, :3]))
 
 
-def test_absolute_targets_come_back(tmp_path):
-    states = [np.random.default_rng(index).normal(size=(40, 2)).cumsum(0) for index in range(3)]
-    data, task = make_demonstrations(
-        states, [states[0][1:], None, None], control_hz=30, action_kind="absolute", targets=[0, 1]
-    )
-    trained = fit(data, task, method="linear", planner={"steps": 2, "width": 8}, progress=False)
-    saved = trained.save(tmp_path / "arm.safetensors")
-    loaded, free = load_policy(saved), load_policy(saved, limits=float("inf"))
-    far = PATH[:, :2] + 1000
-    np.testing.assert_array_equal(actions(loaded, far), actions(trained.policy(), far))
-    assert np.abs(actions(free, far) - far).max() < 500  # near where it is, not near 0
-
-
 def test_files_that_cannot_be_used_are_named(own, trained_run, tmp_path):
     good = own.save(tmp_path / "good.safetensors")
     tensors, about = load_tensors(good)

@@ -75,14 +75,6 @@ def test_an_offset_of_the_numbers_beside_frames_is_subtracted_in_float64(offset,
     assert Observer(task, cameras)(given)[0] - offset == 0.25
 
 
-def test_one_camera_of_two(tmp_path):
-    own = write_own(tmp_path)
-    assert list(embed(own, tmp_path / "seen", cameras=["wrist"])) == ["wrist"]
-    assert load_ted(tmp_path / "seen" / "ted")[1].observation_dim == 7
-    with pytest.raises(ValueError, match="unknown camera 'wrst'; did you mean 'wrist'"):
-        embed(own, tmp_path / "again", cameras=["wrst"])
-
-
 def test_an_interrupted_embedding_goes_on(tmp_path, monkeypatch):
     own, shown = write_own(tmp_path, cameras=("top",)), []
 

@@ -218,12 +218,6 @@ def test_demonstrations_of_another_task_are_refused(tmp_path):
     ]
 
 
-def test_the_target_of_stacking_is_not_read(tmp_path):
-    write_folder(tmp_path, "stacking", extra=["target-box"])
-    frames, actions = read_raw(CONVERTERS["stacking"], tmp_path)
-    assert [part.shape for part in frames] == [(4, 31), (5, 31), (6, 31)] and actions[0].shape == (3, 8)
-
-
 def test_faults_of_all_files_come_together(tmp_path):
     rng = np.random.default_rng(0)
     for number, rows in ((0, 5), (5, 1)):

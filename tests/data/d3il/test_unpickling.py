@@ -224,7 +224,12 @@ def test_damaged_files(tmp_path):
     path.touch()
     with pytest.raises(DataError, match=r"empty\.pkl.*empty"):
         load_pickle(path)
-    for other in (b"not a pickle", b"\x00" * 50, b"PK\x03\x04", content + b"more"):
+    lengths = (
+        b"\x80\x04\x95" + b"\xff" * 7 + b"\x7fN.",
+        b"\x80\x02X\xff\xff\xff\x7fa.",
+        b"\x80\x02\x8b\xff\xff\xff\x7f\x01.",
+    )
+    for other in (b"not a pickle", b"\x00" * 50, b"PK\x03\x04", b"(.", b".", b"\x80\xff.", content + b"more", *lengths):
         with pytest.raises(DataError):
             loads_pickle(other)
     with pytest.raises(FileNotFoundError):

@@ -123,12 +123,6 @@ def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):
     assert load_policy(saved, lead=0.0, gain=1.0, limits=math.inf).limits is None
 
 
-def test_the_gain_is_that_of_the_task_unless_asked():
-    own = get_task("po_sorting").defaults.execution["gain"]
-    assert own > 1 and load_policy("pretrained:po_sorting").execution.gain == own
-    assert load_policy("pretrained:po_sorting", gain=1.4).execution.gain == 1.4
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
