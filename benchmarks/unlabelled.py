@@ -80,7 +80,7 @@ def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
         data = data.copy().set("state", data["state"][:, :11]).set("action", data["action"][:, :7])
     else:
         data = robot_view(data, task)
-    return data[torch.isin(data["episode"], data["episode"].unique()[:most])], task.action_unit
+    return data[torch.isin(data["episode"], data["episode"].unique()[:most])], task.action_units[0]
 
 
 def as_own_data(data: TensorDictBase) -> tuple[TensorDictBase, Task]:

@@ -198,11 +198,10 @@ def seen(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
 def in_projection() -> Iterator[tuple[str, str, Callable[[dict[str, Any], dict[str, str]], Any]]]:
     """What is wrong, what is said, and the change of tensors and description."""
     yield "of other weights", "other|fitted", lambda _, about: about.update(weights="0" * 64)
-    for name in ("weights", "stride", "size"):
+    for name in ("weights", "size"):
         yield f"without {name}", name, lambda _, about, n=name: about.pop(n)
-    for name, value in {"stride": "9", "size": "-1"}.items():
-        yield f"{name} {value}", f"{name}|frames must be", lambda _, about, n=name, v=value: about.update({n: v})
-        yield f"{name} empty", rf"{name}|projection\.safetensors", lambda _, about, n=name: about.update({n: ""})
+    yield "size -1", "size|frames must be", lambda _, about: about.update(size="-1")
+    yield "size empty", r"size|projection\.safetensors", lambda _, about: about.update(size="")
     for name in ("mean", "components"):
         yield f"without {name}", name, lambda held, _, n=name: held.pop(n)
         yield f"{name} cut", "mean|features", lambda held, _, n=name: held.update({n: held[n][:9].clone()})

@@ -19,7 +19,7 @@ from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.envs import make_env, mode_index_of
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.envs.gym import register
+from torchrl_koap.envs.gym import ManipulationGymEnv
 from torchrl_koap.evaluation.diagnosis import contexts_of
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.keys import validate
@@ -110,7 +110,7 @@ def test_it_is_drawn():
 
 
 def test_gymnasium_knows_it():
-    register("puck/Puck-v0", NAME)
+    gymnasium.register("puck/Puck-v0", ManipulationGymEnv, kwargs={"task": NAME})
     env = gymnasium.make("puck/Puck-v0", disable_env_checker=True)
     observation, info = env.reset(seed=0)
     assert observation.shape == (4,) and info["mode_index"] == -1 and info["context"].shape == (1, 3)
@@ -120,7 +120,7 @@ def test_gymnasium_knows_it():
 
 def test_a_robot_without_simulator():
     task = get_task("arm_data")
-    assert task.action_dim == 7 and len(task.delta_actions) == 7 and task.action_unit == "rad"
+    assert task.action_dim == 7 and len(task.delta_actions) == 7 and task.action_units[0] == "rad"
     assert task.tool_columns is None and task.tool_position is None and task.gripper is None
     assert task.state_dim == 9 and task.state_names[-2:] == ("cup_x", "cup_y") and task.num_modes == 1
     for ask in (lambda: make_env(task), lambda: record_demonstrations("arm_data", episodes=1)):
@@ -147,7 +147,7 @@ def test_no_file_of_the_package_knows_them():
 def test_a_fresh_process_needs_the_import_alone():
     code = (
         "import arm_data, sys; assert 'mujoco' not in sys.modules;"
-        "from torchrl_koap.tasks import get_task; print(get_task('arm_data').action_unit)"
+        "from torchrl_koap.tasks import get_task; print(get_task('arm_data').action_units[0])"
     )
     paths = f"{HERE}:{HERE.parents[1]}"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={"PYTHONPATH": paths})

@@ -52,7 +52,6 @@ def test_actions_say_what_they_move():
 def test_units_decide_nothing_but_which_errors_are_averaged():
     actions = {"a": Action("rad"), "grip": Action("N"), "b": Action("rad", "absolute")}
     task = Task(**(TOY | {"actions": actions}))
-    assert task.action_columns() == [0, 2]
     assert task.delta_actions == (0, 1) and task.tool_columns is None and task.gripper is None
 
 

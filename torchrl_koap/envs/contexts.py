@@ -33,11 +33,6 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
 
     Raises:
         ValueError: if the task is unknown or has no contexts, or the number is below 1.
-
-    Examples:
-        >>> from torchrl_koap.envs.contexts import draw_contexts
-        >>> draw_contexts("sorting", 5, 0).shape
-        (5, 4, 3)
     """
     task = get_task(task)
     scene = _scene(task)

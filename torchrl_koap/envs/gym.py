@@ -82,11 +82,7 @@ class ManipulationGymEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode.
-
-        Args:
-            seed (int, optional): seed of the contexts drawn from now on.
-            options (dict, optional): ``"context"``: where the objects start, ``[objects, 3]``. Default: random.
+        """Starts an episode; ``options["context"]`` says where objects start ``[objects, 3]``, by default random ones.
 
         Raises:
             ValueError: for another option, or a context of a wrong shape, out of range, or of a task without objects.

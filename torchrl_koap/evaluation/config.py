@@ -79,11 +79,6 @@ def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
 
     Raises:
         ValueError: for a word that is no ``key=value``.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.config import environment_arguments
-        >>> environment_arguments(["obs_type=state", "max_episode_steps=300", "sparse=True"])
-        {'obs_type': 'state', 'max_episode_steps': 300, 'sparse': True}
     """
     found = {}
     for word in words:

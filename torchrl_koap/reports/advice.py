@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from torchrl_koap.reports.run_facts import RunFacts, number
+from torchrl_koap.reports.run_facts import RunFacts, mapping, number
 
 GOOD = 0.9  # a success rate above which nothing is looked for
 APART = 0.2  # success rates that differ by more than chance of a few dozen rollouts
@@ -108,7 +108,7 @@ def control_is_as_good(run: RunFacts) -> Advice | None:
 
 def few_labels(run: RunFacts) -> Advice | None:
     """Little is labelled, and it does not succeed yet."""
-    labels, success = run.labels, run.success()
+    labels, success = number(mapping(run.summary.get("labels")).get("labelled_transitions")), run.success()
     planner = run.experiment("planner_alone")
     if labels is None or labels >= FEW_LABELS or success is None or success >= GOOD:
         return None

@@ -42,7 +42,7 @@ def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     The bodies of tasks that have them are squares in their colours with a thin path; tools then leave no path. Entries
     as for :func:`~torchrl_koap.reports.rollout_plots.draw_plans`.
     """
-    if not run.in_a_plane:
+    if run.offline:
         raise NothingToDraw("nobody knows which columns lie in a plane")
     paths, mode, outcome = read_episodes(rollouts)
     longest = max(map(len, paths), default=0)

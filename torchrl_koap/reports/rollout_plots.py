@@ -59,7 +59,7 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     time, 1 success, 2 collision) ``[E]``; optionally ``object_position`` ``[E, T, bodies, 2]`` (m) and ``context``
     ``[E, bodies, 3]`` (x, y in m, yaw in rad).
     """
-    if not run.in_a_plane:
+    if run.offline:
         raise NothingToDraw("nobody knows which columns lie in a plane")
     paths, mode, outcome = read_episodes(rollouts)
     bodies, colors = body_paths(rollouts), mode_colors(run.modes)
@@ -99,7 +99,7 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 
 
 def _plans_caption(run: RunFacts) -> str:
-    if not run.in_a_plane:
+    if run.offline:
         return (
             "Wide line: what was executed, grey in a failure. Thin lines: every plan of that episode, from the step"
             " after it was made. Shown are the columns that actions are about, six at most. Failures come first."
@@ -128,7 +128,7 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     :func:`draw_rollouts`, with ``plan`` ``[E, P, H, 2]`` (m, NaN padded) and ``plan_step`` ``[E, P]``, the control step
     at which each plan was made (-1 padding).
     """
-    if not run.in_a_plane:
+    if run.offline:
         return _draw_plans_over_time(rollouts, run)
     paths, mode, outcome = read_episodes(rollouts)
     plan = entry(rollouts, "plan", [len(paths), None, None, 2])

@@ -70,11 +70,6 @@ class RunFacts:
         return self.task is not None and self.task.env is None
 
     @property
-    def in_a_plane(self) -> bool:
-        """Whether the position of the task is known to be x and y in metres, so that paths can be drawn from above."""
-        return self.task is None or self.task.env is not None
-
-    @property
     def control_hz(self) -> float | None:
         """Control steps per second of the task, None if it is not known."""
         return None if self.task is None else self.task.control_hz
@@ -105,16 +100,6 @@ class RunFacts:
         """Mode entropy that a uniform choice would have with as many successes; None where there is no choice."""
         choice = self.modes.number > 1 and self.successes
         return expected_entropy(self.successes, self.modes.number) if choice else None
-
-    @property
-    def execution(self) -> Mapping[str, Any]:
-        """How plans became actions in the evaluation; empty where nobody says so."""
-        return mapping(self.evaluation.get("execution"))
-
-    @property
-    def labels(self) -> float | None:
-        """Labelled transitions, None if nobody counted."""
-        return number(mapping(self.summary.get("labels")).get("labelled_transitions"))
 
     @property
     def action_errors(self) -> Mapping[str, Any]:

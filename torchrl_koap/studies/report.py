@@ -154,7 +154,7 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
 
 def _error_unit(task: str) -> str:
     try:
-        return thousandths(get_task(task).action_unit or "")[0]
+        return thousandths(get_task(task).action_units[0])[0]
     except ValueError:
         return ""
 

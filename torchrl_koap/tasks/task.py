@@ -153,15 +153,6 @@ class Task(Columns):
         """Units of the action columns."""
         return tuple(action.unit for action in self.actions.values())
 
-    @property
-    def action_unit(self) -> str:
-        """Unit of the first action column."""
-        return self.action_units[0]
-
-    def action_columns(self) -> list[int]:
-        """Returns the action columns in the unit of the first one, whose errors may be averaged."""
-        return [index for index, unit in enumerate(self.action_units) if unit == self.action_unit]
-
     @cached_property
     def delta_actions(self) -> tuple[int, ...]:
         """Action columns that are changes of a command, velocities or efforts."""

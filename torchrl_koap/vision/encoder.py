@@ -71,12 +71,11 @@ class FrozenImageEncoder(ObservationTransform):
 
     @property
     def identity(self) -> dict[str, str]:
-        """What pooled features depend on: weights, network and its stride, size of maps and of frames."""
+        """What pooled features depend on: weights, network, size of maps and of frames."""
         maps = self.backbone(torch.zeros(1, 3, *self._shown))
         return {
             "weights": self.backbone.digest,
             "network": self.backbone.name,
-            "stride": str(self.backbone.stride),
             "places": "x".join(map(str, maps.shape[2:])),
             "pooling": "grid",
             "size": "x".join(map(str, self.size)),

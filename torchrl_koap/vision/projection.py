@@ -87,7 +87,7 @@ class Projection(nn.Module):
             with safe_open(str(path), "pt") as file:
                 mean, components = (file.get_tensor(name).float() for name in ("mean", "components"))
                 about = dict(file.metadata() or {})
-            missing = [name for name in ("weights", "network", "stride", "size") if not about.get(name)]
+            missing = [name for name in ("weights", "network", "size") if not about.get(name)]
             if missing:
                 raise ValueError(f"its description has no {missing[0]!r}")
             return cls(mean, components, about)
@@ -170,10 +170,10 @@ def load_encoder(
     if network is None and about["network"] != NETWORK:
         network = about["network"]
     try:
-        stride, size = int(about["stride"]), [int(side) for side in about["size"].split("x")]
+        size = [int(side) for side in about["size"].split("x")]
     except ValueError as error:
-        raise ValueError(f"the description of the projection cannot be used, stride or size: {error}") from error
-    backbone = load_backbone(network, stride=stride)
+        raise ValueError(f"the description of the projection cannot be used, size: {error}") from error
+    backbone = load_backbone(network)
     if backbone.digest != about["weights"]:
         raise WeightsError(
             f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"

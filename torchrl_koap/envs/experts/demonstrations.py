@@ -99,12 +99,9 @@ class RecordingReport:
         )
         if self.disturbance:
             told = notes["disturbance"]
-            kept, disturbed = (
-                ", ".join(f"{n} {kind}" for kind, n in told["kept"].items()),
-                told["disturbed_demonstrations"],
-            )
-            said += f"; {disturbed} disturbed ({kept}), of which the operator recovered in"
-            said += f" {disturbed} of {told['attempts_under_disturbance']} attempts"
+            kept = ", ".join(f"{n} {kind}" for kind, n in told["kept"].items())
+            said += f"; {told['disturbed_demonstrations']} disturbed ({kept}), of which the operator recovered in"
+            said += f" {told['disturbed_demonstrations']} of {told['attempts_under_disturbance']} attempts"
         return said
 
 
@@ -121,12 +118,6 @@ def record_demonstrations(
 
     Everything is computed in float64; ``dtype`` is the floating type of the entries. Other arguments, and errors, are
     those of :func:`iterate_takes`.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-        >>> data, report = record_demonstrations("avoiding", episodes=3, seed=1)
-        >>> data["action"].shape[1], data["has_action"].all().item(), len(report.each("mode"))
-        (2, True, 3)
     """
     task, start = get_task(task), time.perf_counter()
     takes = list(iterate_takes(task, episodes, seed, disturbance=disturbance, **options))

@@ -43,24 +43,11 @@ class Attempt(NamedTuple):
 class Expert(abc.ABC):
     """Plays a batch of ``n`` episodes of a task; a subclass is named by ``Task.expert``.
 
-    Args:
-        modes (sequence of int): mode of each episode.
-        contexts (np.ndarray, optional): context ``[n, bodies, 3]``: x, y (m), yaw (rad); None in a task without bodies.
-        seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
+    Each episode has a mode and a seed, an integer or a sequence of integers as for ``numpy.random.default_rng``; in a
+    task with bodies also a context ``[bodies, 3]``: x, y (m), yaw (rad).
 
     Raises:
         ValueError: if a mode does not exist, or the numbers of modes, seeds and contexts differ.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.recording import Expert
-        >>> class Still(Expert):
-        ...     TASK = "avoiding"
-        ...
-        ...     def act(self, observation):
-        ...         return np.zeros((len(observation), 2))
-        >>> Still([0, 1], None, [0, 1]).act(np.zeros((2, 4))).shape
-        (2, 2)
     """
 
     TASK: str  # name of the task

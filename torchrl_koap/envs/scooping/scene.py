@@ -57,9 +57,10 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
   </default>
   <worldbody>
     <light pos="0.4 0.6 2" dir="0 -0.3 -1" directional="true" diffuse="0.4 0.4 0.4"/>
+    <!-- they look at (0.46, 0, 0.15) and at (0.35, 0, 0.25) -->
     <camera name="third_person" pos="1.12 -0.42 0.62" fovy="40"
-      xyaxes="{_view((1.12, -0.42, 0.62), (0.46, 0.0, 0.15))}"/>
-    <camera name="front" pos="1.6 -0.9 1.1" xyaxes="{_view((1.6, -0.9, 1.1), (0.35, 0.0, 0.25))}" fovy="42"/>
+      xyaxes="0.536875 0.843661 0 -0.434480 0.276487 0.857194"/>
+    <camera name="front" pos="1.6 -0.9 1.1" fovy="42" xyaxes="0.584305 0.811534 0 -0.392099 0.282311 0.875534"/>
     <geom name="table" class="solid" type="plane" size="2 2 0.1" rgba="0.72 0.66 0.56 1"/>
     {_bowl()}
     {"".join(_piece(i) for i in range(NUM_PIECES)) if pieces else ""}
@@ -68,17 +69,6 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
   <actuator>{motors}</actuator>
 </mujoco>"""
     return mujoco.MjModel.from_xml_string(xml)
-
-
-def _view(eye, target) -> str:
-    """Axes x and y of a camera at ``eye`` that looks at ``target``."""
-    z = [a - b for a, b in zip(eye, target, strict=True)]
-    norm = math.sqrt(sum(v * v for v in z))
-    z = [v / norm for v in z]
-    level = math.hypot(z[0], z[1])
-    x = (-z[1] / level, z[0] / level, 0.0)
-    y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
-    return " ".join(f"{v:.6f}" for v in (*x, *y))
 
 
 def _bowl() -> str:
@@ -152,15 +142,10 @@ def _arm() -> str:
             colour = _DARK if dark else _WHITE
             xml += f'<geom type="capsule" size="{radius}" fromto="{span}" rgba="{colour}" mass="0.8"/>'
         closing += "</body>"
-    # the tool's x points ahead and its z up where the flange looks straight down
-    mount = f'<body name="tool" pos="0 0 {FLANGE + HANDLE}" quat="{_mount()}" gravcomp="1">{_spoon()}</body>'
+    # half a turn about x and the flange's eighth of a turn: the tool's x points ahead and its z up at the rest pose
+    turn = "0 0.923880 -0.382683 0"
+    mount = f'<body name="tool" pos="0 0 {FLANGE + HANDLE}" quat="{turn}" gravcomp="1">{_spoon()}</body>'
     return xml + mount + closing
-
-
-def _mount() -> str:
-    """Half a turn about x, then what undoes the flange's eighth of a turn at the last joint's rest angle."""
-    eighth = math.pi / 8
-    return f"0 {math.cos(eighth):.6f} {-math.sin(eighth):.6f} 0"
 
 
 def _hand() -> str:
