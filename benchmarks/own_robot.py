@@ -31,7 +31,7 @@ from torchrl_koap import (
     train,
 )
 from torchrl_koap.data import controller_view, make_demonstrations, save_ted, select_state
-from torchrl_koap.evaluation.action_errors import first_actions
+from torchrl_koap.evaluation.data_errors import first_actions
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.training.closed_form import fit_closed_form
 

@@ -35,7 +35,7 @@ from torchrl_koap import fit
 from torchrl_koap.data import controller_view, make_demonstrations, open_dataset, select_state
 from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.envs.registry import make_env
-from torchrl_koap.evaluation.action_errors import first_actions
+from torchrl_koap.evaluation.data_errors import first_actions
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import Execution, InverseDynamics, Normalizer, blend_plan
 from torchrl_koap.runs.progress import progress_bar

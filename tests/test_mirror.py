@@ -15,7 +15,6 @@ COVERED_BY = {
     "commands/subcommands.py": "commands/test_cli.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
-    "envs/mujoco/scene.py": "envs/mujoco/test_panda.py",
     "envs/mujoco/simulation.py": "envs/mujoco/test_controller.py",
     "envs/registry.py": "plugins/test_plugins.py",
     "envs/scooping/expert.py": "envs/scooping/test_env.py",

@@ -7,7 +7,7 @@ import re
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.evaluation.action_errors import AFTER
+from torchrl_koap.evaluation.data_errors import AFTER
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.runs.weights import load_tensors
 

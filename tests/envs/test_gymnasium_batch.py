@@ -11,9 +11,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
-from toy_gym import NAMES, Reach
+from toy_gym import NAMES, Breaks, Reach
 
-from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
+from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch, GymnasiumEpisode
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, load_backbone
 from torchrl_koap.vision.backbones import MEAN, STD
@@ -148,3 +148,42 @@ def test_errors_and_clipped_actions_are_recorded_and_the_others_go_on():
         "3 of 5 actions left the environment's box and were clipped to it",
         "1 episodes failed because the environment raised an error: seed 11, step 1: RuntimeError: no place",
     ]
+
+
+ACTION = np.full(2, PUSH, dtype=np.float32)
+
+
+def played(env, steps, seed=0):
+    env.reset(seed=seed)
+    return [env.step(ACTION) for _ in range(steps)]
+
+
+def test_an_action_outside_the_box_is_clipped_and_told():
+    env, alone = (GymnasiumEpisode(Reach(), 0, max_steps=9), Reach())
+    env.reset(seed=3)
+    alone.reset(seed=3)
+    given = np.array([5.0, 0.5], dtype=np.float32)
+    observation, *_, told = env.step(given)
+    np.testing.assert_allclose(observation, alone.step(np.array([1.0, 0.5]))[0], rtol=1e-6)
+    assert told["clipped"] and not env.step(ACTION)[-1]["clipped"]
+
+
+def test_rounding_of_float32_is_no_clipping():
+    env = Reach()
+    env.action_space = gymnasium.spaces.Box(-0.1, 0.1, (2,), np.float64)
+    env = GymnasiumEpisode(env, 0, max_steps=9)
+    env.reset(seed=0)
+    assert float(ACTION[0]) > 0.1 and not env.step(ACTION)[-1]["clipped"]
+
+
+def test_an_error_in_a_step_ends_the_episode():
+    told = [step[-1] for step in played(GymnasiumEpisode(Breaks(at=2), 0, max_steps=9), 3)]
+    assert [each["error"] for each in told] == ["", "ZeroDivisionError: division by zero", ""]
+    assert [each["over"] for each in told] == [False, True, True] and not told[-1]["success"]
+    assert told[1]["truncated"] and not told[1]["terminated"]
+
+
+@pytest.mark.parametrize(("said", "wanted"), [("False", False), ("true", True), (np.array([True]), True), (0, False)])
+def test_success_may_be_said_in_words(said, wanted):
+    env = GymnasiumEpisode(Reach(), 0, max_steps=9)
+    assert env._succeeded({"is_success": said}, 0.0, False) is wanted

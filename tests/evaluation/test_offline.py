@@ -12,7 +12,7 @@ from offline_runs import save_arm, train_arm
 
 from torchrl_koap.commands.cli import main
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
-from torchrl_koap.evaluation.action_errors import summarise_errors
+from torchrl_koap.evaluation.data_errors import summarise_errors
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.config import LabelConfig

@@ -10,7 +10,7 @@ import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.mujoco.scene import scene
+from torchrl_koap.envs.mujoco.scene import panda, scene
 from torchrl_koap.tasks.aligning import BASE_HALF, DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 from torchrl_koap.tasks.modes import index_among
 
@@ -104,18 +104,17 @@ class AligningEnv(ManipulationEnv):
         return super().raw_objects() | {"target": self.targets}
 
     def _scene(self) -> Any:
-        return scene(add_objects=_add_tray_and_target)
-
-
-def _add_tray_and_target(root) -> None:
-    tray = root.worldbody.add("body", name="box")
-    tray.add("freejoint", name="box")
-    base = {"size": (BASE_HALF, BASE_HALF, 0.01), "type": "box", "rgba": (0.8, 0.655, 0.45, 1)}
-    tray.add("geom", name="base", mass=1.0, friction=(0.3, 0.001, 0.0001), priority=1, **base)
-    target = root.worldbody.add("body", name="target", mocap=True)
-    target.add("site", name="target_base", **base | {"rgba": (0.8, 0.655, 0.45, 0.5)})
-    for name, (x, y), colour in WALLS:
-        size = (0.005, BASE_HALF, 0.045) if x else (BASE_HALF, 0.005, 0.045)
-        wall = {"type": "box", "size": size, "pos": (x * BASE_HALF, y * BASE_HALF, 0.0485)}
-        tray.add("geom", name=name, mass=0.001, rgba=colour, **wall)
-        target.add("site", name=f"target_{name}", rgba=(*colour[:3], 0.4), **wall)
+        root = scene()
+        tray = root.worldbody.add("body", name="box")
+        tray.add("freejoint", name="box")
+        base = {"size": (BASE_HALF, BASE_HALF, 0.01), "type": "box", "rgba": (0.8, 0.655, 0.45, 1)}
+        tray.add("geom", name="base", mass=1.0, friction=(0.3, 0.001, 0.0001), priority=1, **base)
+        target = root.worldbody.add("body", name="target", mocap=True)
+        target.add("site", name="target_base", **base | {"rgba": (0.8, 0.655, 0.45, 0.5)})
+        for name, (x, y), colour in WALLS:
+            size = (0.005, BASE_HALF, 0.045) if x else (BASE_HALF, 0.005, 0.045)
+            wall = {"type": "box", "size": size, "pos": (x * BASE_HALF, y * BASE_HALF, 0.0485)}
+            tray.add("geom", name=name, mass=0.001, rgba=colour, **wall)
+            target.add("site", name=f"target_{name}", rgba=(*colour[:3], 0.4), **wall)
+        root.attach(panda())
+        return root

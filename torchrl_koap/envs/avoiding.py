@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.mujoco.scene import PANDA, scene
+from torchrl_koap.envs.mujoco.scene import PANDA, panda, scene
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_REACH, ROW_Y
 from torchrl_koap.tasks.modes import index_among
 
@@ -102,6 +102,7 @@ class AvoidingEnv(ManipulationEnv):
 
     def _scene(self) -> Any:
         root = scene()
+        root.attach(panda())
         for name, x, y, radius, half_height in OBSTACLES:
             body = root.worldbody.add("body", name=name, pos=(x, y, 0))
             body.add("geom", name=name, type="cylinder", size=(radius, half_height), rgba=(1, 0, 0, 1))

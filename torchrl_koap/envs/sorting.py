@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.mujoco.scene import add_free_box, scene
+from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.modes import index_among
 from torchrl_koap.tasks.sorting import (
@@ -124,11 +124,10 @@ class SortingEnv(ManipulationEnv):
                 self._mode[rows[index], count] = self._colours[nearest]
 
     def _scene(self) -> Any:
-        def add_boxes(root) -> None:
-            for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
-                add_free_box(root, name, (BOX_HALF,) * 3, _COLOURS[colour])
-
-        root = scene(link_collisions=True, add_objects=add_boxes)
+        root = scene()
+        for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
+            add_free_box(root, name, (BOX_HALF,) * 3, _COLOURS[colour])
+        root.attach(panda(link_collisions=True))
         # bodies of their own, after the boxes: contacts are listed in the order of bodies, as in the original
         platform = root.worldbody.add("body", name="platform", pos=((PLATFORM_X[0] + PLATFORM_X[1]) / 2, -0.1, 0))
         size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)

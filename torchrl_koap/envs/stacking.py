@@ -11,7 +11,7 @@ import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco import controller
-from torchrl_koap.envs.mujoco.scene import add_free_box, scene
+from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.modes import index_among
@@ -126,11 +126,10 @@ class StackingEnv(ManipulationEnv):
         self._mode[rows[arrived], place[arrived]] = nearest[arrived]
 
     def _scene(self) -> Any:
-        return scene(rod=False, arm_alpha=1.0, link_collisions=True, add_objects=_add_boxes_and_target)
-
-
-def _add_boxes_and_target(root) -> None:
-    for name, half in BOXES:
-        add_free_box(root, name, half, COLOURS[name])
-    size = (TARGET_HALF, TARGET_HALF, 0.04)
-    root.worldbody.add("site", name="target", type="box", pos=(*TARGET, 0), size=size, rgba=(1, 0.5, 0, 0.3))
+        root = scene()
+        for name, half in BOXES:
+            add_free_box(root, name, half, COLOURS[name])
+        size = (TARGET_HALF, TARGET_HALF, 0.04)
+        root.worldbody.add("site", name="target", type="box", pos=(*TARGET, 0), size=size, rgba=(1, 0.5, 0, 0.3))
+        root.attach(panda(rod=False, alpha=1.0, link_collisions=True))
+        return root

@@ -10,10 +10,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import controller_view
-from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
+from torchrl_koap.evaluation.data_errors import errors_left_out, errors_of_chunks, errors_outside_budget, plan_errors
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.loop_on_labels import check_loop
-from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.training.datasets import split_held_out

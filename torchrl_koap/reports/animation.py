@@ -185,7 +185,7 @@ def _gymnasium_frames(made: Mapping[str, Any], index: int, actions: np.ndarray, 
     """The same in the environment of Gymnasium of an ``eval.json``."""
     import gymnasium  # it and the simulator take seconds
 
-    from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode
+    from torchrl_koap.envs.gymnasium_batch import GymnasiumEpisode
     from torchrl_koap.evaluation.config import environment_arguments
 
     given, frames = environment_arguments(made.get("env_kwargs") or ()), list[np.ndarray]()

@@ -119,7 +119,7 @@ def _eval_command(run: RunFacts) -> str:
     episode = evaluation.get("episode")
     first = mapping(episode[0]) if isinstance(episode, list) and episode else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
-    options |= dict(mapping(evaluation.get("execution"))) | {key: evaluation.get(key) for key in _ABOUT_ENV}
+    options |= dict(mapping(run.evaluation.get("execution"))) | {key: evaluation.get(key) for key in _ABOUT_ENV}
     for key, value in options.items():
         if value not in (None, []):
             words += [f"--{key.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]

@@ -9,13 +9,15 @@ import pytest
 
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.mujoco import controller, kinematics
-from torchrl_koap.envs.mujoco.scene import compile_scene, scene
+from torchrl_koap.envs.mujoco.scene import compile_scene, panda, scene
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
 
 
 @pytest.fixture(scope="module")
 def model():
-    return compile_scene(scene(rod=True))
+    root = scene()
+    root.attach(panda())
+    return compile_scene(root)
 
 
 @pytest.fixture

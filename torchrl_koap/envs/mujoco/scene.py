@@ -1,16 +1,35 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all tasks share: simulator settings, table, ground, lights, cameras (docs/appendix/d3il.md, Simulator)."""
+"""The scene of D3IL's tasks as a `dm_control.mjcf` model: table, lights, cameras and the Franka Panda arm.
+
+The numbers are D3IL's (docs/appendix/d3il.md, Simulator and Robot), not those of the Panda that ships with
+``gymnasium-robotics``: only the ten meshes are taken from that package. Lengths in m, masses in kg, inertias in kg m^2,
+angles in rad, quaternions (w, x, y, z).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import importlib.util
+import math
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
 
-import mujoco
+import mujoco  # it reads MUJOCO_GL for itself, so before the variable is hidden
 
-from torchrl_koap.envs.mujoco.panda import mjcf, panda
+from torchrl_koap.envs.mujoco.kinematics import TIMESTEP
+from torchrl_koap.graphics import no_graphics
+from torchrl_koap.tasks.panda_kinematics import LINKS
 
-TIMESTEP = 0.001
-TABLE_TOP = -0.019
+# Importing dm_control opens whatever OpenGL back end it finds (and fails if MUJOCO_GL names one that is not installed),
+# although building a scene needs none. A program that wants dm_control's own renderer imports it before this package.
+if "dm_control._render" in sys.modules:
+    from dm_control import mjcf
+else:
+    with no_graphics(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from dm_control import mjcf
+
 PANDA = "panda/"  # prefix of every name of the arm inside a scene
 
 _WOOD = (0.8, 0.655, 0.45, 1)
@@ -18,19 +37,168 @@ _ALUMINIUM = (0.6, 0.6, 0.62, 1)
 _STIFF = {"solref": (0.002, 1), "solimp": (0.999, 0.999, 0.001), "contype": 7, "conaffinity": 7}
 _DRAWN = {"contype": 0, "conaffinity": 0}
 
+TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
+FLANGE_OFFSET = 0.107  # link8 along the z axis of link7
+HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z
 
-def scene(
-    *,
-    rod: bool = True,
-    arm_alpha: float = 0.3,
-    link_collisions: bool = False,
-    add_objects: Callable[[mjcf.RootElement], None] | None = None,
-):
-    """Builds the common scene with the arm attached at the origin; tasks add what stands still to the result.
+_TURN = 0.5**0.5
+_TURNS = ((1.0, 0.0, 0.0, 0.0), (_TURN, _TURN, 0.0, 0.0), (_TURN, -_TURN, 0.0, 0.0))  # about x: none, +90, -90 deg
+# mass and centre of mass of the links, by which they hang on each other
+_MASSES = (
+    (3.01399, (-0.0291898, -0.000879465, 0.0566032)),
+    (2.77281, (1.1399e-05, -0.0312655, -0.0693733)),
+    (2.7996, (-1.31766e-05, -0.0703216, 0.0311782)),
+    (2.14603, (0.0443483, 0.0249283, -0.03813)),
+    (2.18807, (-0.0385503, 0.0395256, 0.0247162)),
+    (3.19545, (-6.36776e-05, 0.0384124, -0.10997)),
+    (1.35761, (0.0510023, 0.00693267, 0.00616899)),
+    (0.417345, (0.0103614, 0.0103596, 0.0791078)),
+)
+# their principal inertia and its frame
+_INERTIA = (
+    ((0.0126801, 0.0117603, 0.00856656), (0.00411744, 0.564916, 0.0132875, 0.825031)),
+    ((0.0164224, 0.0153969, 0.00546286), (0.98466, 0.174481, -0.000101815, 0.000347662)),
+    ((0.016787, 0.0157415, 0.00553027), (0.57484, 0.818266, -6.05764e-05, -6.61626e-05)),
+    ((0.00915257, 0.00896477, 0.00384742), (0.0615263, 0.349824, 0.234291, 0.904956)),
+    ((0.00946899, 0.00928491, 0.00396694), (0.813566, 0.465041, 0.309792, 0.160858)),
+    ((0.0278873, 0.0268823, 0.00569569), (0.990767, -0.135571, 0.000963106, 0.000694406)),
+    ((0.00412168, 0.0033698, 0.00213304), (-0.0460841, 0.754362, 0.044494, 0.653325)),
+    ((0.000637671, 0.000528056, 0.000279577), (0.63547, 0.278021, -0.670462, 0.263369)),
+)
+_LOW = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)  # of the joints
+_HIGH = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
+_MOTOR_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+_FINGER_LIMIT = 70.0
+_MESHES = (*(f"link{i}" for i in range(8)), "hand", "finger")
 
-    World: x forward, y left, z up, robot base at the origin; the table top lies at z = -0.019 m. ``add_objects`` adds
-    the free bodies of the task, before the arm is attached, so that they come first in the state vector. The rest is
-    the arm's, see :func:`~torchrl_koap.envs.mujoco.panda.panda`.
+
+def mesh_folder() -> Path:
+    """Finds the ten detailed Panda meshes of the installed ``gymnasium-robotics`` package.
+
+    Raises:
+        ImportError: if the package is not installed.
+        FileNotFoundError: if this version of the package has no such meshes.
+    """
+    spec = importlib.util.find_spec("gymnasium_robotics")
+    if spec is None or spec.origin is None:
+        raise ImportError(
+            "the Panda meshes come from the package 'gymnasium-robotics', which is not installed:"
+            " pip install 'gymnasium-robotics>=1.4'"
+        )
+    folder = Path(spec.origin).parent / "envs" / "assets" / "kitchen_franka" / "franka_assets" / "meshes" / "visual"
+    missing = [name for name in _MESHES if not _mesh(folder, name).exists()]
+    if missing:
+        raise FileNotFoundError(
+            f"the installed 'gymnasium-robotics' has no Panda mesh {missing[0]}.stl in {folder} (version 1.4.2 does)"
+        )
+    return folder
+
+
+def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3) -> mjcf.RootElement:
+    """Builds the arm: 7 hinge joints, 2 finger slides, 9 motors, TCP body, wrist camera, optionally a rod in the hand.
+
+    What can touch something always collides: rod, fingers, finger pads and hand. Names: joints ``joint1`` ...
+    ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ... ``link8``, ``hand``, ``tcp``,
+    geom ``rod``, camera ``wrist``.
+
+    With ``link_collisions`` the convex hulls of links 0-7 collide with objects and table too. The original lets them
+    collide with each other as well, which joint limits and tasks keep them from; testing takes time.
+
+    Raises:
+        ImportError: if ``gymnasium-robotics``, which holds the meshes, is not installed.
+    """
+    folder = mesh_folder()
+    root = mjcf.RootElement(model="panda")
+    root.compiler.angle = "radian"
+    for name in _MESHES:
+        root.asset.add("mesh", name=name, file=str(_mesh(folder, name)))
+    colour, dark = (0.95, 0.95, 0.95, alpha), (0.25, 0.25, 0.28, alpha)
+    hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
+
+    body = root.worldbody
+    placed = (((0.0, 0.0, 0.0), 0), *LINKS)
+    links = zip(placed, _MASSES, _INERTIA, strict=True)
+    for index, ((offset, turn), (mass, com), (inertia, frame)) in enumerate(links):
+        body = body.add("body", name=f"link{index}", pos=offset, quat=_TURNS[turn])
+        body.add("inertial", mass=mass, pos=com, diaginertia=inertia, quat=frame)
+        if index:
+            joint = {"type": "hinge", "axis": (0, 0, 1), "limited": True, "range": (_LOW[index - 1], _HIGH[index - 1])}
+            body.add("joint", name=f"joint{index}", **joint)
+        wrist = {"solimp": (1.998, 1.999, 0.0)} if index == 7 else {}
+        body.add("geom", name=f"link{index}", type="mesh", mesh=f"link{index}", rgba=colour, **hull, **wrist)
+
+    flange = body.add("body", name="link8", pos=(0, 0, FLANGE_OFFSET))
+    flange.add("inertial", mass=0.1, pos=(0, 0, 0), diaginertia=(0.1, 0.1, 0.1))
+    hand = flange.add("body", name="hand", quat=HAND_QUAT)
+    hand.add(
+        "inertial",
+        mass=0.670782,
+        pos=(-2.76618e-6, -0.00061547, 0.0239295),
+        diaginertia=(0.00227632, 0.00206087, 0.000456542),
+        quat=(0.697945, 0.716151, -0.000242485, 8.47563e-5),
+    )
+    hand.add("geom", name="hand", type="mesh", mesh="hand", rgba=colour, solimp=(1.998, 1.999, 0.0))
+    hand.add("camera", name="wrist", pos=(0.1, 0, 0), euler=(0, 3.14, 1.57), fovy=60)
+    hand.add("body", name="tcp", pos=(0, 0, TCP_OFFSET))
+    if rod:
+        _add_rod(hand)
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        _add_finger(hand, side, name, dark)
+
+    chain = [f"link{i}" for i in range(9)] + ["hand"]
+    for first, second in zip(chain, chain[1:], strict=False):
+        root.contact.add("exclude", body1=first, body2=second)
+    motors = [(f"joint{i + 1}", limit) for i, limit in enumerate(_MOTOR_LIMITS)]
+    motors += [("finger_left", _FINGER_LIMIT), ("finger_right", _FINGER_LIMIT)]
+    for motor, limit in motors:
+        root.actuator.add("motor", name=motor, joint=motor, gear=(1,), forcelimited=True, forcerange=(-limit, limit))
+    return root
+
+
+def _mesh(folder: Path, name: str) -> Path:
+    return folder / f"{name}.stl"
+
+
+def _add_rod(hand: mjcf.Element) -> None:
+    # D3IL leaves the inertia of rod and tip to their shapes, at the density of water
+    radius, length, density = 0.01, 0.3, 1000.0
+    mass = density * math.pi * radius**2 * length
+    across, along = mass * (3 * radius**2 + length**2) / 12, mass * radius**2 / 2
+    rod = hand.add("body", name="rod")
+    rod.add("inertial", mass=mass, pos=(0, 0, 0.075), diaginertia=(across, across, along))
+    rod.add("geom", name="rod", type="cylinder", size=(0.01, 0.15), pos=(0, 0, 0.075), rgba=(0.2, 0.4, 0.8, 1))
+    tip = rod.add("body", name="rod_tip")
+    mass = density * 4 / 3 * math.pi * radius**3
+    tip.add("inertial", mass=mass, pos=(0, 0, 0.225), diaginertia=(0.4 * mass * radius**2,) * 3)
+    drawn = {"contype": 0, "conaffinity": 0, "rgba": (0.2, 0.4, 0.8, 1)}
+    tip.add("geom", name="rod_tip", type="sphere", size=(0.01,), pos=(0, 0, 0.225), **drawn)
+
+
+def _add_finger(hand: mjcf.Element, side: float, name: str, colour: tuple) -> None:
+    finger = hand.add("body", name=f"finger_{name}", pos=(0, 0, 0.0584))
+    finger.add(
+        "inertial",
+        mass=0.0218754,
+        pos=(-2.42335e-5 * side, 0.0119585 * side, 0.0237816),
+        diaginertia=(5.69661e-6, 5.56035e-6, 1.55183e-6),
+        quat=(0.996177, 0.0868631 * side, -2.77937e-5 * side, -0.00926642),
+    )
+    slide = {"type": "slide", "axis": (0, side, 0), "limited": True, "range": (0, 0.04), "damping": 10}
+    finger.add("joint", name=f"finger_{name}", **slide)
+    firm = {"condim": 4, "margin": 0.001, "solimp": (0.998, 0.999, 0.001)}
+    turned = {} if side > 0 else {"quat": (0, 0, 0, 1)}
+    shape = {"type": "mesh", "mesh": "finger", "friction": (1, 0.005, 0.0001), "solref": (0.02, 1), "rgba": colour}
+    finger.add("geom", name=f"finger_{name}", **shape, **firm, **turned)
+    tip = finger.add("body", name=f"finger_tip_{name}", pos=(0, 0.0085 * side, 0.056))
+    tip.add("inertial", mass=0.01, pos=(0, 0, 0), diaginertia=(0.01, 0.01, 0.01), quat=(0, 0, 0, 1))
+    pad = {"type": "box", "size": (0.008, 0.004, 0.008), "pos": (0, -0.005 * side, -0.012), "rgba": colour}
+    tip.add("geom", name=f"pad_{name}", **pad, friction=(2, 0.05, 0.0001), solref=(0.01, 0.5), **firm)
+
+
+def scene() -> mjcf.RootElement:
+    """Builds what all tasks share. They attach the arm after their free bodies, which come first in the state vector.
+
+    World: x forward, y left, z up, robot base at the origin; the table top lies at z = -0.019 m.
     """
     root = mjcf.RootElement(model="d3il")
     root.compiler.angle = "radian"
@@ -65,9 +233,6 @@ def scene(
         for y in (-0.96, 0.96):
             bar = {"type": "box", "pos": (x, y, -0.48), "size": (0.02, 0.02, 0.459), "rgba": _ALUMINIUM}
             table.add("geom", **bar, **_DRAWN)
-    if add_objects is not None:
-        add_objects(root)
-    root.attach(panda(rod=rod, alpha=arm_alpha, link_collisions=link_collisions))
     return root
 
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from torchrl_koap.envs.mujoco.kinematics import Q_REST
-from torchrl_koap.envs.mujoco.panda import panda
-from torchrl_koap.envs.mujoco.scene import TABLE_TOP, compile_scene, scene
+from torchrl_koap.envs.mujoco.scene import compile_scene, panda, scene
 
 
 def compiled(**arguments) -> mujoco.MjModel:
@@ -60,12 +59,12 @@ def test_consecutive_links_never_collide_although_their_hulls_overlap():
 
 
 def test_scene_settings():
-    model = compile_scene(scene(rod=True))
+    model = compile_scene(scene())
     option = model.opt
     assert (option.timestep, option.impratio, option.tolerance, option.iterations) == (0.001, 3.0, 1e-10, 100)
     assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and option.integrator == mujoco.mjtIntegrator.mjINT_EULER
     table = model.geom("table_top")
-    assert table.pos[2] + table.size[2] == pytest.approx(TABLE_TOP)
+    assert table.pos[2] + table.size[2] == pytest.approx(-0.019)
 
 
 def test_the_rod_ends_12_cm_below_the_tcp():
