@@ -24,7 +24,7 @@ def test_the_nearest_name_is_suggested(name, near):
     assert str(error.value) == f"unknown thing {name!r}; did you mean {near!r}?"
 
 
-@pytest.mark.parametrize("name", ["", "xyzzy", None, 3, ["dense"], {"dense": 1}, b"dense", float("nan")])
+@pytest.mark.parametrize("name", ["", "xyzzy", None, ["dense"], float("nan")])
 def test_without_a_near_name_all_are_listed(name):
     with pytest.raises(ValueError) as error:
         lookup(TABLE, name, "thing")

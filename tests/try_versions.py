@@ -28,7 +28,6 @@ TESTS = (
         "tests/objectives",
         "tests/data",
         "tests/envs/test_avoiding.py",
-        "tests/envs/test_avoiding_batches.py",
         "tests/training/test_loop.py",
     ),
 )

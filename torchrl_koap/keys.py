@@ -96,11 +96,7 @@ def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, re
 
 
 def observed_numbers(given: Any) -> Tensor:
-    """Reads an observation as a tensor: tensors as they are, all else as float64; what is masked or None is NaN.
-
-    Raises:
-        ValueError: if it holds anything but numbers.
-    """
+    """Reads an observation as a tensor: tensors as they are, all else as float64; what is masked or None is NaN."""
     if isinstance(given, Tensor):
         return given
     try:
@@ -113,11 +109,7 @@ def observed_numbers(given: Any) -> Tensor:
 
 
 def frame_mask(mask: Tensor | None, name: object, state: Tensor) -> Tensor:
-    """Checks a mask of the frames of windows ``[*B, T, d]``, which may have a trailing 1, and returns ``[*B, T]``.
-
-    Raises:
-        ValueError: for another shape or type; says what it is and what it is of (``name``).
-    """
+    """Checks a mask of the frames of windows ``[*B, T, d]``, which may have a trailing 1, and returns ``[*B, T]``."""
     frames = state.shape[:-1]
     if mask is None or mask.shape not in (frames, (*frames, 1)) or mask.dtype != torch.bool:
         got = "None: hand in 'has_action'" if mask is None else f"{mask.dtype} {list(mask.shape)}"

@@ -73,13 +73,7 @@ class Demos(Command):
     plugins: Plugins = ()
 
     def __call__(self) -> RecordingReport | VideoReport:
-        """Records and writes; returns what it took.
-
-        Raises:
-            FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
-            ValueError: if the task has no environment or no scripted expert.
-            RecordingError: if the expert fails again and again.
-        """
+        """Records and writes; returns what it took."""
         load_plugins(self.plugins)
         task = get_task(self.task)
         if task.env is None or task.expert is None:
@@ -252,11 +246,7 @@ class Validate(Command):
     plugins: Plugins = ()
 
     def __call__(self) -> dict[str, str]:
-        """Reads and checks demonstrations.
-
-        Raises:
-            DataError: with all problems.
-        """
+        """Reads and checks demonstrations."""
         load_plugins(self.plugins)
         task = find_task_of(self.dataset, self.task)
         with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:

@@ -39,11 +39,7 @@ class Doctor(Command):
     run: tyro.conf.Positional[Path | None] = None
 
     def __call__(self) -> dict[str, str]:
-        """Facts about this machine, or about a run, name to value.
-
-        Raises:
-            RunDirectoryError: with all problems of a run.
-        """
+        """Facts about this machine, or about a run, name to value."""
         return machine_facts() if self.run is None else check_run(self.run)
 
 
@@ -64,11 +60,7 @@ def machine_facts() -> dict[str, str]:
 
 
 def check_run(folder: Path) -> dict[str, str]:
-    """Reads every file of a run that a command would read, checksums included; returns what was found by file.
-
-    Raises:
-        RunDirectoryError: with all problems.
-    """
+    """Reads every file of a run that a command would read, checksums included; returns what was found by file."""
     run, problems, found = RunDirectory(folder), [], {}
     for name in ("config.json", "summary.json", *_LATER):
         if name in _LATER and not (folder / name).exists():

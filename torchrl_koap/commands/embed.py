@@ -55,13 +55,7 @@ class Embed(Command):
     plugins: Plugins = ()
 
     def __call__(self) -> dict[str, Any]:
-        """Reads, embeds and writes.
-
-        Raises:
-            WeightsError: if weights are missing or of another network.
-            DataError: if a source is none, or frames are missing, damaged or unlike the others.
-            ValueError: if the projection is damaged, or there is no such camera.
-        """
+        """Reads, embeds and writes."""
         load_plugins(self.plugins)
         if self.components < 1:
             raise ValueError(f"--components must be at least 1, got {self.components}")

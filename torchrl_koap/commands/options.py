@@ -189,12 +189,7 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
 
 
 def check_call(kind: Any, arguments: Sequence[str]) -> None:
-    """Checks that a call names a command and options that its help lists, with numbers where it says so.
-
-    Raises:
-        ValueError: for the first unknown name, with the nearest one of that command, or the first value that is no
-            number.
-    """
+    """Checks that a call names a command and options that its help lists, with numbers where it says so."""
     command = next(iter(arguments), "-")
     if command.startswith("-"):
         return

@@ -196,11 +196,7 @@ def trim_still(recordings: Recordings) -> Recordings:
 
 
 def drop_short(recordings: Recordings) -> Recordings:
-    """Leaves out trajectories with fewer steps than a window; ``skipped`` names them.
-
-    Raises:
-        DataError: if none is left.
-    """
+    """Leaves out trajectories with fewer steps than a window; ``skipped`` names them."""
     kept = [index for index, steps in enumerate(recordings.actions) if len(steps) >= WINDOW]
     if not kept:
         raise DataError("these recordings", f"no trajectory has the {WINDOW} steps of a window")

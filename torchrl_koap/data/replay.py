@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         root (str or Path): folder of the demonstrations, see :func:`~torchrl_koap.data.open_dataset`.
         label_budget (LabelBudget, optional): hides labels, and commands whose changes are labels, from everything that
             uses this data set; what was spent is in :attr:`label_report`.
-        progress (callable, optional): called with the number of raw files read and that of all.
         batch_size, sampler, sample_unit, transform, prefetch, collate_fn (optional): as in
             :class:`~torchrl.data.TensorDictReplayBuffer`.
 
@@ -57,11 +55,10 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         root: str | Path,
         *,
         label_budget: LabelBudget | None = None,
-        progress: Callable[[int, int], None] | None = None,
         **kwargs: Any,
     ):
         self.root = Path(root).expanduser()
-        data, self.task = open_dataset(root, task=get_task(task), progress=progress)
+        data, self.task = open_dataset(root, task=get_task(task))
         keys.validate(data, command=self.task.command_columns)
         self.label_report: LabelReport | None = None
         if label_budget is not None:

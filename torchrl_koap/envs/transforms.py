@@ -16,16 +16,10 @@ from torchrl_koap.tasks import Task, get_task
 
 
 class PartialObservation(ObservationTransform):
-    """Drops parts of the observations ``[*B, obs]``: by default what ``Task.state_of`` leaves out.
-
-    Args:
-        task (Task or str): the task whose parts are named.
-        drop (sequence of str, optional): parts to drop, names of ``Task.observation``. Default: the command and
-            ``Task.hidden``.
+    """Leaves of observations ``[*B, obs]`` what ``Task.state_of`` does: no command, and nothing of ``Task.hidden``.
 
     Raises:
-        ValueError: for a part that the task does not have, or if nothing would remain. When applied, if the observation
-            has another number of columns than the task.
+        ValueError: when applied, if the observation has another number of columns than the task.
 
     Examples:
         >>> import torch
@@ -36,31 +30,20 @@ class PartialObservation(ObservationTransform):
         torch.Size([3, 10])
     """
 
-    def __init__(self, task: Task | str, drop: Sequence[str] | None = None):
+    def __init__(self, task: Task | str):
         super().__init__(in_keys=[OBSERVATION], out_keys=[OBSERVATION])
         self.task = get_task(task)
-        parts, drop = self.task.observation, (self.task.command, *self.task.hidden) if drop is None else drop
-        unknown = [name for name in drop if name not in (*parts, None)]
-        if unknown:
-            raise ValueError(f"task {self.task.name!r} has no part {unknown[0]!r}; known: {', '.join(parts)}")
-        kept = [column for name, part in parts.items() if name not in drop for column in range(part.start, part.stop)]
-        if not kept:
-            raise ValueError(f"nothing of task {self.task.name!r} remains without {', '.join(drop)}")
-        self.register_buffer("columns", torch.tensor(kept), persistent=False)
 
     def _apply_transform(self, observation: Tensor) -> Tensor:
-        if observation.shape[-1] != self.task.observation_dim:
-            wanted = f"{OBSERVATION!r} of task {self.task.name!r} has {self.task.observation_dim} columns"
-            raise ValueError(f"{wanted}, got {observation.shape[-1]}")
-        return observation[..., self.columns]
+        return self.task.state_of(observation)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """The specification without the dropped columns."""
+        """The specification without the columns that are left out."""
         spec = observation_spec[OBSERVATION]
-        shape = (*spec.shape[:-1], len(self.columns))
+        shape = (*spec.shape[:-1], self.task.state_dim)
         observation_spec[OBSERVATION] = Unbounded(shape, device=spec.device, dtype=spec.dtype)
         return observation_spec
 

@@ -141,9 +141,6 @@ def draw_pictures(
     Returns:
         dict: what went wrong, a message per picture that could not be drawn although its source is there. A picture
         whose source is absent, or holds nothing to draw, is not an error.
-
-    Raises:
-        FileNotFoundError: if there is no such directory.
     """
     run = RunFacts.read(folder)
     problems = {}

@@ -44,11 +44,7 @@ class RunFacts:
 
     @classmethod
     def read(cls, folder: str | Path) -> RunFacts:
-        """Reads the JSON files of a run directory, those that are there.
-
-        Raises:
-            FileNotFoundError: if there is no such directory.
-        """
+        """Reads the JSON files of a run directory, those that are there."""
         folder, damaged = Path(folder), []
         if not folder.is_dir():
             raise FileNotFoundError(f"there is no run directory {str(folder)!r}")

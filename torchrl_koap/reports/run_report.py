@@ -26,9 +26,6 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
     """Writes ``index.html`` into a run directory; sections whose files are absent say which command makes them.
 
     Pictures are drawn first (``draw``; otherwise those already there are shown), moving ones too (``animation``).
-
-    Raises:
-        FileNotFoundError: if there is no such directory.
     """
     run = RunFacts.read(folder)
     problems = draw_pictures(run.folder, animation=animation) if draw else {}

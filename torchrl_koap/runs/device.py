@@ -70,11 +70,7 @@ def set_up_torch(threads: int | None, device: str) -> None:
 
 
 def check_machine(threads: int | None, device: str) -> None:
-    """Refuses a number of threads and a name of a device that no machine has.
-
-    Raises:
-        ValueError: naming which of them.
-    """
+    """Refuses a number of threads and a name of a device that no machine has."""
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be >= 1, got {threads}")
     if threads is not None and threads > _MOST_THREADS:

@@ -30,11 +30,7 @@ def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
 
 
 def check_resume(run: RunDirectory, config: TrainConfig) -> None:
-    """Refuses a folder that holds another run than what is to be trained, or was not asked to be resumed.
-
-    Raises:
-        RunDirectoryError: naming what differs.
-    """
+    """Refuses a folder that holds another run than what is to be trained, or was not asked to be resumed."""
     if not (run.path / "config.json").exists():
         names = ("planner.safetensors", "controller.safetensors", "checkpoints")
         if left := [name for name in names if (run.path / name).exists()]:
@@ -54,9 +50,6 @@ def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
     """Refuses to go on with other demonstrations, or another version of this package, than a run was begun with.
 
     ``content`` is what ``config.json`` is to hold, ``data`` and ``versions`` included.
-
-    Raises:
-        RunDirectoryError: naming what differs.
     """
     if not (run.path / "config.json").exists():
         return

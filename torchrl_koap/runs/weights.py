@@ -49,11 +49,7 @@ def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any
 
 
 def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[str, nn.Module | None]) -> None:
-    """Hands several modules, those that are not None, their weights, of names ``"PART.ENTRY"`` in a file.
-
-    Raises:
-        CheckpointError: as :func:`load_weights`.
-    """
+    """Hands several modules, those that are not None, their weights, of names ``"PART.ENTRY"`` in a file."""
     for part, module in parts.items():
         if module is not None:
             own = {name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")}

@@ -16,11 +16,7 @@ ENTROPIES = ("all", "contexts", "solved_contexts")
 
 
 def check_task(task: Task) -> None:
-    """Checks a task.
-
-    Raises:
-        ValueError: with all faults, one a line, each naming the field.
-    """
+    """Checks a task."""
     faults = [] if task.name and isinstance(task.name, str) else [f"name: wanted a name, got {task.name!r}"]
     if not faults and (set("/\\") & set(task.name) or task.name in (".", "..")):
         faults.append(f"name: part of the names of files, it may hold no / or \\, got {task.name!r}")

@@ -53,11 +53,7 @@ class Modes:
 
 
 def index_among(leaves: Sequence[Sequence[int]], leaf: Tensor) -> Tensor:
-    """Returns which of the leaves of all modes a leaf ``mode`` ``[*B, entries]`` is, int64 ``[*B]``; -1: none of them.
-
-    Raises:
-        ValueError: if the leaf has another number of entries.
-    """
+    """Returns which of the leaves of all modes a leaf ``mode`` ``[*B, entries]`` is, int64 ``[*B]``; -1: none."""
     if leaf.shape[-1] != len(leaves[0]):
         raise ValueError(f"mode must have {len(leaves[0])} entries on the last axis, got shape {list(leaf.shape)}")
     same = (leaf.unsqueeze(-2) == torch.tensor(leaves, device=leaf.device)).all(-1)

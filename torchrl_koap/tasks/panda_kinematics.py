@@ -21,11 +21,7 @@ _FLANGE_TO_TOOL = 0.212  # m along the last joint's axis
 
 
 def tool_position(joints: Tensor) -> Tensor:
-    """Computes the position of the tool ``[*B, 3]`` (m, robot base at the origin) from arm joints ``[*B, 7]`` (rad).
-
-    Raises:
-        ValueError: if there are not seven joints on the last axis.
-    """
+    """Computes the position of the tool ``[*B, 3]`` (m, robot base at the origin) from arm joints ``[*B, 7]`` (rad)."""
     if joints.shape[-1] != 7:
         raise ValueError(f"seven joints are needed on the last axis, got shape {list(joints.shape)}")
     x, y, z = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(*joints.shape[:-1], 3, 3).unbind(-1)

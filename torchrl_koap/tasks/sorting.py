@@ -156,11 +156,7 @@ register_task(
 
 
 def sorting_task(num_boxes: int) -> Task:
-    """Returns the task with 2, 4 or 6 boxes.
-
-    Raises:
-        ValueError: for another number.
-    """
+    """Returns the task with 2, 4 or 6 boxes."""
     if num_boxes not in _BY_BOXES:
         raise ValueError(f"num_boxes must be one of {', '.join(map(str, sorted(_BY_BOXES)))}, got {num_boxes!r}")
     return _BY_BOXES[num_boxes]

@@ -40,9 +40,6 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
     left; of a single trajectory none can be.
 
     The fraction is a share of all trajectories of flat data ``[N]``, in ``[0, 1)``; None is 0.
-
-    Raises:
-        ValueError: if the share is out of range.
     """
     if not fraction:
         return []
@@ -71,9 +68,6 @@ def split_held_out(
     """Parts flat data ``[N]`` in what a planner learns from, what is held out from it, and what a controller sees.
 
     The second is None where nothing is held out. A controller sees held-out trajectories that have a label.
-
-    Raises:
-        ValueError: if nothing is left.
     """
     if not len(episodes):
         return data, None, data

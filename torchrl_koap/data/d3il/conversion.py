@@ -148,12 +148,7 @@ def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
 def read_raw(
     converter: Converter, root: str | Path, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Reads raw demonstrations, one trajectory per file: frames ``[T, obs]`` and actions ``[T - 1, act]``, float64.
-
-    Raises:
-        DataError: with the problems of all files.
-        FileNotFoundError: if there are none.
-    """
+    """Reads raw demonstrations, one trajectory per file: frames ``[T, obs]`` and actions ``[T - 1, act]``, float64."""
     problems: list[str] = []
     frames: list[np.ndarray] = []
     actions: list[np.ndarray] = []
@@ -183,11 +178,7 @@ def read_raw(
 
 
 def read_raw_episode(path: str | Path, *, robot: Sequence[str] = (), objects: Sequence[str] = ()) -> RawEpisode:
-    """Reads and checks a pickle, in which entries ``robot`` and poses of ``objects`` must be there.
-
-    Raises:
-        DataError: with all problems.
-    """
+    """Reads and checks a pickle, in which entries ``robot`` and poses of ``objects`` must be there."""
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("robot"), dict):
         held = f"the keys {sorted(map(str, content))}" if isinstance(content, dict) else f"a {type(content).__name__}"

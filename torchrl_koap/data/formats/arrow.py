@@ -11,11 +11,7 @@ import numpy as np
 
 
 def import_pyarrow() -> Any:
-    """The package pyarrow.
-
-    Raises:
-        RuntimeError: if it is not installed; the message names the extra.
-    """
+    """The package pyarrow."""
     if importlib.util.find_spec("pyarrow") is None:
         raise RuntimeError("parquet files and LeRobot data sets need an extra: pip install 'torchrl_koap[lerobot]'")
     import pyarrow

@@ -54,9 +54,6 @@ def assemble(
     Options are those of :func:`~torchrl_koap.data.read_recordings`. Messages call the whole ``source``. Of what the
     reader knows, time stamps must agree with ``declared_hz``; ``action_names`` count where nothing has actions;
     ``skipped`` was left out already, and ``no_rate`` is said where nothing tells the rate.
-
-    Raises:
-        DataError: with all faults.
     """
     if not pieces:
         raise DataError(source, "there are no trajectories")

@@ -298,11 +298,7 @@ def _video_starts(root: Path, camera: str) -> dict[int, tuple[int, int, float]]:
 
 
 def check_cameras(pieces: Sequence[Piece], source: str) -> None:
-    """Checks that every trajectory has every camera, and a frame per row.
-
-    Raises:
-        DataError: with all that is missing.
-    """
+    """Checks that every trajectory has every camera, and a frame per row."""
     names = dict.fromkeys(name for piece in pieces for name in piece.cameras)
     problems = []
     for name in names:

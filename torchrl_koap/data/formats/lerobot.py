@@ -133,9 +133,6 @@ def read_rows(
 
     They are float64 ``[T, d]``, NaN where a row is empty; ``frame_index`` is ``[T]``. ``file`` is where the rows lie.
     Columns of the files that are not read come second.
-
-    Raises:
-        DataError: with the problems of all files and episodes.
     """
     root = Path(root).expanduser()
     table, unread = _read_table(root, (*features, EPISODE, FRAME), (ACTION, TIME, *flags))

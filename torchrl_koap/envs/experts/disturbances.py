@@ -38,11 +38,7 @@ def share_disturbed(task: Task, share: float | None) -> float:
 
 
 def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
-    """Draws which episodes of a recording are disturbed, bool ``[episodes]``; none depends on how many there are.
-
-    Raises:
-        ValueError: if the share is not between 0 and 1.
-    """
+    """Draws which episodes of a recording are disturbed, bool ``[episodes]``; none depends on how many there are."""
     if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 <= share <= 1:
         raise ValueError(f"disturbance must be the share of the episodes that are disturbed, 0 to 1, got {share!r}")
     return np.random.default_rng((seed, _CHOICE_STREAM)).random(episodes) < share

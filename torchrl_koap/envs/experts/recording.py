@@ -71,11 +71,7 @@ class Expert(abc.ABC):
 
     @abc.abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step.
-
-        Raises:
-            ValueError: if the observations have another shape.
-        """
+        """Decides actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step."""
 
     def touching(self, env: Any) -> np.ndarray:
         """Where something forbidden is touched in an environment, bool ``[n]``."""
@@ -111,11 +107,7 @@ def ar1_noise(
 
 
 def expert_of(task: Task) -> type[Expert]:
-    """Returns the task's scripted expert.
-
-    Raises:
-        ValueError: if it has none.
-    """
+    """Returns the task's scripted expert."""
     if task.expert is None:
         raise ValueError(f"task {task.name!r} has no scripted expert (Task.expert is None): nothing can be recorded")
     return resolve(task.expert, f"expert of task {task.name!r}")

@@ -27,9 +27,6 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
     """Compiles the scene of a ``"robot"``, a Panda of seven actuated joints, or a ``"hand"``, which moves freely.
 
     The pieces' free joints come first, then those of what holds the spoon; the bowl is the only mocap body.
-
-    Raises:
-        ValueError: for another embodiment.
     """
     holder, kinds = lookup({"robot": (_arm, _ARM_SERVO), "hand": (_hand, _HAND_SERVO)}, embodiment, "embodiment")
     motors = "".join(f'<position name="a{i}" joint="j{i}" kp="{kp}" kv="{kv}"/>' for i, (kp, kv) in enumerate(kinds, 1))

@@ -66,9 +66,6 @@ class Denoiser(nn.Module):
     Keyword Args:
         frequencies (int): octaves of the condition's Fourier features.
         condition_width (int): width ``w`` of the :class:`ConditionEncoder`.
-
-    Raises:
-        ValueError: at the call for a sequence or condition of another shape.
     """
 
     def __init__(self, state_dim: int, condition_dim: int, *, frequencies: int, condition_width: int):
