@@ -36,9 +36,6 @@ def test_both_tables_are_whole():
     ("task", "method", "level", "share", "text"),
     [
         ("avoiding", "koap", 1, 0.02, "78.0 +- 8.6"),
-        ("avoiding", "dp", 5, 0.5, "94.7 +- 1.8"),
-        ("aligning", "koap", 5, 0.5, "92.0 +- 5.4"),
-        ("sorting", "dd", 2, 0.02, "49.7 +- 7.6"),
         ("po_sorting", "vae", 3, 0.05, "16.4 +- 1.9"),
         ("stacking_unobserved_joints", "koap", 4, 0.1, "37.0 +- 10.8"),
         ("stacking_1", "koap", 4, 0.1, "37.0 +- 10.8"),

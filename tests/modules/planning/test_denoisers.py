@@ -136,7 +136,3 @@ def test_every_task_s_relations_fit_its_state_and_travel_with_the_planner(name):
     planner.fit_normalizers(windows)
     assert planner.encode_history(windows[:5, :2]).shape == (5, width)
     assert planner.sample(windows[:5, :2]).shape == (5, 14, task.state_dim)
-
-
-def test_avoiding_has_none():
-    assert not get_task("avoiding").relative_columns()

@@ -58,28 +58,3 @@ def test_both_modes_of_a_bimodal_future_appear(exploration):
         plans = planner.sample(torch.zeros(600, 1, 1))
     torch.testing.assert_close(plans.abs(), torch.ones_like(plans), atol=0.02, rtol=0)
     assert 0.42 < (plans > 0).float().mean() < 0.58
-
-
-def goal_walks(count, *, frames=16, seed=0):
-    """A column that goes a tenth of the way to the other one in every frame."""
-    generator = torch.Generator().manual_seed(seed)
-    place, goal = torch.randn(2, count, generator=generator).unbind(0)
-    rows = []
-    for _ in range(frames):
-        rows.append(torch.stack([place, goal], -1))
-        place = place + 0.1 * (goal - place)
-    return torch.stack(rows, 1)
-
-
-def test_a_plan_comes_back_and_known_states_are_kept():
-    torch.manual_seed(0)
-    model = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2)
-    windows = goal_walks(40) + 0.1 * torch.randn(40, 16, 2, generator=torch.Generator().manual_seed(3))
-    model.fit_normalizers(windows)
-    history, plan = model.split_window(windows)
-    encoded = model.encode(history, plan)
-    torch.testing.assert_close(encoded.square().mean(0).sqrt(), torch.ones(14, 2), atol=0.06, rtol=0)  # most rows move
-    torch.testing.assert_close(model.decode(history, encoded), plan, atol=1e-5, rtol=1e-5)
-    with torch.no_grad():
-        again = model.sample(history[:3], prefix=plan[:3, :4])
-    torch.testing.assert_close(again[:, :4], plan[:3, :4], atol=1e-5, rtol=1e-5)
