@@ -205,4 +205,5 @@ def extrapolate_ends(data: TensorDictBase, frames: int) -> TensorDict:
         states.append(torch.cat([state, state[-1] + ahead * velocity]))
         episodes.append(episode[:1].expand(len(state) + frames))
     states = torch.cat(states)
-    return TensorDict({keys.STATE: states, keys.EPISODE: torch.cat(episodes)}, batch_size=[len(states)])
+    found = {keys.STATE: states, keys.EPISODE: torch.cat(episodes)}
+    return TensorDict(found, batch_size=[len(states)], device=data.device)
