@@ -91,8 +91,8 @@ def test_text_of_tutorials_is_plain(file):
     assert not banned(text)
 
 
-def test_words_of_the_appendix_and_of_generated_pages_are_plain():
-    pages = [page.read_text() for page in sorted((DOCS / "appendix").glob("*.md"))]
+def test_words_of_the_readme_the_appendix_and_generated_pages_are_plain():
+    pages = [page.read_text() for page in (ROOT / "README.md", *sorted((DOCS / "appendix").glob("*.md")))]
     for file in sorted((DOCS / "extensions").glob("*.py")):
         nodes = ast.walk(ast.parse(file.read_text()))
         pages += [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
@@ -109,10 +109,6 @@ def texts_of(tree: ast.Module) -> list[str]:
     """Docstrings, messages, help and what is printed, without names in quotes."""
     found = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
     return [re.sub(r"[\"']\w+[\"']", "", text) for text in found if text not in NAMES]
-
-
-def test_words_of_the_readme_are_plain():
-    assert not banned((ROOT / "README.md").read_text())
 
 
 @pytest.mark.parametrize("folder", ["torchrl_koap", "examples"])

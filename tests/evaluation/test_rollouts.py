@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from small_samplers import small_planner
 from torchrl.envs import TransformedEnv
 from toy_episodes import episode_of, number
 from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
@@ -14,7 +15,7 @@ from torchrl_koap.envs.transforms import EndEffectorNoise
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
-from torchrl_koap.modules import Execution, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics, make_policy
+from torchrl_koap.modules import Execution, make_koopman_inverse_dynamics, make_policy
 
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
 
@@ -54,8 +55,7 @@ def test_results_do_not_depend_on_the_batch_size(together, batch_size):
 
 @pytest.mark.parametrize("strategy", ["feedback", "open_loop"])
 def test_real_networks_do_not_depend_on_it_either(strategy):
-    torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3)
+    planner = small_planner(num_steps=3)
     planner.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1))
     controller = make_koopman_inverse_dynamics(2, 2)
     torch.nn.init.normal_(controller.action_decoder.linear.weight, std=1e-3)

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from small_controllers import controller_of
+from small_samplers import a_system
 from tensordict import TensorDict
 
 from torchrl_koap.modules import ResponseModel
@@ -24,16 +25,6 @@ from torchrl_koap.training.response import (
 
 def columns(**options) -> ResponseModel:
     return ResponseModel([0, 1], [0, 1], [0, 1], **options)
-
-
-def a_system() -> ResponseModel:
-    system = columns()
-    system.weight[[0, 1], [0, 1], 0] = torch.tensor([0.7, 0.5])
-    system.weight[[0, 1], [0, 1], 2] = torch.tensor([0.1, 0.2])
-    system.weight[[0, 1], [0, 1], 1] = torch.tensor([-0.2, 0.1])  # else its coordinates depend on each other
-    system.weight[[0, 1], [0, 1], 3] = torch.tensor([0.2, 0.3])
-    system.weight[[0, 1], [0, 1], 4] = torch.tensor([-0.1, 0.1])
-    return system.double()
 
 
 def recordings(episodes: int = 6, length: int = 60, noise: float = 0.0) -> TensorDict:

@@ -168,7 +168,6 @@ def _complain(message: str) -> None:
 
 
 def _show(result: Any) -> None:
-    """Prints a result: a table of names and values."""
     if not isinstance(result, Mapping):
         print(result)
         return

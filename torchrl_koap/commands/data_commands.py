@@ -98,7 +98,6 @@ class Demos(Command):
             )
 
     def _film(self, task: Task, episodes: int, embodiments: Sequence[str]) -> VideoReport:
-        """Records camera frames."""
         if self.embodiment is None:
             raise ValueError(f"say who demonstrates: --embodiment {' or '.join(embodiments)}")
         lookup(embodiments, self.embodiment, "embodiment")

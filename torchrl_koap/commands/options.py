@@ -220,7 +220,6 @@ def _check_number(option: str, value: str, wanted: str) -> None:
 
 
 def _first_page() -> type:
-    """A dataclass of the options that most calls need."""
     options: list[Any] = []
     for name, (kind, about) in FIRST.items():
         default = [] if name == "out" else [False if kind is bool else None]

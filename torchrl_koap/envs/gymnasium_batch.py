@@ -86,7 +86,6 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         }
 
     def _succeeded(self, info: Mapping[str, Any], reward: float, terminated: bool) -> bool:
-        """Whether a step reports success."""
         found = success_entry(info, self.success_key)
         if found is None:
             return self.success_key is None and terminated and reward > 0

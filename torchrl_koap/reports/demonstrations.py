@@ -80,7 +80,6 @@ def _draw_objects(axes: Axes, paths: list[np.ndarray], task: Task | None) -> Non
 
 
 def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, task: Task, head: str) -> Figure:
-    """A panel per state column."""
     first = np.concatenate([[0], borders]).astype(int)
     time = (np.arange(len(state)) - np.repeat(first, np.diff(np.append(first, len(state))))) / task.control_hz
     columns = list(zip(task.state_names, task.state_units, strict=True))

@@ -158,7 +158,6 @@ def run_logged(function: Callable[[str], None], folder: str, log: str) -> str | 
 
 
 def _open_log(path: str) -> TextIO:
-    """Opens a file to append to."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     return Path(path).open("a", buffering=1)  # by lines: a job that is killed has said what it did until then
 

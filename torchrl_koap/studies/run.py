@@ -239,7 +239,6 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
 
 
 def _is_trained(folder: Path) -> bool:
-    """Whether a shared planner was finished."""
     try:
         return read_result(folder) is not None and (folder / "planner.safetensors").is_file()
     except RunDirectoryError:

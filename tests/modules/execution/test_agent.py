@@ -4,28 +4,21 @@
 import numpy as np
 import pytest
 import torch
+from small_samplers import chunk_policy, small_planner
 from torchrl.collectors import Collector
 from toy_gym import reach
 
 from torchrl_koap.modules import (
     Agent,
-    DiffusionPolicy,
     Execution,
     PlanningPolicy,
     PolicyEnv,
-    StatePlanner,
-    TemporalUnet,
     make_koopman_inverse_dynamics,
     make_policy,
 )
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 STEPS = 13
-
-
-def small_planner(**options):
-    torch.manual_seed(0)
-    return StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, **options)
 
 
 def policy_of(strategy="feedback", columns=(0, 1), **options):
@@ -40,13 +33,7 @@ def ready(policy=None, **options):
     return agent
 
 
-def chunks():
-    torch.manual_seed(0)
-    diffusion = DiffusionPolicy(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, action_dim=2, num_steps=3)
-    return make_policy(diffusion, state_of=(0, 1))
-
-
-POLICIES = [lambda: policy_of(), lambda: policy_of("open_loop"), chunks]
+POLICIES = [lambda: policy_of(), lambda: policy_of("open_loop"), chunk_policy]
 
 
 @pytest.mark.parametrize("make", POLICIES, ids=["feedback", "open loop", "chunks"])

@@ -6,6 +6,7 @@ import threading
 import numpy as np
 import pytest
 import torch
+from small_samplers import small_planner
 from toy_policies import CountingPlanner, EchoController
 
 from torchrl_koap.modules import (
@@ -14,8 +15,6 @@ from torchrl_koap.modules import (
     CommandDecoder,
     Execution,
     ResponseModel,
-    StatePlanner,
-    TemporalUnet,
     make_koopman_inverse_dynamics,
     make_policy,
 )
@@ -120,8 +119,7 @@ def test_refusals():
 
 @pytest.mark.parametrize("kind", ["mpc", "command_regression"])
 def test_plans_are_followed_as_the_policy_follows_them(kind):
-    torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
+    planner = small_planner()
     if kind == "mpc":
         law = ResponseModel([0, 1], [0, 1], [0, 1])
         law.weight[[0, 1], [0, 1], 2] = 0.3

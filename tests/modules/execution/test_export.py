@@ -7,15 +7,9 @@ import json
 import numpy as np
 import pytest
 import torch
+from small_samplers import chunk_policy, small_planner
 
-from torchrl_koap.modules import (
-    DiffusionPolicy,
-    Execution,
-    StatePlanner,
-    TemporalUnet,
-    make_koopman_inverse_dynamics,
-    make_policy,
-)
+from torchrl_koap.modules import Execution, make_koopman_inverse_dynamics, make_policy
 from torchrl_koap.modules.execution.export import FACTS, SUFFIXES, ExportError, export_policy, exportable, relative_gap
 
 needs_onnx = pytest.mark.skipif(
@@ -29,12 +23,9 @@ COLUMNS = {
 
 
 def policy(ranges=None, **execution):
-    torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
-    controller = make_koopman_inverse_dynamics(2, 3)
     return make_policy(
-        planner,
-        controller,
+        small_planner(),
+        make_koopman_inverse_dynamics(2, 3),
         state_of=(2, 3),
         changes=(0, 1),
         commanded={"commands": [0, 1], "states": [0, 1]},
@@ -45,9 +36,7 @@ def policy(ranges=None, **execution):
 
 
 def chunks():
-    torch.manual_seed(0)
-    diffusion = DiffusionPolicy(TemporalUnet(3, 4, channels=(8, 16)), state_dim=2, action_dim=3, num_steps=2)
-    return make_policy(diffusion, state_of=(2, 3))
+    return chunk_policy((2, 3), actions=3)
 
 
 def test_the_stateless_policy_is_the_open_loop_one():

@@ -3,6 +3,7 @@
 
 import pytest
 import torch
+from small_samplers import a_system
 from tensordict import TensorDict
 
 from torchrl_koap.modules import MPC, Execution, MLPDenoiser, ResponseModel, StatePlanner, make_policy
@@ -10,16 +11,10 @@ from torchrl_koap.modules import MPC, Execution, MLPDenoiser, ResponseModel, Sta
 AXES = 2
 
 
-def a_system() -> ResponseModel:
-    """A stable, coupled system of two axes."""
-    system = ResponseModel([0, 1], [0, 1], [0, 1])
-    system.weight[[0, 1], [0, 1], 0] = torch.tensor([0.7, 0.5])  # momentum
-    system.weight[[0, 1], [0, 1], 2] = torch.tensor([0.1, 0.2])  # pull of the command
-    system.weight[[0, 1], [0, 1], 1] = torch.tensor([-0.2, 0.1])  # else its coordinates depend on each other
-    system.weight[[0, 1], [0, 1], 3] = torch.tensor([0.2, 0.3])
-    system.weight[[0, 1], [0, 1], 4] = torch.tensor([-0.1, 0.1])
+def coupled_system() -> ResponseModel:
+    system = a_system()
     system.weight[1, 0, 3] = -0.1  # the second axis is moved by the first command
-    return system.double()
+    return system
 
 
 def rollout(system: ResponseModel, changes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -41,21 +36,23 @@ def steps_of(system: ResponseModel, count: int = 60) -> tuple[torch.Tensor, torc
 
 
 def test_a_fit_finds_the_system():
-    system = a_system()
+    system = coupled_system()
     fitted = ResponseModel([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(system), penalty=1e-12)
     torch.testing.assert_close(fitted.weight, system.weight, atol=1e-5, rtol=0)
 
 
 def test_uncoupled_axes_know_nothing_of_each_other():
     fitted = (
-        ResponseModel([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(a_system()), penalty=1e-12, coupled=False)
+        ResponseModel([0, 1], [0, 1], [0, 1])
+        .double()
+        .fit_ridge(*steps_of(coupled_system()), penalty=1e-12, coupled=False)
     )
     assert not fitted.weight[0, 1].any() and not fitted.weight[1, 0].any()
-    torch.testing.assert_close(fitted.weight[0, 0], a_system().weight[0, 0], atol=1e-2, rtol=0)
+    torch.testing.assert_close(fitted.weight[0, 0], coupled_system().weight[0, 0], atol=1e-2, rtol=0)
 
 
 def test_impulses_add_up_to_the_prediction():
-    system, steps = a_system(), 6
+    system, steps = coupled_system(), 6
     changes = torch.randn(steps, AXES, dtype=torch.float64)
     nothing = torch.zeros(3, AXES, dtype=torch.float64)
     wanted = system.predict(nothing, nothing[0], nothing[1:], changes)

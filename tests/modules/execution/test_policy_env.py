@@ -5,31 +5,21 @@ from functools import partial
 
 import pytest
 import torch
+from small_samplers import chunk_policy, small_planner
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, SerialEnv
 from toy_gym import reach
 
-from torchrl_koap.modules import (
-    DiffusionPolicy,
-    Execution,
-    PlanningPolicy,
-    PolicyEnv,
-    StatePlanner,
-    TemporalUnet,
-    make_koopman_inverse_dynamics,
-)
-from torchrl_koap.modules import (
-    make_policy as build,
-)
+from torchrl_koap.modules import Execution, PlanningPolicy, PolicyEnv, make_koopman_inverse_dynamics
+from torchrl_koap.modules import make_policy as build
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 
 def feedback(**execution):
-    torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(4, 8, channels=(8, 16)), state_dim=4, num_steps=2)
-    controller = make_koopman_inverse_dynamics(4, 2)
-    return build(planner, controller, state_of=range(4), execution=Execution(**execution))
+    return build(
+        small_planner(4), make_koopman_inverse_dynamics(4, 2), state_of=range(4), execution=Execution(**execution)
+    )
 
 
 def open_loop():
@@ -41,9 +31,7 @@ def cold():
 
 
 def chunks():
-    torch.manual_seed(0)
-    diffusion = DiffusionPolicy(TemporalUnet(2, 8, channels=(8, 16)), state_dim=4, action_dim=2, num_steps=2)
-    return build(diffusion, state_of=range(4))
+    return chunk_policy(range(4))
 
 
 def make_env(make_policy):
@@ -161,8 +149,7 @@ def test_in_processes_of_a_collector(make_policy, copied_processes):
 
 
 def test_the_environment_writes_what_a_policy_of_other_keys_reads():
-    torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(4, 8, channels=(8, 16)), state_dim=4, num_steps=2, noise_key=None)
+    planner = small_planner(4, noise_key=None)
     follower = InverseDynamicsFollower(make_koopman_inverse_dynamics(4, 2))
     policy = PlanningPolicy(planner, follower, state_of=range(4), history_key="frames")
     start = PolicyEnv(reach(), policy).reset()

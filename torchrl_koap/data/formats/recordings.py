@@ -193,7 +193,6 @@ def wrong_rate(value: Any, name: str) -> list[str]:
 
 
 def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
-    """One array per trajectory."""
     with contextlib.suppress(TypeError, RuntimeError):  # what is no sequence; nested tensors
         if not isinstance(values, (str, Path, Mapping)):
             return list(values)

@@ -101,7 +101,6 @@ def _read(
 
 
 def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]], *, behind: bool) -> Piece:
-    """One demonstration."""
     states: dict[str, np.ndarray] = {}
     following = group[NEXT] if behind else {}
     for entry in chosen:

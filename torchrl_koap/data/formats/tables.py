@@ -114,7 +114,6 @@ def _stamped(piece: Piece, rate: float) -> Piece:
 
 
 def _entries(file: Path) -> dict[str, np.ndarray]:
-    """The arrays of an archive."""
     if not zipfile.is_zipfile(file):
         raise ValueError("it is no NumPy archive, as np.savez writes them, or damaged")
     entries = {}
@@ -187,7 +186,6 @@ def _named_alike(pieces: list[Piece]) -> list[Piece]:
 
 
 def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, np.ndarray]:
-    """Columns of a table by name."""
     width = table.shape[1]
     made_up = [f"{kind}_{index}" for index in range(width)]
     names = made_up if given is None else np.atleast_1d(given).astype(str).tolist()

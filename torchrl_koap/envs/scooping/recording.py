@@ -79,7 +79,6 @@ def _play_episodes(embodiment: str, episodes: int, seed: int, task: str) -> Iter
 
 
 def _context_at(task: str, start: int, generator: np.random.Generator) -> np.ndarray:
-    """A random context around one of the start positions."""
     while True:
         context = draw_contexts(task, 1, generator)[0]
         if start_of(context) == start:

@@ -207,7 +207,6 @@ class CompactLifting(TensorDictModuleBase):
         return torch.cat([self.small.encode(components), self.large.encode(components)], -1) * self.kept
 
     def _decoded(self, lifted: Tensor) -> tuple[Tensor, Tensor]:
-        """Components by either network."""
         small, large = lifted.split([self.coordinates, 2 * self.coordinates], -1)
         return self.small.decode(small), self.large.decode(large)
 
