@@ -73,6 +73,13 @@ def test_the_part_that_fails_is_named(shares, words):
     assert words in item.finding
 
 
+def test_a_controller_that_stays_near_recorded_tool_paths_is_not_what_fails():
+    """Where things are pushed, recorded actions do not answer to where they went: its success says little."""
+    inspection = inspected(0.95, 0.3, 0.4) | {"recordings_left": {"count": 3, "episodes": 60}}
+    (item,) = found(evaluation=rates(0.4), inspection=inspection)
+    assert "leave what the planner was trained on" in item.finding
+
+
 def test_more_labels_are_not_proposed_where_the_planner_fails():
     numbers = {"summary": {"labels": {"labelled_transitions": 80}}, "evaluation": rates(0.5)}
     numbers["config"] = {"method": "koap"}

@@ -44,7 +44,7 @@ class LabelReport:
     available_transitions: int  # with a label in the data as they came
 
     def __str__(self) -> str:
-        share, units = self.labelled_transitions / self.total_transitions, _plural(self.unit)
+        share, units = self.labelled_transitions / self.total_transitions, plural_of(self.unit)
         had = ""
         if self.available_transitions < self.total_transitions:
             had = f"; the data came with {self.available_transitions} labels, on {self.available_units} {units}"
@@ -183,7 +183,7 @@ class LabelBudget:
 
     def _number_of(self, total: int, usable: int) -> int:
         """Units to draw, of ``total`` of which ``usable`` have a label."""
-        plural = _plural(self.unit)
+        plural = plural_of(self.unit)
         if self.count is not None:
             if self.count > usable:
                 have = f"there are {total}" if usable == total else f"only {usable} of {total} have a label"
@@ -267,5 +267,6 @@ def subsample_trajectories(data: TensorDictBase, fraction: float, *, seed: int =
     return data[kept.to(lengths.device).repeat_interleave(lengths)]
 
 
-def _plural(unit: str) -> str:
-    return {"trajectory": "trajectories"}.get(unit, f"{unit}s")
+def plural_of(unit: str) -> str:
+    """What labels are counted in, in words; "" is any unit."""
+    return {"trajectory": "trajectories", "": "labels"}.get(unit, f"{unit}s")

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from torchrl_koap.evaluation.findings import GOOD
 from torchrl_koap.reports.run_facts import RunFacts, mapping, number
 
-GOOD = 0.9  # a success rate above which nothing is looked for
 APART = 0.2  # success rates that differ by more than chance of a few dozen rollouts
 WIDE = 0.25  # width of a 95 % interval that hardly tells two methods apart
 FEW_MODES = 0.7  # of the entropy that a uniform choice would have

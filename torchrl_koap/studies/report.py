@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.data.label_budget import plural_of
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, REFERENCE, Outcome, compare_cells
@@ -17,7 +18,6 @@ from torchrl_koap.studies.table import (
     markdown_table,
     not_done,
     percent,
-    plural,
     summarise,
     table_rows,
     write_csv,
@@ -106,7 +106,7 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Two sentences on the cells, and what their methods are."""
     count = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
     names = {name: list(dict.fromkeys(row.get(name) for row in rows)) for name in ("task", "method", "seed")}
-    unit = list(dict.fromkeys(plural(row.get("label_unit") or "") for row in rows))
+    unit = list(dict.fromkeys(plural_of(row.get("label_unit") or "") for row in rows))
     text = ", ".join(
         (
             f"{', '.join(map(str, names['task']))}: methods {', '.join(map(str, names['method']))}",
@@ -141,7 +141,7 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
             known.remove(error)
         for kind in known:
             path = folder / FOLDER / f"{name}_{kind}.png"
-            counted = plural(label_unit) if label_unit else ""
+            counted = plural_of(label_unit) if label_unit else ""
             plot_measure(main, path, kind, methods=methods, label_unit=counted, **wanted[kind])
             used = f" All with {percent(shares[-1])} of the demonstrations." if shares[-1] != 1 else ""
             hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""

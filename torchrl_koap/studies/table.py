@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.data.label_budget import plural_of
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.files import replacing_file
 
@@ -138,7 +139,7 @@ def _summary(task: str, method: str, labels: float, demonstrations: float, unit:
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     """The table as text, a row per method and share of labels; columns without any value are left out."""
     units = {item.label_unit for item in summaries}
-    labels = f"labels ({plural(*units)})" if len(units) == 1 and "" not in units else "labels"
+    labels = f"labels ({plural_of(*units)})" if len(units) == 1 and "" not in units else "labels"
     error = "unit of the first column" if any(item.offline for item in summaries) else "mm, mrad"
     numbers = {  # heading to measure and form
         "mode entropy": ("mode_entropy", ".2f"),
@@ -153,7 +154,7 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     rows = [
         {
             "task": item.task,
-            labels: percent(item.labels) + (f" of {plural(item.label_unit)}" if len(units) > 1 else ""),
+            labels: percent(item.labels) + (f" of {plural_of(item.label_unit)}" if len(units) > 1 else ""),
             "demonstrations used": percent(item.demonstrations),
             "method": item.method,
             **_success(item),
@@ -241,8 +242,3 @@ def percent(share: float | None, digits: int | None = None) -> str:
     if share is None:
         return "–"
     return f"{100 * share:.6g} %" if digits is None else f"{100 * share:.{digits}f} %"
-
-
-def plural(unit: str) -> str:
-    """What the labels are counted in, in words; "" is any unit."""
-    return {"trajectory": "trajectories", "": "labels"}.get(unit, f"{unit}s")
