@@ -9,7 +9,7 @@ import pytest
 from torchrl_koap.commands.options import parse
 from torchrl_koap.commands.subcommands import Subcommand
 from torchrl_koap.evaluation.findings import EXPERIMENTS
-from torchrl_koap.reports.advice import RULES, advice
+from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
@@ -99,4 +99,3 @@ def test_a_ridge_that_errs_less_is_pointed_out():
 def test_wide_intervals_come_last():
     evaluation = rates(0.5, low=0.2, high=0.8, episodes=8)
     assert commands(evaluation=evaluation)[-1] == "koap eval {run} --episodes 60 --seed 100"
-    assert RULES[-1].__name__ == "few_rollouts"

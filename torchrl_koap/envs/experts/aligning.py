@@ -101,13 +101,13 @@ class _Player:
 
     def __init__(self, mode: int, context: np.ndarray, generator: np.random.Generator):
         self.mode = mode
-        self.doing = self._travel
         self.time = self.since_success = self.waited = 0
         self.contact: np.ndarray | None = None
         self.plan = np.empty(PLAN_SIZE)
         self.choices = 0
         self.action, self.last_tcp, self.last_pose = np.zeros(3), np.zeros(3), np.zeros(3)
-        self._restart_push()
+        self._begin_push()
+        self.doing = self._travel
         self.pace = generator.uniform(0.88, 1.03)
         self.pause = generator.integers(0, 6)
         self.settle = generator.integers(2, 6)
@@ -186,11 +186,11 @@ class _Player:
             return goal, 0.0
         self.waited += abs(self.command[2] - self.height) < 0.002 and abs(self.tcp[2] - self.height) < 0.012
         if self.waited > self.settle:
-            self.doing = self._push
-            self._restart_push()
+            self._begin_push()
         return goal, 0.009 if self.command[2] > self.height + 0.03 else 0.005
 
-    def _restart_push(self) -> None:
+    def _begin_push(self) -> None:
+        self.doing = self._push
         self.stuck, self.progress, self.shortest, self.started = 0, 0.01, 2.0, False
 
     def _push(self) -> tuple[np.ndarray, float]:
@@ -248,8 +248,7 @@ class _Player:
         distance = max(math.hypot(*away), 1e-9)
         if self.mode == _INSIDE:
             if distance < 0.015:
-                self.doing = self._push
-                self._restart_push()
+                self._begin_push()
             return np.append(self.pose[:2], self.height), 0.006
         if distance > 0.09:
             self.doing = self._around
@@ -267,8 +266,7 @@ class _Player:
             return np.append(goal, self.height), 0.008
         still = _apart(self.tcp, self.last_tcp) < 0.004
         if _apart(entry, self.tcp) < 0.012 and _apart(entry, self.command) < 0.010 and still:
-            self.doing = self._push
-            self._restart_push()
+            self._begin_push()
         return np.append(entry, self.height), min(0.008, 0.002 + 0.2 * _apart(entry, self.command))
 
     def _lift(self) -> tuple[np.ndarray, float]:
