@@ -33,7 +33,7 @@ from torchrl_koap.tasks.scooping import CAMERA, EMBODIMENTS
 from torchrl_koap.training.methods import METHODS as KNOWN
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.vision.embedding import embed_recordings, join_recordings, read_sources
-from torchrl_koap.vision.projection import SCOOPING, Projection, projection_of
+from torchrl_koap.vision.encoder import SCOOPING, Projection, projection_of
 
 RESULTS = Path(__file__).parent / "results"
 Task = Literal["scooping", "scooping_moving_bowl"]

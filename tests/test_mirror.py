@@ -19,7 +19,6 @@ COVERED_BY = {
     "envs/registry.py": "plugins/test_plugins.py",
     "envs/scooping/expert.py": "envs/scooping/test_env.py",
     "envs/scooping/recording.py": "envs/scooping/test_env.py",
-    "envs/scooping/scene.py": "envs/scooping/test_env.py",
     "envs/scooping/simulation.py": "envs/scooping/test_env.py",
     "graphics.py": "envs/mujoco/test_rendering.py",
     "evaluation/closed_loop.py": "commands/test_eval.py",
@@ -46,7 +45,6 @@ COVERED_BY = {
     "training/method.py": "training/test_methods.py",
     "training/policy_facts.py": "modules/execution/test_command_limits.py",
     "vision/backbones.py": "vision/test_encoder.py",
-    "vision/projection.py": "vision/test_encoder.py",
 }
 
 

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl_koap.data import open_dataset
 from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
 from torchrl_koap.vision import Observer, load_backbone
-from torchrl_koap.vision.projection import cameras_of
+from torchrl_koap.vision.encoder import cameras_of
 
 OWN = "tiny_network:random_layer"
 GROUNDS = run.grounds()

@@ -14,7 +14,7 @@ from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
 from torchrl_koap.vision import Observer, Projection, backbones, load_encoder
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
-from torchrl_koap.vision.projection import load_cameras
+from torchrl_koap.vision.encoder import load_cameras
 
 OWN = "tiny_network:random_layer"
 

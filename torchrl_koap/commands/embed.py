@@ -18,7 +18,7 @@ from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import get_task
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
-from torchrl_koap.vision.projection import Projection, projection_of
+from torchrl_koap.vision.encoder import Projection, projection_of
 
 
 @dataclass(kw_only=True)

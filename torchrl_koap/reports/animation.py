@@ -13,8 +13,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from torchrl_koap.reports.mode_plots import color_of_mode, mode_colors
 from torchrl_koap.reports.pictures import Film, NotFilmed, NothingToDraw, picture
+from torchrl_koap.reports.rollout_plots import color_of_mode, mode_colors
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.scenes import bodies_of, body_paths, draw_scene, keep_inside, read_episodes
 from torchrl_koap.reports.style import FAILURE_MARKS, INK, SUCCESS, entry, set_title

@@ -34,7 +34,7 @@ from torchrl_koap.reports.run_facts import RunFacts
 
 FOLDER = "plots"
 HOLD_SECONDS = 1.5  # of the last frame of a film
-_BUILT_IN = ("rollout_plots", "demonstrations", "error_plots", "animation", "mode_plots", "inspection_plots")
+_BUILT_IN = ("rollout_plots", "demonstrations", "error_plots", "animation", "inspection_plots")
 EVAL = "koap eval {run} --episodes 60 --seed 100"
 TRAIN = "koap train --out {run}"
 _COMMANDS = {

@@ -25,7 +25,7 @@ from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.trained import build_networks
 from torchrl_koap.vision import Observer
-from torchrl_koap.vision.projection import cameras_of
+from torchrl_koap.vision.encoder import cameras_of
 
 PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
 # options of a Study by name, those of its sections in mappings of their own

@@ -42,7 +42,7 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_planner
 from torchrl_koap.training.planner import learn_planner
 from torchrl_koap.training.trained import Trained, build_networks, facts_of
-from torchrl_koap.vision.projection import cameras_of
+from torchrl_koap.vision.encoder import cameras_of
 
 
 def train(config: TrainConfig, *, command: str | None = None, planner_only: bool = False) -> Trained:

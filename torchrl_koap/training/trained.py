@@ -30,7 +30,7 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
 from torchrl_koap.training.policy_facts import policy_facts
 from torchrl_koap.vision import Observer, Projection
-from torchrl_koap.vision.projection import load_cameras
+from torchrl_koap.vision.encoder import load_cameras
 
 FORMAT, VERSION = "torchrl_koap policy", 2
 

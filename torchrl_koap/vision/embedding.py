@@ -24,8 +24,7 @@ from torchrl_koap.files import DataError, replacing_file
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task
 from torchrl_koap.vision.backbones import load_backbone
-from torchrl_koap.vision.encoder import BATCH, FrozenImageEncoder
-from torchrl_koap.vision.projection import CAMERAS, Projection, load_encoder
+from torchrl_koap.vision.encoder import BATCH, CAMERAS, FrozenImageEncoder, Projection, load_encoder
 
 MOST = 4000  # frames that components are fitted to
 HELD_OUT = 10  # one trajectory in so many judges them

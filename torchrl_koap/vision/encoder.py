@@ -1,20 +1,26 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A frozen network as a TorchRL transform: frames in, embeddings out."""
+"""A frozen network as a TorchRL transform, frames in, embeddings out, and the principal components behind it."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import ObservationTransform
 
+from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.files import check_file, replacing_file
 from torchrl_koap.keys import read_entry
-from torchrl_koap.vision.backbones import Backbone, load_backbone
+from torchrl_koap.vision.backbones import NETWORK, Backbone, WeightsError, load_backbone
 
 BATCH = 32  # frames that go through the network at once
 GRID = 6  # cells of the pooling, both ways: averages of the whole picture forget where things are
@@ -130,3 +136,168 @@ class FrozenImageEncoder(ObservationTransform):
         probe = self.embed(torch.zeros(*self.size, 3, dtype=torch.uint8))
         observation_spec[self.out_keys[0]] = Unbounded((*batch, probe.shape[-1]), dtype=torch.float32)
         return observation_spec
+
+
+CAMERAS = "cameras"  # folder of projections beside a data set, and in a run
+SCOOPING = Path(__file__).with_name("scooping.safetensors")
+
+
+class Projection(nn.Module):
+    """Principal components of pooled features, fitted on frames without labels.
+
+    Args:
+        mean (Tensor): ``[F]``.
+        components (Tensor): ``[F, d]``; scaled so that the first component has variance 1.
+        about (mapping, optional): what the features are of: :attr:`FrozenImageEncoder.identity`.
+
+    Raises:
+        ValueError: if mean and components have other shapes.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.vision import Projection
+        >>> features = torch.randn(200, 10, generator=torch.Generator().manual_seed(0)) * torch.arange(1.0, 11.0)
+        >>> projected = Projection.fit(features, 3)(features)
+        >>> projected.shape, round(projected[:, 0].std().item(), 3), bool(projected.mean(0).abs().max() < 1e-4)
+        (torch.Size([200, 3]), 1.0, True)
+    """
+
+    def __init__(self, mean: Tensor, components: Tensor, about: Mapping[str, str] | None = None):
+        super().__init__()
+        self.about = dict(about or {})
+        if mean.ndim != 1 or components.ndim != 2 or len(mean) != len(components):
+            raise ValueError(
+                f"mean must be [F] and components [F, d], got {list(mean.shape)} and {list(components.shape)}"
+            )
+        self.register_buffer("mean", mean)
+        self.register_buffer("components", components)
+
+    @classmethod
+    def fit(cls, features: Tensor, dim: int) -> Projection:
+        """Fits ``dim`` components to features ``[N, F]``, more of both, of frames that are not all alike."""
+        if min(features.shape) <= dim:
+            raise ValueError(f"{dim} components need more frames and features than that, got {list(features.shape)}")
+        features = features.double()
+        if bool((features == features[:1]).all()):
+            raise ValueError(f"all {len(features)} frames look the same to the network: there is nothing to embed")
+        mean = features.mean(0)
+        centred = features - mean
+        if len(centred) < centred.shape[1]:  # the small one of the two products
+            values, left = torch.linalg.eigh(centred @ centred.T)
+            values, left = values.flip(0)[:dim].clamp_min(1e-12), left.flip(1)[:, :dim]
+            axes = centred.T @ left / values.sqrt()
+        else:
+            values, axes = torch.linalg.eigh(centred.T @ centred)
+            values, axes = values.flip(0)[:dim], axes.flip(1)[:, :dim]
+        signs = axes.gather(0, axes.abs().argmax(0, keepdim=True)).sign()  # the same on every machine
+        scale = (values[0] / (len(features) - 1)).sqrt()
+        return cls(mean.float(), (axes * signs / scale).float())
+
+    @property
+    def dim(self) -> int:
+        """Number of components."""
+        return self.components.shape[1]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Projection:
+        """Reads a file that :meth:`save` wrote; no network is needed. One that is missing or damaged is refused."""
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"no projection: there is no file {path}")
+        check_file(path)
+        try:
+            with safe_open(str(path), "pt") as file:
+                mean, components = (file.get_tensor(name).float() for name in ("mean", "components"))
+                about = dict(file.metadata() or {})
+            missing = [name for name in ("weights", "network", "size") if not about.get(name)]
+            if missing:
+                raise ValueError(f"its description has no {missing[0]!r}")
+            return cls(mean, components, about)
+        except Exception as error:  # what a damaged file makes of its reader
+            raise ValueError(f"the projection {path} cannot be used: {error}") from error
+
+    def save(self, path: str | Path) -> Path:
+        """Writes it and what it belongs to, its components in half precision; returns the file."""
+        tensors = {"mean": self.mean.contiguous(), "components": self.components.half().contiguous()}
+        with replacing_file(path) as aside:
+            save_file(tensors, aside, self.about)
+        return Path(path)
+
+    def kept(self, features: Tensor) -> tuple[float, float]:
+        """Computes the share of the variance of features ``[N, F]`` that is kept, and the relative error of what is.
+
+        The error is the root mean square of what reconstructed features are off, over that of the features' spread.
+        """
+        centred = (features - self.mean).double()
+        axes = torch.linalg.qr(self.components.double())[0]
+        left = (centred - centred @ axes @ axes.T).square().sum() / centred.square().sum().clamp_min(1e-12)
+        return 1 - float(left), float(left) ** 0.5
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Computes components ``[*B, d]`` of features ``[*B, F]``; refuses those of another size."""
+        if features.shape[-1] != len(self.mean):
+            raise ValueError(
+                f"the projection was fitted on {len(self.mean)} features, got {features.shape[-1]}: another network,"
+                " stage or size of the frames"
+            )
+        return (features - self.mean) @ self.components
+
+
+def projection_of(task: str) -> Path:
+    """Returns the file of a task's projection that comes with the package; a task without one is refused."""
+    path = SCOOPING.with_stem(task)
+    if not path.is_file():
+        known = ", ".join(sorted(each.stem for each in SCOOPING.parent.glob("*.safetensors")))
+        raise ValueError(f"no projection comes with the package for task {task!r} (only for {known}): pass your own")
+    return path
+
+
+def load_cameras(folder: str | Path) -> dict[str, Projection]:
+    """Reads the projections in a folder, such as ``cameras`` of a run, by the name of the camera; needs no network."""
+    return {file.stem: Projection.load(file) for file in sorted(Path(folder).glob("*.safetensors"))}
+
+
+def cameras_of(dataset: str | Path | None) -> dict[str, Projection]:
+    """Reads the projections that ``koap embed`` wrote beside a data set; none where its columns are no embeddings."""
+    stored = None if dataset is None else stored_folder(Path(dataset).expanduser())
+    return {} if stored is None else load_cameras(stored.parent / CAMERAS)
+
+
+def load_encoder(
+    projection: Projection | str | Path = SCOOPING, network: str | Path | None = None, **options: Any
+) -> FrozenImageEncoder:
+    """Makes the encoder that a projection was fitted behind.
+
+    Args:
+        projection (Projection, str or Path): it, or its file. Default: the one of Scooping that comes with the package.
+        network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`. Default: as it was fitted.
+        **options: ``in_key`` and ``out_key`` of :class:`~torchrl_koap.vision.FrozenImageEncoder`.
+
+    Returns:
+        FrozenImageEncoder: frozen, in evaluation mode.
+
+    Raises:
+        WeightsError: if there are no weights, or others than those the projection was fitted behind.
+        FileNotFoundError: if there is no such file.
+
+    Examples:
+        >>> from torchrl_koap.vision import load_encoder
+        >>> load_encoder("nowhere.safetensors")
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: no projection: there is no file nowhere.safetensors
+    """
+    fitted = projection if isinstance(projection, Projection) else Projection.load(projection)
+    about = fitted.about
+    if network is None and about["network"] != NETWORK:
+        network = about["network"]
+    try:
+        size = [int(side) for side in about["size"].split("x")]
+    except ValueError as error:
+        raise ValueError(f"the description of the projection cannot be used, size: {error}") from error
+    backbone = load_backbone(network)
+    if backbone.digest != about["weights"]:
+        raise WeightsError(
+            f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"
+            f" {backbone.digest[:12]} of {backbone.name}: fit one for them, or pass the network it belongs to"
+        )
+    return FrozenImageEncoder(backbone, projection=fitted, size=(size * 2)[:2], **options)

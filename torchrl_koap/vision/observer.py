@@ -13,8 +13,7 @@ from torch import Tensor
 from torchrl_koap.data.formats.frames import fault_of
 from torchrl_koap.keys import observed_numbers
 from torchrl_koap.tasks import Task
-from torchrl_koap.vision.encoder import FrozenImageEncoder
-from torchrl_koap.vision.projection import Projection, load_encoder
+from torchrl_koap.vision.encoder import FrozenImageEncoder, Projection, load_encoder
 
 STATE = "state"
 

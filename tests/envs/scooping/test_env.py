@@ -31,7 +31,7 @@ from torchrl_koap.tasks.scooping import (
     scores,
     start_of,
 )
-from torchrl_koap.vision.projection import projection_of
+from torchrl_koap.vision.encoder import projection_of
 
 NEAR = np.array([[*STARTS["near"], 0.4]])
 MOVING = get_task("scooping_moving_bowl")

@@ -16,8 +16,7 @@ from torchrl_koap.envs.scooping.expert import SpoonKinematics, start_joints
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
-from torchrl_koap.vision.encoder import FrozenImageEncoder
-from torchrl_koap.vision.projection import load_encoder, projection_of
+from torchrl_koap.vision.encoder import FrozenImageEncoder, load_encoder, projection_of
 
 JOINT_SPEED = 2.5  # rad/s; targets that are further away are gone towards at this speed
 PIXELS = "pixels"

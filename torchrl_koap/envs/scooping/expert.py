@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_koap.envs.scooping.scene import scooping_model
-from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
+from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, scooping_model
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks.scooping import FRAME_HZ, START_HEIGHT, STARTS
 

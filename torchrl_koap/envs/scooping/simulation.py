@@ -1,5 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A batch of Scooping's simulations: joint targets in, the spoon's pose and the pieces in it out."""
+"""Scooping simulated: its scene, and batches of it with joint targets in, the spoon's pose and the pieces in it out.
+
+The scene has a table, a bowl, free pieces, a camera, and what holds the spoon: a Panda of capsules, or a hand. All are
+primitive shapes, at a small part of the cost of detailed meshes in software rendering; the arm's outline is only
+roughly that of the meshes (``docs/results/scooping.md``).
+"""
 
 from __future__ import annotations
 
@@ -10,8 +15,174 @@ import mujoco
 import numpy as np
 
 from torchrl_koap.envs.mujoco.simulation import Simulations
-from torchrl_koap.envs.scooping.scene import SPOON_HALF, TIMESTEP, scooping_model
-from torchrl_koap.tasks.scooping import BOWL, CONTROL_HZ, FRAME_HZ, NUM_PIECES, PIECE_RADIUS, RIM_HEIGHT, RIM_RADIUS
+from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks.panda_kinematics import LINKS
+from torchrl_koap.tasks.scooping import (
+    BOWL,
+    BOWL_RADIUS,
+    CONTROL_HZ,
+    FRAME_HZ,
+    NUM_PIECES,
+    PIECE_RADIUS,
+    RIM_HEIGHT,
+    RIM_RADIUS,
+)
+
+TIMESTEP = 1 / 180
+SPOON_HALF = (0.025, 0.023)  # half its length and width inside (m)
+WALL = 0.011  # half the height of its walls (m)
+HANDLE = 0.17  # its length (m)
+_WHITE, _DARK = "0.93 0.93 0.93 1", "0.25 0.25 0.27 1"
+_SKIN, _SLEEVE, _STEEL = "0.85 0.6 0.48 1", "0.2 0.35 0.6 1", "0.2 0.55 0.85 1"
+
+
+def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.MjModel:
+    """Compiles the scene of a ``"robot"``, a Panda of seven actuated joints, or a ``"hand"``, which moves freely.
+
+    The pieces' free joints come first, then those of what holds the spoon; the bowl is the only mocap body.
+    """
+    holder, kinds = lookup({"robot": (_arm, _ARM_SERVO), "hand": (_hand, _HAND_SERVO)}, embodiment, "embodiment")
+    motors = "".join(f'<position name="a{i}" joint="j{i}" kp="{kp}" kv="{kv}"/>' for i, (kp, kv) in enumerate(kinds, 1))
+    xml = f"""
+<mujoco model="scooping">
+  <compiler angle="radian"/>
+  <option timestep="{TIMESTEP}" integrator="implicitfast" cone="pyramidal" iterations="10" tolerance="1e-6"/>
+  <size memory="8M"/>
+  <visual>
+    <global offwidth="640" offheight="640"/>
+    <quality shadowsize="0" offsamples="0" numslices="12" numstacks="8"/>
+    <headlight ambient="0.45 0.45 0.45" diffuse="0.5 0.5 0.5" specular="0 0 0"/>
+    <map znear="0.02" zfar="20"/>
+  </visual>
+  <default>
+    <geom contype="0" conaffinity="0"/>
+    <default class="solid"><geom contype="1" conaffinity="2" friction="0.5 0.005 0.0002" solref="0.01 1"/></default>
+    <default class="tool">
+      <geom contype="4" conaffinity="3" friction="0.5 0.005 0.0002" solref="0.01 1"/>
+    </default>
+    <default class="piece">
+      <geom contype="2" conaffinity="3" type="sphere" size="{PIECE_RADIUS}" mass="0.004" condim="3"
+            friction="0.5 0.003 0.0005" solref="0.01 1" rgba="0.45 0.22 0.1 1"/>
+    </default>
+  </default>
+  <worldbody>
+    <light pos="0.4 0.6 2" dir="0 -0.3 -1" directional="true" diffuse="0.4 0.4 0.4"/>
+    <!-- they look at (0.46, 0, 0.15) and at (0.35, 0, 0.25) -->
+    <camera name="third_person" pos="1.12 -0.42 0.62" fovy="40"
+      xyaxes="0.536875 0.843661 0 -0.434480 0.276487 0.857194"/>
+    <camera name="front" pos="1.6 -0.9 1.1" fovy="42" xyaxes="0.584305 0.811534 0 -0.392099 0.282311 0.875534"/>
+    <geom name="table" class="solid" type="plane" size="2 2 0.1" rgba="0.72 0.66 0.56 1"/>
+    {_bowl()}
+    {"".join(_piece(i) for i in range(NUM_PIECES)) if pieces else ""}
+    {holder()}
+  </worldbody>
+  <actuator>{motors}</actuator>
+</mujoco>"""
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def _bowl() -> str:
+    sides = 16
+    rise, run = RIM_HEIGHT, RIM_RADIUS - BOWL_RADIUS
+    slope, half = math.atan2(run, rise), math.hypot(rise, run) / 2
+    middle, width = (RIM_RADIUS + BOWL_RADIUS) / 2 + 0.002, RIM_RADIUS * math.tan(math.pi / sides) + 0.001
+    walls = "".join(
+        f'<geom class="solid" type="box" size="0.002 {width:.5f} {half:.5f}" rgba="0.95 0.93 0.85 1"'
+        f' pos="{middle * math.cos(turn):.5f} {middle * math.sin(turn):.5f} {rise / 2:.5f}"'
+        f' quat="{_quat(turn, slope)}"/>'
+        for turn in (2 * math.pi * side / sides for side in range(sides))
+    )
+    floor = f'<geom type="cylinder" size="{BOWL_RADIUS + 0.005} 0.0005" rgba="0.88 0.86 0.78 1"/>'
+    return f'<body name="bowl" mocap="true" pos="{BOWL[0]} {BOWL[1]} 0">{floor}{walls}</body>'
+
+
+def _quat(yaw: float, pitch: float) -> str:
+    """Quaternion of a turn about z after one about y."""
+    a, b, c, d = math.cos(yaw / 2), math.sin(yaw / 2), math.cos(pitch / 2), math.sin(pitch / 2)
+    return f"{a * c:.6f} {-b * d:.6f} {a * d:.6f} {b * c:.6f}"
+
+
+def _piece(index: int) -> str:
+    return f'<body name="piece{index}" pos="0.9 {index * 0.03} 0.01"><freejoint/><geom class="piece"/></body>'
+
+
+def _spoon() -> str:
+    """A scoop open to the front (x); its origin is the middle of its floor, the handle rises from its back wall."""
+    x, y = SPOON_HALF
+    solid = f'class="tool" type="box" rgba="{_STEEL}"'
+    return f"""
+<geom name="spoon_floor" {solid} size="{x} {y} 0.001" pos="0 0 -0.001"/>
+<geom name="spoon_left" {solid} size="{x} 0.001 {WALL}" pos="0 {y} {WALL - 0.002}"/>
+<geom name="spoon_right" {solid} size="{x} 0.001 {WALL}" pos="0 {-y} {WALL - 0.002}"/>
+<geom name="spoon_back" {solid} size="0.001 {y} {WALL + 0.004}" pos="{-x} 0 {WALL + 0.002}"/>
+<geom name="handle" type="capsule" size="0.006" fromto="{-x} 0 {2 * WALL} {-x} 0 {HANDLE}" rgba="{_STEEL}" mass="0.05"/>
+<site name="spoon" size="0.002" rgba="0 0 0 0"/>"""
+
+
+# capsules of the links: from, to, radius, whether dark
+_CAPSULES: tuple[tuple[tuple, ...], ...] = (
+    (((0, 0, -0.19), (0, 0, -0.03), 0.06, False),),
+    (((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)),
+    (((0, 0, -0.13), (0, 0, -0.03), 0.055, False), ((0.0, 0, 0), (0.08, 0, 0), 0.05, True)),
+    (((0, 0, -0.04), (0, 0, 0.04), 0.055, False), ((0, 0, 0), (-0.08, 0.09, 0), 0.055, False)),
+    (((0, 0, -0.26), (0, 0.03, -0.14), 0.05, False), ((0, 0.05, -0.12), (0, 0.03, 0), 0.04, False)),
+    (((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)),
+    (((0, 0, 0.0), (0, 0, 0.08), 0.045, False),),
+)
+_LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
+_HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
+# joints: stiffness (N m / rad) and damping; with the armature a servo of some 50 ms
+_ARM_SERVO = ((1200, 80),) * 4 + ((500, 34),) * 3
+_HAND_SERVO = ((900, 60),) * 3 + ((12, 0.8),) * 3
+FLANGE = 0.107  # m, along the last joint's axis
+
+
+def _arm() -> str:
+    xml, closing = '<geom type="capsule" size="0.07" fromto="-0.06 0 0.06 0 0 0.06" rgba="0.93 0.93 0.93 1"/>', ""
+    for index, ((offset, turn), capsules) in enumerate(zip(LINKS, _CAPSULES, strict=True), 1):
+        quat = {0: "1 0 0 0", -1: "0.707107 -0.707107 0 0", 1: "0.707107 0.707107 0 0"}[turn]
+        place = " ".join(str(v) for v in offset)
+        armature = 0.6 if index <= 4 else 0.25
+        xml += (
+            f'<body name="link{index}" pos="{place}" quat="{quat}" gravcomp="1">'
+            f'<joint name="j{index}" axis="0 0 1" range="{_LOW[index - 1]} {_HIGH[index - 1]}" armature="{armature}"/>'
+        )
+        for start, end, radius, dark in capsules:
+            span = " ".join(f"{v:.4f}" for v in (*start, *end))
+            colour = _DARK if dark else _WHITE
+            xml += f'<geom type="capsule" size="{radius}" fromto="{span}" rgba="{colour}" mass="0.8"/>'
+        closing += "</body>"
+    # half a turn about x and the flange's eighth of a turn: the tool's x points ahead and its z up at the rest pose
+    turn = "0 0.923880 -0.382683 0"
+    mount = f'<body name="tool" pos="0 0 {FLANGE + HANDLE}" quat="{turn}" gravcomp="1">{_spoon()}</body>'
+    return xml + mount + closing
+
+
+def _hand() -> str:
+    joints = "".join(
+        f'<joint name="j{i}" type="slide" axis="{axis}" armature="1"/>'
+        for i, axis in enumerate(("1 0 0", "0 1 0", "0 0 1"), 1)
+    )
+    joints += "".join(
+        f'<joint name="j{i}" axis="{axis}" armature="0.01"/>' for i, axis in enumerate(("0 0 1", "0 1 0", "1 0 0"), 4)
+    )
+    x, top = -SPOON_HALF[0], HANDLE
+    fingers = "".join(
+        f'<geom type="capsule" size="0.009" rgba="{_SKIN}" mass="0.02"'
+        f' fromto="{x + 0.016} {-0.02} {top - 0.065 + 0.019 * k} {x + 0.012} 0.026 {top - 0.06 + 0.019 * k}"/>'
+        for k in range(4)
+    )
+    return f"""
+<body name="tool" gravcomp="1">{joints}{_spoon()}{fingers}
+<geom type="ellipsoid" size="0.022 0.03 0.045" pos="{x - 0.012} -0.012 {top - 0.03}" rgba="{_SKIN}" mass="0.2"/>
+<geom type="capsule" size="0.01" fromto="{x} 0.02 {top - 0.02} {x + 0.012} 0.012 {top + 0.03}" rgba="{_SKIN}"
+  mass="0.02"/>
+<geom type="capsule" size="0.026" fromto="{x - 0.02} -0.02 {top} {x - 0.11} -0.05 {top + 0.1}" rgba="{_SKIN}"
+  mass="0.3"/>
+<geom type="capsule" size="0.042" fromto="{x - 0.11} -0.05 {top + 0.1} {x - 0.3} -0.12 {top + 0.3}" rgba="{_SLEEVE}"
+  mass="0.3"/>
+</body>"""
+
 
 TICKS = round(CONTROL_HZ / FRAME_HZ)  # commands per frame
 SUBSTEPS = round(1 / (CONTROL_HZ * TIMESTEP))  # per command
