@@ -153,9 +153,8 @@ def _arm() -> str:
             xml += f'<geom type="capsule" size="{radius}" fromto="{span}" rgba="{colour}" mass="0.8"/>'
         closing += "</body>"
     # half a turn about x and the flange's eighth of a turn: the tool's x points ahead and its z up at the rest pose
-    turn = "0 0.923880 -0.382683 0"
-    mount = f'<body name="tool" pos="0 0 {FLANGE + HANDLE}" quat="{turn}" gravcomp="1">{_spoon()}</body>'
-    return xml + mount + closing
+    place = f'pos="0 0 {FLANGE + HANDLE}" quat="0 0.923880 -0.382683 0"'
+    return f'{xml}<body name="tool" {place} gravcomp="1">{_spoon()}</body>{closing}'
 
 
 def _hand() -> str:
