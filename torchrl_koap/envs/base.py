@@ -309,10 +309,7 @@ class ManipulationEnv(EnvBase):
         """Simulates action sequences from the present state of the environments ``rows`` and restores it.
 
         Sequences ``[m, len(rows), k, act]`` lead to observations ``[m, len(rows), k, obs]``. Entry ``k`` is the state
-        after actions 0 to ``k``; :meth:`step` observes it one control step later.
-
-        Raises:
-            ValueError: if the shape is wrong.
+        after actions 0 to ``k``; :meth:`step` observes it one control step later. Another shape is refused.
         """
         if actions.ndim != 4 or actions.shape[1] != len(rows) or actions.shape[3] != self.task.action_dim:
             wanted = f"[m, {len(rows)}, k, {self.task.action_dim}] [sequences, environments, control steps, action]"

@@ -29,11 +29,7 @@ def _scene(task: Task) -> Scene:
 
 
 def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | int | None = None) -> np.ndarray:
-    """Draws random contexts from the ranges of a task, float64 ``[num, objects, 3]``; ``generator`` may be a seed.
-
-    Raises:
-        ValueError: if the task is unknown or has no contexts, or the number is below 1.
-    """
+    """Draws random contexts from the ranges of a task that has some, float64 ``[num, objects, 3]``; a seed will do."""
     task = get_task(task)
     scene = _scene(task)
     if num < 1:
@@ -61,10 +57,7 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
     """Returns the first contexts of the fixed table on which methods are compared, float64 ``[num, objects, 3]``.
 
     The table (``evaluation_contexts.json``) never changes. Contexts of a task that is not in it are drawn with a seed
-    that its name alone decides.
-
-    Raises:
-        ValueError: if the task is unknown or has no contexts, or more are asked for than the table holds.
+    that its name alone decides. More than the table holds are refused.
     """
     task = get_task(task)
     _scene(task)
@@ -78,11 +71,7 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
 
 
 def check_contexts(task: Task, contexts) -> np.ndarray:
-    """Returns contexts ``[C, objects, 3]`` in float64.
-
-    Raises:
-        ValueError: if the task has none, the shape is another, or an object lies where the task never puts it.
-    """
+    """Returns contexts ``[C, objects, 3]`` in float64; refuses those in which an object lies where it never does."""
     scene, contexts = _scene(task), np.asarray(contexts, dtype=np.float64)
     if contexts.ndim != 3 or contexts.shape[1:] != (len(task.objects), 3) or not len(contexts):
         raise ValueError(
@@ -105,13 +94,9 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
 
 
 def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
-    """Reads D3IL's own context file, a pickled list of contexts, as float64 ``[C, objects, 3]``.
+    """Reads D3IL's own context file, a pickled list of contexts, as float64 ``[C, objects, 3]``; refuses other content.
 
     D3IL's degrees become rad, its further entries are left out. The restricted unpickler reads it.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file does not hold contexts of this task.
     """
     task = get_task(task)
     _scene(task)

@@ -75,11 +75,7 @@ class EvalConfig(RolloutConfig):
 
 
 def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
-    """Reads arguments of an environment: numbers, lists, true, false and null as such, anything else as text.
-
-    Raises:
-        ValueError: for a word that is no ``key=value``.
-    """
+    """Reads ``key=value`` words: numbers, lists, true, false and null as such, anything else as text."""
     found = {}
     for word in words:
         name, equals, value = word.partition("=")

@@ -120,9 +120,6 @@ class OracleFollower(Follower):
         """The action ``[n, 1, act]`` whose effect is nearest to the plan; arguments as for the base class.
 
         The first planned state is the present one, which is observed a step late.
-
-        Raises:
-            RuntimeError: before :meth:`attach`, or if it is asked for actions ahead.
         """
         if self._env is None:
             raise RuntimeError("the strategy 'oracle' does not know its environment: call policy.attach(env) first")

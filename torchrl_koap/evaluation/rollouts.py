@@ -36,18 +36,11 @@ def roll_out(
 ) -> list[TensorDict]:
     """Runs one episode per seed, on which alone the planner's noise depends; returns each ``[steps]``, cut at its end.
 
-    Args:
-        policy (PlanningPolicy): the policy.
-        make_env (callable): makes an environment of a given number of parallel episodes.
-        seeds (sequence of int): one per episode.
-
-    Keyword Args:
-        max_steps (int): control steps at most.
-        batch_size (int, optional): episodes at a time, on which outcomes do not depend. Default: :data:`AT_ONCE`.
-        contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
-        given (callable, optional): ``given(episodes)`` writes what the planner reads in those episodes in place of
-            start noise.
-        progress (callable, optional): called with the number of episodes finished.
+    ``make_env`` makes an environment of a given number of parallel episodes. There are ``batch_size`` episodes at a
+    time (by default :data:`AT_ONCE`), on which outcomes do not depend, of ``max_steps`` control steps at most.
+    ``contexts`` are those ``[objects, 3]`` of every episode, for a task that has them. ``given(episodes)`` writes what
+    the planner reads in those episodes in place of start noise. ``progress`` is called with the number of episodes
+    finished.
     """
     if not len(seeds) or (batch_size is not None and batch_size < 1):
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")

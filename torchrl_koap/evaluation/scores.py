@@ -43,12 +43,9 @@ def score(
     :func:`~torchrl_koap.evaluation.rollouts.roll_out`; ``mode_index`` maps the leaf ``mode`` to a number, -1 if
     incomplete; ``num_modes`` is the base of the entropy's logarithm.
 
-    Keyword Args:
-        contexts (sequence of int, optional): number of the context of every episode. With it ``mode_entropy`` is the
-            mean over contexts, None below two rollouts per context, and ``pooled_mode_entropy`` is that of all
-            successful episodes together.
-        unsolved (str): what contexts without success count, see
-            :func:`~torchrl_koap.evaluation.statistics.conditional_entropy`.
+    With ``contexts``, the number of the context of every episode, ``mode_entropy`` is the mean over contexts, None
+    below two rollouts per context, and ``pooled_mode_entropy`` that of all successful episodes together. ``unsolved``
+    is as of :func:`~torchrl_koap.evaluation.statistics.conditional_entropy`.
     """
     rows: list[dict[str, Any]] = []
     for seed, episode in zip(seeds, episodes, strict=True):
@@ -115,9 +112,8 @@ def task_scores(
 def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
     """Tells how many boxes were brought to the zone of Stacking, in how many orders, and D3IL's figure.
 
-    Returns:
-        dict: ``rates`` of one, two and three boxes, entropies of the first one, two and three letters (bases 3, 6, 6)
-        over contexts, and ``d3il_score``, the sum of the three rates.
+    These are ``rates`` of one, two and three boxes, entropies of the first one, two and three letters (bases 3, 6, 6)
+    over contexts, and ``d3il_score``, the sum of the three rates.
     """
     found = _stacked(episodes, contexts, most=3)
     return found | {"d3il_score": sum(sum(good) / len(good) for good in found["rates"].values())}

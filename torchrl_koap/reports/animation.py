@@ -150,12 +150,7 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     The simulator repeats itself exactly, so the film shows what happened, as long as the context is the recorded one to
     the last digit (float64), or the environment of Gymnasium begins by its seed. Entries: ``action`` ``[E, T, act]``
     (NaN after the end), ``outcome`` ``[E]``, and ``context`` ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw
-    (rad).
-
-    Raises:
-        NothingToDraw: if actions were not kept, or the task is not known.
-        NotFilmed: if the scene has no camera, or no OpenGL library can be used; the message says what to install.
-        ValueError: for a wrong shape, or no context where one is needed.
+    (rad). Where the scene has no camera, or no OpenGL library can be used, :class:`NotFilmed` says so.
     """
     task, made = run.task, run.evaluation
     if "action" not in rollouts or not (made.get("env") or (task is not None and task.env is not None)):

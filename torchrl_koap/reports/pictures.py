@@ -66,27 +66,16 @@ Draw = Callable[[Any, RunFacts], Figure | Film]
 
 @dataclass(frozen=True)
 class Picture:
-    """Holds one picture of a run: its words, its source and the function that draws it.
+    """Holds one picture of a run: its words, its source and the function that draws it."""
 
-    Args:
-        name (str): file name inside ``plots/``.
-        source (str): file of the run directory it is drawn from.
-        title (str): its heading in the report.
-        caption (str or callable): what it shows and how to read it, or a function of the run that says so.
-        draw (callable): from the content of the source and the run to a figure or film.
-        order (int): pictures stand in the report in this order.
-        empty (str): what the report says where the source holds nothing to draw; nothing if it is empty.
-        offline (bool): it is of tasks without an environment alone, which are evaluated on recorded data.
-    """
-
-    name: str
-    source: str
-    title: str
-    caption: str | Callable[[RunFacts], str]
-    draw: Draw
-    order: int = 1000
-    empty: str = ""
-    offline: bool = False
+    name: str  # file name inside ``plots/``
+    source: str  # file of the run directory it is drawn from
+    title: str  # its heading in the report
+    caption: str | Callable[[RunFacts], str]  # what it shows and how to read it, or a function of the run that says so
+    draw: Draw  # from the content of the source and the run to a figure or film
+    order: int = 1000  # pictures stand in the report in this order
+    empty: str = ""  # what the report says where the source holds nothing to draw; nothing if it is empty
+    offline: bool = False  # it is of tasks without an environment alone, which are evaluated on recorded data
 
     @property
     def made_by(self) -> str:
@@ -136,11 +125,8 @@ def draw_pictures(
 ) -> dict[str, str]:
     """Draws every picture, or those named, into ``plots/`` whose source is there; one that fails stops no other.
 
-    Moving ones take some seconds more (``animation``).
-
-    Returns:
-        dict: what went wrong, a message per picture that could not be drawn although its source is there. A picture
-        whose source is absent, or holds nothing to draw, is not an error.
+    Moving ones take some seconds more (``animation``). Returned is a message per picture that could not be drawn; one
+    whose source is absent, or holds nothing to draw, is no error.
     """
     run = RunFacts.read(folder)
     problems = {}

@@ -20,10 +20,7 @@ FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X", ERROR: "v"}
 
 
 def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.ndarray:
-    """Returns an entry that has to be there as an array of a shape, of which None allows any size.
-
-    One that is missing is refused with a list of those that are there, like one of another shape.
-    """
+    """Returns an entry, which has to be there, as an array of a shape, of which None allows any size."""
     if key not in data:
         raise ValueError(f"missing entry {key!r}; got {', '.join(sorted(map(str, data))) or 'nothing'}")
     value = np.asarray(data[key])

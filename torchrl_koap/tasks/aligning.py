@@ -27,11 +27,7 @@ _POSES = dict(zip((*_BOX, *_TARGET), (3, 4, 3, 4), strict=True))  # their column
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether the tray lies in the target pose, bool ``[*B]`` of states ``[*B, d]``.
-
-    Within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
-    :data:`ROTATION_TOLERANCE` half turns.
-    """
+    """Says whether the tray is near to its target and turned like it, bool ``[*B]`` of states ``[*B, d]``."""
     part = {name: state[..., columns] for name, columns in task.state_slices.items()}
     distance = (part["box_position"] - part["target_position"]).norm(dim=-1)
     cosine = torch.nn.functional.cosine_similarity(part["box_quaternion"], part["target_quaternion"], dim=-1)

@@ -42,10 +42,7 @@ def yaw_of(quaternion: Tensor) -> Tensor:
 
 
 def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
-    """Computes the tangent of the yaw ``[...]`` of quaternions ``[..., 4]`` (w, x, y, z) as D3IL does.
-
-    The sign of ``x y`` is the original's, which matters for tilted boxes only.
-    """
+    """Computes ``tan(yaw)`` ``[...]`` of quaternions ``[..., 4]`` (w, x, y, z), with D3IL's sign of ``x y``."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2)))
 

@@ -68,10 +68,7 @@ def get_task(name: Task | str) -> Task:
 def task_from(name: str, definition: object) -> Task:
     """Finds the task of a data set or run: the one that it brings along, as :meth:`Task.to_json` wrote it, or names.
 
-    A folder that somebody sent must not decide what is run.
-
-    Raises:
-        ValueError: if the definition is damaged or names code, or there is none and nobody has registered the name.
+    A folder that somebody sent must not decide what is run: a definition that names code is refused.
     """
     if definition is None:
         return get_task(name)

@@ -66,10 +66,7 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
-    """Computes D3IL's figure ``d3il_score``: success minus the divergence of the modes from equally frequent ones.
-
-    Equally frequent modes are those of our demonstrations. None where no context had two rollouts.
-    """
+    """Computes ``d3il_score``: success less the divergence of the modes from equally frequent ones, as recorded."""
     if result["mode_entropy"] is None:
         return {}
     return {"d3il_score": result["rates"]["success"]["rate"] - (1 - result["mode_entropy"])}

@@ -237,11 +237,7 @@ class Task(Columns):
         return next(iter(self.state_parts.items())) == (self.position, "plain")
 
     def controller_columns(self, part: str) -> tuple[int, ...]:
-        """Returns the state columns that a controller reads: ``"all"`` or the ``"robot"``'s, which actions command.
-
-        Raises:
-            ValueError: for another part.
-        """
+        """Returns the state columns that a controller reads: ``"all"`` or the ``"robot"``'s, which actions command."""
         everything = tuple(range(self.state_dim))
         return lookup({"robot": self.robot or everything, "all": everything}, part, "part of the state")
 
@@ -293,11 +289,7 @@ class Task(Columns):
         return {place: value for place, value in named.items() if value}
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the task as dictionaries, lists, strings and numbers.
-
-        Raises:
-            TypeError: if a field holds an object instead of its import string.
-        """
+        """Returns the task as dictionaries, lists, strings and numbers; an object in place of its name is refused."""
         return {name: _plain(value, name) for name, value in asdict(self).items()}
 
     def definition(self) -> dict[str, Any] | None:
@@ -306,11 +298,7 @@ class Task(Columns):
 
     @classmethod
     def from_json(cls, entries: object) -> Task:
-        """Reads the task that :meth:`to_json` wrote.
-
-        Raises:
-            ValueError: for an unknown or missing entry, or facts that do not fit each other.
-        """
+        """Reads the task that :meth:`to_json` wrote; unknown, missing and unfitting entries are refused."""
         return dataclass_from_json(cls, entries)
 
 

@@ -97,17 +97,10 @@ def embed_recordings(
     A camera that is a part of the task's observation fills it. Embeddings of any other one are further columns, which
     are not the robot's. Features lie in ``out/unfinished`` until all is done, so that the same call goes on.
 
-    Keyword Args:
-        cameras (sequence of str): which of them. Default: all.
-        network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`.
-        components (int): per camera, fitted to frames of nine trajectories in ten; a part of the task has its own.
-        projection (Projection, optional): take this one instead of fitting; for a single camera.
-        progress (callable, optional): called with the number of frames that are done, and that of all.
-
-    Raises:
-        DataError: if frames are missing, damaged or unlike the others; camera, trajectory and frame are named.
-        ValueError: for an unknown camera, or more components than frames or features.
-        WeightsError: if weights are missing or others than those of the projection.
+    Of every camera, or of those named, ``components`` are fitted to frames of nine trajectories in ten, or as many as
+    the part of the task has, unless a ``projection`` is given for a single one. ``progress`` is called with the number
+    of frames that are done, and that of all. Frames that are missing, damaged or unlike the others are refused by
+    camera, trajectory and frame.
     """
     out, chosen = Path(out), list(cameras) or list(recordings.cameras)
     if not chosen:

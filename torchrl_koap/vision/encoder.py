@@ -6,7 +6,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -30,6 +29,8 @@ SHORT_SIDE = 96  # pixels that the network is shown of the shorter side of a fra
 class FrozenImageEncoder(ObservationTransform):
     """Embeds camera frames: a frozen network, means over a coarse grid, principal components.
 
+    Frames are ``pixels``, uint8 ``[*B, H, W, 3]``, and become ``embedding``, float32 ``[*B, d]``.
+
     The network is shown 96 pixels of the shorter side of a frame, and all of it where it has fewer.
 
     Args:
@@ -41,7 +42,6 @@ class FrozenImageEncoder(ObservationTransform):
             :class:`~torchrl_koap.vision.Projection`. Default: none, the features are the embedding.
         size (int, or sequence of int): height and width of the recorded frames. Frames of another size are resized,
             with a warning at the first one.
-        in_key, out_key (str): frames, uint8 ``[*B, H, W, 3]``, and embeddings, float32 ``[*B, d]``.
 
     Raises:
         WeightsError: if there are no weights.
@@ -62,10 +62,8 @@ class FrozenImageEncoder(ObservationTransform):
         *,
         projection: nn.Module | None = None,
         size: int | Sequence[int] = 96,
-        in_key: str = "pixels",
-        out_key: str = "embedding",
     ):
-        super().__init__(in_keys=[in_key], out_keys=[out_key])
+        super().__init__(in_keys=["pixels"], out_keys=["embedding"])
         self.backbone = load_backbone() if backbone is None else backbone
         self.projection = projection
         self.size = (size, size) if isinstance(size, int) else (int(size[0]), int(size[1]))
@@ -263,14 +261,13 @@ def cameras_of(dataset: str | Path | None) -> dict[str, Projection]:
 
 
 def load_encoder(
-    projection: Projection | str | Path = SCOOPING, network: str | Path | None = None, **options: Any
+    projection: Projection | str | Path = SCOOPING, network: str | Path | None = None
 ) -> FrozenImageEncoder:
     """Makes the encoder that a projection was fitted behind.
 
     Args:
         projection (Projection, str or Path): it, or its file. Default: the one of Scooping that comes with the package.
         network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`. Default: as it was fitted.
-        **options: ``in_key`` and ``out_key`` of :class:`~torchrl_koap.vision.FrozenImageEncoder`.
 
     Returns:
         FrozenImageEncoder: frozen, in evaluation mode.
@@ -300,4 +297,4 @@ def load_encoder(
             f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"
             f" {backbone.digest[:12]} of {backbone.name}: fit one for them, or pass the network it belongs to"
         )
-    return FrozenImageEncoder(backbone, projection=fitted, size=(size * 2)[:2], **options)
+    return FrozenImageEncoder(backbone, projection=fitted, size=(size * 2)[:2])

@@ -42,11 +42,8 @@ def record_to_folder(
 ) -> RecordingReport:
     """Records demonstrations into a folder; called again with the same arguments, it goes on where it was interrupted.
 
-    Arguments, and further errors, are those of :func:`~torchrl_koap.envs.experts.demonstrations.iterate_takes`.
-
-    Raises:
-        FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
-        LockedError: if another process records into the folder.
+    Arguments are those of :func:`~torchrl_koap.envs.experts.demonstrations.iterate_takes`. A folder that holds
+    demonstrations already, or other unfinished ones, or that another process records into, is refused.
     """
     start, disturbance = time.perf_counter(), share_disturbed(task, disturbance)
     task = get_task(task.source)

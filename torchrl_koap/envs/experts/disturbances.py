@@ -70,11 +70,7 @@ class Disturbances:
 
 
 def disturbed_columns(task: Task) -> np.ndarray:
-    """Returns the action columns that are disturbed: changes of a command, of a tool on the table only sideways.
-
-    Raises:
-        ValueError: if no action of the task is a change of a command.
-    """
+    """Returns the action columns that are disturbed: changes of a command, of a tool on the table only sideways."""
     changes = task.delta_actions
     if not changes:
         raise ValueError(f"task {task.name!r} has no action that is a change of a command: nothing can be disturbed")

@@ -47,11 +47,7 @@ LOG_WIDTH = 46
 
 @functools.cache
 def step_address() -> int:
-    """Returns the address of ``mj_step`` in the MuJoCo library that the Python package has loaded.
-
-    Raises:
-        OSError: if the library is not found beside the ``mujoco`` package.
-    """
+    """Returns the address of ``mj_step`` in the library beside the ``mujoco`` package, which must be there."""
     folder = Path(mujoco.__file__).parent
     found = [path for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll") for path in folder.glob(pattern)]
     if not found:

@@ -32,11 +32,7 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 
 def backends() -> list[str]:
-    """Lists the OpenGL back ends to try, in order: the one named by ``MUJOCO_GL``, else what suits this machine.
-
-    Raises:
-        RuntimeError: if ``MUJOCO_GL`` switches rendering off or names a back end that does not exist.
-    """
+    """Lists the OpenGL back ends to try, in order: the one named by ``MUJOCO_GL``, else what suits this machine."""
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if chosen in _SWITCHED_OFF:
         raise RuntimeError(f"rendering is switched off by the environment variable MUJOCO_GL={chosen}")
@@ -52,11 +48,7 @@ def backends() -> list[str]:
 
 
 def open_context(names: Sequence[str], model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """Opens the first back end of some that a model can be drawn with: its window, and its graphics memory.
-
-    Raises:
-        RuntimeError: if there is none; the message says why, and what to install.
-    """
+    """Opens the first back end that a model can be drawn with, its window and graphics memory, or says why none."""
     reasons = []
     for name in names:
         try:
@@ -92,9 +84,7 @@ def _try(name: str) -> str:
 class Renderer:
     """Draws simulations of one model into arrays [height, width, 3]; without ``shadows`` software takes half the time.
 
-    Raises:
-        RuntimeError: if no OpenGL library can be used; the message says what to install.
-        ValueError: if a size is below 1.
+    Where no OpenGL library can be used, a RuntimeError says what to install.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, *, shadows: bool = True):
@@ -112,11 +102,7 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
 
     def render(self, data: mujoco.MjData, camera: str = "cage") -> np.ndarray:
-        """Draws one simulation, uint8 [height, width, 3], by a camera of the scene; the arm's prefix may be left out.
-
-        Raises:
-            ValueError: if the scene has no such camera.
-        """
+        """Draws one simulation, uint8 [height, width, 3], by a camera; the arm's prefix may be left out of its name."""
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
         self._camera.fixedcamid = self._camera_id(camera)
         self._context.make_current()

@@ -73,12 +73,7 @@ _MESHES = (*(f"link{i}" for i in range(8)), "hand", "finger")
 
 
 def mesh_folder() -> Path:
-    """Finds the ten detailed Panda meshes of the installed ``gymnasium-robotics`` package.
-
-    Raises:
-        ImportError: if the package is not installed.
-        FileNotFoundError: if this version of the package has no such meshes.
-    """
+    """Finds the ten detailed Panda meshes of the package ``gymnasium-robotics``; an error says if they are missing."""
     spec = importlib.util.find_spec("gymnasium_robotics")
     if spec is None or spec.origin is None:
         raise ImportError(
@@ -103,9 +98,6 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3
 
     With ``link_collisions`` the convex hulls of links 0-7 collide with objects and table too. The original lets them
     collide with each other as well, which joint limits and tasks keep them from; testing takes time.
-
-    Raises:
-        ImportError: if ``gymnasium-robotics``, which holds the meshes, is not installed.
     """
     folder = mesh_folder()
     root = mjcf.RootElement(model="panda")

@@ -36,11 +36,7 @@ class Simulations:
         return len(self.data)
 
     def _run(self, advance: Callable[[np.ndarray], None], rows: np.ndarray, substeps: int) -> None:
-        """Advances the simulations ``rows`` by ``substeps``, in threads where there are several of both.
-
-        Raises:
-            RuntimeError: if a simulation becomes unstable.
-        """
+        """Advances the simulations ``rows`` by ``substeps``, in threads where there are several of both."""
         timestep = self.model.opt.timestep
         due = [self.data[row].time + substeps * timestep for row in rows]
         if self.num_threads == 1 or len(rows) <= 1:

@@ -116,12 +116,8 @@ def record_videos(
 ) -> VideoReport:
     """Records demonstrations of a ``"robot"``, or of a ``"hand"`` without actions, as a LeRobot data set with pictures.
 
-    The two never share a start. ``progress`` is called with the number of demonstrations recorded and wanted.
-
-    Raises:
-        FileExistsError: if the folder is not empty.
-        ValueError: for another embodiment, or a number out of range.
-        RuntimeError: if there is no OpenGL library, pyarrow is missing, or the expert fails again and again.
+    The two never share a start. ``progress`` is called with the number of demonstrations recorded and wanted. A folder
+    that is not empty is refused.
     """
     task = get_task(task)
     lookup(HABITS, embodiment, "embodiment")

@@ -259,11 +259,7 @@ class ScoopingSimulations(Simulations):
         self.held[rows] = 0
 
     def advance(self, rows: np.ndarray, targets: np.ndarray) -> None:
-        """Advances by one frame: the commands go from the last target to the new one ``[n, nu]`` in equal parts.
-
-        Raises:
-            RuntimeError: if a simulation becomes unstable.
-        """
+        """Advances by one frame: the commands go from the last target to the new one ``[n, nu]`` in equal parts."""
 
         def advance(piece: np.ndarray) -> None:
             for row in piece:
