@@ -23,8 +23,7 @@ CONTROLLER_UPDATES = 500
 PLACES = "absolute"  # what the default preset is where actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
-# no figure counts the modes of plans; blending takes their acceleration for a distance to the robot
-OWN_EXECUTION: dict[str, Any] = {"temperature": 0.7, "blend": 0.0}
+OWN_TEMPERATURE = 0.7  # of plans where no figure counts the modes
 Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 
 
@@ -110,7 +109,7 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
 
 
 def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionConfig:
-    own = (OWN_EXECUTION if task.env is None else {}) | dict(task.defaults.execution)
+    own = ({"temperature": OWN_TEMPERATURE} if task.env is None else {}) | dict(task.defaults.execution)
     if asked.strategy == "oracle":
         raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
     if not method.plans:

@@ -28,8 +28,17 @@ def test_a_blended_plan_leaves_from_the_present_state_and_ends_as_planned():
     assert torch.equal(blend_plan(history, line, 0.0), line)
     batched = blend_plan(history.expand(3, 4, 2, 2), line.expand(3, 4, 14, 2), 0.8)
     torch.testing.assert_close(batched[2, 3], blended)
-    uneven = torch.tensor([[1.0], [5.0], [3.0]])  # least-squares line through (1, 1), (2, 5), (3, 3): at 0 it is 1
-    torch.testing.assert_close(blend_plan(torch.tensor([[1.0]]), uneven, 0.5), uneven)
+    short = torch.tensor([[1.0], [5.0], [3.0], [4.0]])
+    assert torch.equal(blend_plan(torch.tensor([[1.0]]), short, 0.5), short)
+
+
+def test_a_plan_that_accelerates_from_the_present_state_is_left_as_it_is():
+    time = torch.arange(1.0, 15.0)[:, None]
+    accelerating = torch.tensor([2.0, -1.0]) + time * torch.tensor([0.5, 0.0]) + time**2 * torch.tensor([0.1, -0.3])
+    torch.testing.assert_close(blend_plan(torch.tensor([[2.0, -1.0]]), accelerating, 0.8), accelerating)
+    parabola = torch.linalg.lstsq(time[:5] ** torch.arange(3), torch.tensor([[1.0], [0.0], [3.0], [0.0], [1.0]]))
+    rough = torch.tensor([[1.0], [0.0], [3.0], [0.0], [1.0]])
+    torch.testing.assert_close(blend_plan(parabola.solution[:1], rough, 0.5), rough)  # least squares, at present
 
 
 def test_what_is_left_of_plans_of_different_age():

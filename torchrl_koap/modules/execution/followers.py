@@ -14,6 +14,8 @@ from torchrl.envs import EnvBase
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 ActionRule = Callable[[Tensor, Tensor], Tensor]  # (states [*B, T, d], actions [*B, T, act]) -> actions
+# five times the weights of a plan's first states in where it has the robot at present
+_AT_PRESENT = (9.0, 0.0, -4.0, -3.0, 3.0)
 
 
 class Follower(nn.Module):
@@ -108,14 +110,14 @@ def blend_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
     r"""Bends the beginning of a plan so that it leaves from the present state.
 
     .. math::
-        x'_{t+k} = x_{t+k} + \rho^k e, \qquad e = x_t - (4 x_{t+1} + x_{t+2} - 2 x_{t+3}) / 3
+        x'_{t+k} = x_{t+k} + \rho^k e, \qquad e = x_t - (9 x_{t+1} - 4 x_{t+3} - 3 x_{t+4} + 3 x_{t+5}) / 5
 
-    with the present state ``x_t`` and where the plan has the robot at present: its first three states, continued
-    backwards along their least-squares line.
+    with the present state ``x_t`` and where the plan has the robot at present: its first five states, continued
+    backwards along their least-squares parabola. A line would take acceleration for a distance to the robot.
 
     Args:
         history (Tensor): observed states ``[*B, h, d]``, the present one last.
-        plan (Tensor): planned states ``[*B, H, d]``; one shorter than three states is returned as it is.
+        plan (Tensor): planned states ``[*B, H, d]``; one shorter than five states is returned as it is.
         decay (float): ``rho``.
 
     Returns:
@@ -124,13 +126,13 @@ def blend_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
     Examples:
         >>> import torch
         >>> from torchrl_koap.modules import blend_plan
-        >>> plan = torch.tensor([[2.0], [3.0], [4.0]])
-        >>> blend_plan(torch.tensor([[0.0]]), plan, 0.5).flatten().tolist()  # the plan begins at 1, the robot is at 0
-        [1.5, 2.75, 3.875]
+        >>> plan = torch.tensor([[2.0], [4.0], [7.0], [11.0], [16.0]])  # it was at 1
+        >>> blend_plan(torch.tensor([[0.0]]), plan, 0.5).flatten().tolist()  # the robot is at 0
+        [1.5, 3.75, 6.875, 10.9375, 15.96875]
     """
-    if decay == 0 or plan.shape[-2] < 3:
+    if decay == 0 or plan.shape[-2] < len(_AT_PRESENT):
         return plan
-    first, second, third = plan[..., :3, :].unbind(-2)
-    behind = history[..., -1, :] - (4 * first + second - 2 * third) / 3
+    present = (plan.new_tensor(_AT_PRESENT).unsqueeze(-1) * plan[..., : len(_AT_PRESENT), :]).sum(-2) / 5
+    behind = history[..., -1, :] - present
     frames = torch.arange(1, plan.shape[-2] + 1, device=plan.device, dtype=plan.dtype)
     return plan + behind.unsqueeze(-2) * (decay**frames).unsqueeze(-1)
