@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -47,6 +48,25 @@ def test_numbers_are_those_of_the_environment_itself():
     np.testing.assert_allclose(rollout["observation"][1].numpy(), np.stack(rows), rtol=1e-6)
     assert torch.equal(rollout["observation"][0], rollout["observation"][2])
     assert not torch.equal(rollout["observation"][0], rollout["observation"][1])
+
+
+def test_origins_of_the_data_are_subtracted_from_observations_and_added_to_actions():
+    origin = np.array([1e6, -1e6, 0.0, 3.0])
+
+    box = functools.partial(gymnasium.spaces.Box, -np.inf, np.inf, dtype=np.float64)
+
+    def make_far():
+        env = gymnasium.wrappers.TransformObservation(Reach(), lambda near: near + origin, box(shape=(4,)))
+        return gymnasium.wrappers.TransformAction(env, lambda action: action - origin[:2], box(shape=(2,)))
+
+    gymnasium.register("ToyFar-v0", make_far, disable_env_checker=True)
+    targets = {name: Action("rad", "absolute", column=column) for column, name in enumerate("ab")}
+    task = replace(TASK, actions=targets, observation_origin=tuple(origin))
+    far, near = (
+        run(GymnasiumBatch("ToyFar-v0", task, 2), 4, [4, 9]),
+        run(GymnasiumBatch("ToyReach-v0", TASK, 2), 4, [4, 9]),
+    )
+    torch.testing.assert_close(far["observation"], near["observation"], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,9 @@ class GymnasiumBatch(EnvBase):
     ``success`` stays True from the step on in which it is reported (:class:`GymnasiumEpisode`). Actions are clipped to
     the environment's box. An environment that raises an error ends its episode as failed (``failed``).
 
+    Observations and actions are those of the data: the task's ``origins`` are subtracted from what environments report
+    and added to what they are told.
+
     Where the policy was trained with cameras (``observe``), the environment's observation is a dictionary: its uint8
     pictures are the frames of the cameras of their names (of the only one whatever their name), its numbers side by
     side the state.
@@ -156,6 +159,7 @@ class GymnasiumBatch(EnvBase):
     ):
         super().__init__(batch_size=[num_envs])
         self.env_id, self.task, self._observe = env_id, task, observe
+        self._origin, self._added = map(np.asarray, task.origins or (0.0, 0.0))
         self.record = EpisodeRecord() if record is None else record
         make = partial(gymnasium.make, env_id, **(env_kwargs or {}))
         try:
@@ -213,7 +217,7 @@ class GymnasiumBatch(EnvBase):
         return self._leaves(seen)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen, reward, _, _, told = self._env.step(tensordict.get(ACTION).cpu().numpy())
+        seen, reward, _, _, told = self._env.step(tensordict.get(ACTION).cpu().numpy() + self._added)
         self._steps += told["played"]
         self.record.actions += int(told["played"].sum())
         self.record.clipped += int(told["clipped"].sum())
@@ -230,7 +234,7 @@ class GymnasiumBatch(EnvBase):
         """What was seen and the state of every episode, as leaves."""
         if self._observe is not None:
             seen = np.stack([self._read(each) for each in iterate(self._env.observation_space, seen)])
-        self._state[OBSERVATION] = torch.from_numpy(np.array(seen, dtype=np.float32))
+        self._state[OBSERVATION] = torch.from_numpy((np.asarray(seen) - self._origin).astype(np.float32))
         return TensorDict({name: value.clone() for name, value in self._state.items()}, self.batch_size)
 
     def _read(self, observation: Any) -> np.ndarray:
@@ -238,7 +242,7 @@ class GymnasiumBatch(EnvBase):
         frames, numbers = _sorted(dict(_entries(observation)))
         named = _named(frames, self._observe)
         state = np.concatenate([np.ravel(value) for value in numbers.values()]) if numbers else None
-        return self._observe(named if state is None else {STATE: state.astype(np.float32), **named})
+        return self._observe(named if state is None else {STATE: state, **named})
 
     def close(self, **kwargs: Any) -> None:
         """Closes the environments."""
