@@ -29,11 +29,6 @@ def short_loops(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory):
-    return save_arm(tmp_path_factory.mktemp("data") / "arm")
-
-
-@pytest.fixture(scope="module")
 def run(tmp_path_factory):
     arm = save_arm(tmp_path_factory.mktemp("data") / "arm")
     return train_arm(tmp_path_factory.mktemp("runs") / "run", arm)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchrl_koap.tasks import TASKS, Columns, get_task
-from torchrl_koap.tasks.columns import double_yaw, plane, yaw_of
+from torchrl_koap.tasks.columns import double_yaw, yaw_of
 
 PARTS = {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1}
 TOY = {"name": "toy", "observation_parts": PARTS, "command": "command"}
@@ -96,7 +96,3 @@ def test_yaw_of_quaternions_ignores_sign_and_a_small_tilt():
     w, _, _, z = upright.unbind(-1)
     tilted = torch.stack([w * tilt[0], w * tilt[1], z * tilt[1], z * tilt[0]], -1)
     assert (yaw_of(tilted) - expected).abs().max() < 2e-3
-
-
-def test_plane_drops_the_height():
-    assert plane(torch.tensor([1.0, 2.0, 3.0])).tolist() == [1.0, 2.0]

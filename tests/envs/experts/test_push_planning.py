@@ -53,14 +53,6 @@ def test_an_off_centre_push_turns_about_the_point_that_theory_names():
     assert y == pytest.approx(-radius * (1 - math.cos(angle)), rel=0.01)
 
 
-def test_mirrored_contacts_move_mirrored():
-    left, right = (
-        motion(contact(-0.055, 0.02, 0.0, shift=0.01), 0.4),
-        motion(contact(-0.055, -0.02, 0.0, shift=0.01), -0.4),
-    )
-    assert left == pytest.approx((right[0], -right[1], -right[2], right[3], -right[4]))
-
-
 @pytest.mark.parametrize("target", [(0.5, 0.3, 0.0), (0.42, 0.25, 0.9), (0.6, 0.2, -1.2)])
 def test_a_found_plan_arrives(target):
     pose, target = np.array([0.5, -0.2, 0.1]), np.array(target)

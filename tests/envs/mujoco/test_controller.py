@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from torchrl_koap.envs.avoiding import AvoidingEnv
-from torchrl_koap.envs.mujoco import controller, kinematics
+from torchrl_koap.envs.mujoco import kinematics
 from torchrl_koap.envs.mujoco.scene import compile_scene, panda, scene
-from torchrl_koap.envs.mujoco.simulation import SimulationBatch
 
 
 @pytest.fixture(scope="module")
@@ -106,32 +105,3 @@ def test_inverse_kinematics_converge_and_respect_the_bound_of_joint_3():
     np.testing.assert_allclose(tcp, target[:3], atol=1e-6)
     assert abs(quat[1]) > 1 - 1e-10
     assert compiled_inverse_kinematics(target, np.array([0, 0.5, 2.8, -2, 0, 2, 0.0]))[2] == 2.0
-
-
-@pytest.mark.parametrize(
-    "positions, velocities, width, grasping, wanted",
-    [
-        ((0.0, 0.0), (0.0, 0.0), 0.001, False, (0.5, 0.5)),
-        ((0.03, 0.03), (0.0, 0.0), 0.0, True, (-20.0, -20.0)),
-        ((0.03, 0.03), (-0.1, 0.0), 0.0, False, (-1.0, -2.0)),
-        ((0.02, 0.03), (0.0, 0.0), 0.04, False, (2.5 + 5.0, -2.5 + 5.0)),
-        ((0.040, 0.038), (0.01, 0.0), 0.039, False, (-0.5 - 0.5 - 0.1, 0.5 + 0.5)),
-    ],
-)
-def test_finger_forces(positions, velocities, width, grasping, wanted):
-    position, velocity, ctrl = np.zeros(9), np.zeros(9), np.zeros(9)
-    position[7:], velocity[7:] = positions, velocities
-    controller._finger_forces(position, velocity, width, grasping, ctrl)
-    np.testing.assert_allclose(ctrl[7:], wanted, atol=1e-12)
-
-
-def test_logged_velocity_is_jacobian_times_joint_velocity(model):
-    sims = SimulationBatch(model, 1)
-    sims.reset(np.array([0]), np.array(AvoidingEnv.START_JOINTS))
-    command = np.array([[0.55, -0.2, 0.12, 0, 1, 0, 0]])
-    sims.track_pose(np.array([0]), command, 10)
-    sims.track_pose(np.array([0]), command, 1)
-    data, jacobian = sims.data[0], np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, jacobian, None, model.body("panda/tcp").id)
-    np.testing.assert_allclose(sims.log[0, controller.LOG_COLUMNS["c_vel"]], jacobian @ data.qvel, atol=1e-13)
-    np.testing.assert_array_equal(sims.log[0, controller.LOG_COLUMNS["j_pos"]], data.qpos[:7])

@@ -7,36 +7,14 @@ import importlib.util
 from types import SimpleNamespace
 
 import mujoco
-import numpy as np
 import pytest
 
 from torchrl_koap.envs.mujoco.kinematics import Q_REST
-from torchrl_koap.envs.mujoco.scene import compile_scene, panda, scene
+from torchrl_koap.envs.mujoco.scene import compile_scene, panda
 
 
 def compiled(**arguments) -> mujoco.MjModel:
     return compile_scene(panda(**arguments))
-
-
-def test_masses_and_inertias_are_those_of_the_table():
-    model = compiled(rod=True)
-    links = 3.01399 + 2.77281 + 2.7996 + 2.14603 + 2.18807 + 3.19545 + 1.35761 + 0.417345
-    rest = 0.1 + 0.670782 + 2 * (0.0218754 + 0.01) + 0.09424778 + 0.00418879
-    assert model.body_mass.sum() == pytest.approx(links + rest, abs=1e-8)
-    np.testing.assert_allclose(model.body("link8").inertia, 0.1)
-    np.testing.assert_allclose(model.body("finger_tip_left").inertia, 0.01)
-    np.testing.assert_allclose(model.body("tcp").mass, 0.0)
-
-
-def test_joints_and_motors():
-    model = compiled(rod=True)
-    assert model.nq == model.nv == model.nu == 9
-    np.testing.assert_allclose(model.joint("joint4").range, [-3.1416, 0.0873])
-    np.testing.assert_allclose(model.dof_damping, [0.0] * 7 + [10.0] * 2)
-    assert not model.dof_armature.any() and not model.dof_frictionloss.any()
-    np.testing.assert_allclose(model.actuator_forcerange[:, 1], [87.0] * 4 + [12.0] * 3 + [70.0] * 2)
-    np.testing.assert_allclose(model.actuator_gear[:, 0], 1.0)
-    assert not model.actuator_ctrllimited.any()
 
 
 @pytest.mark.parametrize("link_collisions", [False, True])
@@ -56,15 +34,6 @@ def test_consecutive_links_never_collide_although_their_hulls_overlap():
     data.qpos[7:] = 0.02
     mujoco.mj_forward(model, data)
     assert data.ncon == 0
-
-
-def test_scene_settings():
-    model = compile_scene(scene())
-    option = model.opt
-    assert (option.timestep, option.impratio, option.tolerance, option.iterations) == (0.001, 3.0, 1e-10, 100)
-    assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and option.integrator == mujoco.mjtIntegrator.mjINT_EULER
-    table = model.geom("table_top")
-    assert table.pos[2] + table.size[2] == pytest.approx(-0.019)
 
 
 def test_the_rod_ends_12_cm_below_the_tcp():

@@ -16,7 +16,7 @@ from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.registry import make_env
-from torchrl_koap.envs.scooping.expert import ScoopingExpert, SpoonKinematics, rotation_of, start_joints
+from torchrl_koap.envs.scooping.expert import ScoopingExpert, SpoonKinematics, start_joints
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, settled_layouts
 from torchrl_koap.tasks import get_task
@@ -112,13 +112,6 @@ def test_targets_that_are_far_away_are_approached_at_a_limited_speed():
         env.step(data.set("action", torch.full((1, 7), torch.nan)))
 
 
-def test_inverse_kinematics_reaches_turned_poses():
-    arm = SpoonKinematics()
-    for x, y, z, yaw, pitch in ((0.5, 0.2, 0.2, 0.0, 0.0), (0.55, 0.0, 0.01, 0.8, 0.2), (0.5, 0.05, 0.14, -0.8, -0.5)):
-        joints = arm.solve(np.array([x, y, z]), rotation_of(yaw, pitch), iterations=80)
-        np.testing.assert_allclose(arm.position(joints), (x, y, z), atol=2e-3)
-
-
 def test_scores_tell_the_starts_apart():
     env = ScoopingEnv(num_envs=2, embed=False, contexts=np.array([[[0.5, 0.22, 0]], [[0.33, 0, 0]]]), max_steps=2)
     episodes = list(env.rollout(2))
@@ -206,17 +199,12 @@ def test_the_bowl_and_its_pieces_stand_where_the_context_says():
     assert np.abs(after - spread).max() < 2e-3  # they rest there
 
 
-@pytest.mark.parametrize("bowl", CORNERS)
-def test_the_expert_finds_the_bowl_wherever_it_stands(bowl):
-    _, sims = play("robot", context_at(bowl))
-    assert sims.success[0] and sims.rim[0]
-
-
 def test_what_takes_a_piece_out_of_one_bowl_is_not_even_over_the_rim_of_another():
     targets, sims = play("robot", context_at(CORNERS[0]))
     assert sims.success[0]
     _, elsewhere = play("robot", context_at(CORNERS[3]), targets)
     assert not elsewhere.rim[0] and not elsewhere.success[0]
+    assert play("robot", context_at(CORNERS[3]))[1].success[0]
 
 
 def test_a_saved_state_knows_where_the_bowl_stands():
