@@ -9,8 +9,8 @@ from torchrl_koap.envs.experts.sorting_decision import (
     ORIGIN,
     SHAPE,
     STEP,
+    best_push,
     descent,
-    pushing_cost,
     solve_eikonal,
     square_distance,
     value_at,
@@ -24,7 +24,7 @@ ROD = np.array([LANE, -0.25])
 def cost(*boxes):
     """Of leading the first box to the first bin."""
     boxes = np.array(boxes)
-    return pushing_cost(boxes, np.zeros(len(boxes)), np.ones(len(boxes), dtype=bool), 0, LANE, ROD)
+    return best_push(boxes, np.zeros(len(boxes)), np.ones(len(boxes), dtype=bool), 0, LANE, ROD)[-1]
 
 
 def test_a_box_in_front_of_its_bin_costs_about_the_way():

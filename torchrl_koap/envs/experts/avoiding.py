@@ -39,14 +39,9 @@ _MEMORY = 12
 _HORIZON = 300  # control steps for which hand noise is drawn
 
 
-def _hand_response() -> np.ndarray:
-    """Weights [13] by which the deflection follows the decisions of the last steps; rings a little, like a hand."""
-    time = np.arange(-6, 7)
-    weights = np.sinc(time / 3.6) * np.hanning(17)[2:-2]
-    return weights / weights.sum()
-
-
-_HAND = _hand_response()
+# weights [13] by which the deflection follows the decisions of the last steps; rings a little, like a hand
+_RING = np.sinc(np.arange(-6, 7) / 3.6) * np.hanning(17)[2:-2]
+_HAND = _RING / _RING.sum()
 _HAND_REST = 1 - np.cumsum(_HAND)  # share of a decision that is still to come after so many steps
 
 

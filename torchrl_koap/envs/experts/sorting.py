@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.envs.experts.recording import Expert, ar1_noise
-from torchrl_koap.envs.experts.sorting_decision import decide, pushing_cost
+from torchrl_koap.envs.experts.sorting_decision import best_push, decide
 from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X, arrival_orders, box_colours, sorting_task
 
 ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
@@ -118,7 +118,7 @@ class SortingExpert(Expert):
         costs = []
         for target in candidates:
             lane = BIN_X[self._colours[target]]
-            costs.append(pushing_cost(places, yaws, present, target, lane, rod))
+            costs.append(best_push(places, yaws, present, target, lane, rod)[-1])
         return int(candidates[np.argmin(np.array(costs) + self._habits.taste[row, candidates])])
 
 

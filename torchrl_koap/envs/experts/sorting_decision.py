@@ -204,27 +204,24 @@ def _direction_cost(box, yaw, angle, to_go, way, slowness):
 
 
 @njit(cache=True)
-def _choose_direction(box, yaw, to_go, way, slowness):
-    """Angle along which to push, and its cost."""
-    best, best_cost = 0.0, np.inf
-    for k in range(_DIRECTIONS):
-        angle = 2 * np.pi * k / _DIRECTIONS
-        cost = _direction_cost(box, yaw, angle, to_go, way, slowness)
-        if cost < best_cost:
-            best, best_cost = angle, cost
-    return best, best_cost
+def best_push(boxes, yaws, present, target, lane, rod):
+    """Chooses how to push a box to its bin; arguments are those of :func:`decide`.
 
-
-@njit(cache=True)
-def _best_push(boxes, yaws, present, target, lane, rod):
-    """Costs of the rest of the box's way and of the rod's, its slowness; angle along which to push, and its cost."""
+    Returned are the costs of the rest of the box's way and of the rod's [X, Y], its slowness [X, Y], the angle along
+    which to push (rad), and the cost of that (m of way), the rod's own way included.
+    """
     others = present.copy()
     others[target] = False
     to_go = _box_field(boxes, yaws, others, lane)
     slowness = _rod_slowness(boxes, yaws, present, target)
     way = _cost_from(slowness, rod[0], rod[1])
-    angle, cost = _choose_direction(boxes[target], yaws[target], to_go, way, slowness)
-    return to_go, way, slowness, angle, cost
+    best, least = 0.0, np.inf
+    for k in range(_DIRECTIONS):
+        angle = 2 * np.pi * k / _DIRECTIONS
+        cost = _direction_cost(boxes[target], yaws[target], angle, to_go, way, slowness)
+        if cost < least:
+            best, least = angle, cost
+    return to_go, way, slowness, best, least
 
 
 @njit(cache=True)
@@ -243,7 +240,7 @@ def decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     boxes = boxes.copy()
     boxes[target] = _carried(boxes[target], yaws[target], rod, ahead)
     box, yaw = boxes[target], yaws[target]
-    to_go, way, slowness, angle, cost = _best_push(boxes, yaws, present, target, lane, ahead)
+    to_go, way, slowness, angle, cost = best_push(boxes, yaws, present, target, lane, ahead)
     change = 0.0 if np.isnan(held) else _wrapped(angle - held)
     if 0.0 < abs(change) <= 0.5:
         angle = held + 0.4 * change
@@ -271,9 +268,3 @@ def decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
         direction = descent(_cost_from(slowness, x, y), ahead[0], ahead[1])
     speed = min(_FREE, max(0.45 * gap, 0.005))
     return speed * direction[0], speed * direction[1], False, angle
-
-
-@njit(cache=True)
-def pushing_cost(boxes, yaws, present, target, lane, rod):
-    """Computes the cost (m of way) of leading a box to its bin, the rod's own way to it included; as :func:`decide`."""
-    return _best_push(boxes, yaws, present, target, lane, rod)[4]
