@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_koap.envs import AvoidingEnv, SortingEnv
+from torchrl_koap.envs import SortingEnv
 from torchrl_koap.envs.transforms import EndEffectorNoise, PartialObservation
 from torchrl_koap.tasks import get_task
 
@@ -42,17 +42,6 @@ def test_noise_has_the_stated_size_and_touches_nothing_else():
     assert found[:, measured].mean().abs() < 2e-4
     rest = [column for column in range(20) if column not in range(3, 6)]
     assert not found[:, rest].any() and not clean.any()
-
-
-def test_noise_of_an_episode_depends_on_its_seed_alone():
-    def observed(seeds, place):
-        env = TransformedEnv(AvoidingEnv(len(seeds)), EndEffectorNoise("avoiding", sigma=0.01))
-        env.transform.seed_episodes(seeds)
-        still = env.rollout(3, lambda td: td.set("action", torch.zeros(len(seeds), 2)))
-        return still["next", "observation"][place]
-
-    assert torch.equal(observed([7, 8, 9], 1), observed([8, 3], 0))
-    assert not torch.equal(observed([7, 8], 0), observed([7, 8], 1))
 
 
 def test_a_negative_sigma_is_refused():

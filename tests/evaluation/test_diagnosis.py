@@ -135,7 +135,7 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
         policies.append(policy)
         return roll_out(policy, *arguments, **options)
 
-    monkeypatch.setattr(Trained, "load", lambda run: other)
+    monkeypatch.setattr(Trained, "load", lambda run, plugins: other)
     for module in (inspection, diagnosis):
         monkeypatch.setattr(module, "roll_out", noted)
     asked = inspection.InspectConfig(episodes=2, threads=1)
@@ -151,7 +151,7 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     assert policies[-1].execution == Execution(**own | {"replan_interval": 4})
     config = replace(trained.config, execution=ExecutionConfig(temperature=0.5))
     cold = replace(trained, config=config)
-    monkeypatch.setattr(Trained, "load", lambda run: cold)
+    monkeypatch.setattr(Trained, "load", lambda run, plugins: cold)
     inspection.inspect(copied_run, asked)
     assert [policy.execution.temperature for policy in policies[-2:]] == [0.5, 1]  # recordings are no noise
 

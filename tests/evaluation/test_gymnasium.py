@@ -61,12 +61,6 @@ def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
     assert any("failed because the environment raised an error: seed 11, step 1" in fault for fault in found["faults"])
 
 
-def test_processes_of_their_own_change_no_result(arm_run):
-    asked = {"episodes": 3, "env": "toy_gym:ToyReach-v0", "threads": 1}
-    one, several = (evaluate(arm_run, EvalConfig(**asked, num_envs=number)) for number in (None, 2))
-    assert one["episode"] == several["episode"] and one["rates"] == several["rates"]
-
-
 def test_the_closed_loop_is_inspected_there(arm_run):
     found = inspect(arm_run, InspectConfig(episodes=2, env="toy_gym:ToyReach-v0", threads=1))
     assert found["both"] == rate([True] * 2) and {"plan_to_execution", "distance_to_demonstrations"} <= set(found)

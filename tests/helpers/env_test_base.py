@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What every environment of D3IL's tasks has to do; a test file per task subclasses it."""
 
+import functools
+
 import mujoco
 import numpy as np
 import pytest
@@ -210,15 +212,10 @@ class ContextTestBase(EnvTestBase):
         np.testing.assert_array_equal(env.reset(contexts=table[:3])["context"], table[:3])
 
     def test_wrong_contexts_are_named(self):
-        env, good = self.make(2), evaluation_contexts(self.make().task, 2)
-        objects, last = len(env.task.objects), env.task.objects[-1]
-        far = good.copy()
-        far[1, -1, 0] = 9.0
-        with pytest.raises(ValueError, match=f"context 1 puts '{last}' at .*outside its region"):
-            env.reset(contexts=far)
-        with pytest.raises(ValueError, match=rf"\[C, {objects}, 3\].*got shape \[2, {objects + 1}, 3\]"):
-            env.reset(contexts=np.zeros((2, objects + 1, 3)))
+        env, contexts = self.make(2), evaluation_contexts(self.make().task, 2)
         with pytest.raises(ValueError, match="wanted 2, got 1"):
-            env.reset(contexts=good[:1])
-        with pytest.raises(ValueError, match="context 1 puts"):
-            self.make(2, contexts=far)
+            env.reset(contexts=contexts[:1])
+        contexts[1, -1, 0] = 9.0
+        for refuse in (env.reset, functools.partial(self.make, 2)):
+            with pytest.raises(ValueError, match=f"context 1 puts '{env.task.objects[-1]}' at .*outside its region"):
+                refuse(contexts=contexts)

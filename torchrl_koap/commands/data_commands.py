@@ -91,8 +91,8 @@ class Demos(Command):
                 task,
                 episodes,
                 self.seed,
-                self.threads,
-                count_up_to(bar),
+                progress=count_up_to(bar),
+                num_threads=self.threads,
                 batch_size=self.batch_size,
                 disturbance=self.disturbance,
             )

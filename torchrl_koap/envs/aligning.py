@@ -52,11 +52,10 @@ class AligningEnv(ManipulationEnv):
     ``context``     [n, 2, 3] ``dtype``         start of the tray, and target: x, y (m), yaw (rad)
     =============== ========= ================= ===============================================================
 
-    The order of events is that of :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one
-    control step back. There is no failure. Unlike the original, exact alignment counts (its rotation distance has no
-    clipping and becomes NaN).
+    There is no failure. Unlike the original, exact alignment counts (its rotation distance has no clipping and becomes
+    NaN).
 
-    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
+    Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Examples:
         >>> from torchrl_koap.envs import AligningEnv

@@ -50,15 +50,14 @@ class SortingEnv(ManipulationEnv):
                                                 6 columns with as many boxes)
     =============== ========= ================= ===============================================================
 
-    The order of events is that of :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one
-    control step back, except for the mode. There is no failure; a box that lies in the wrong bin stays there.
+    There is no failure; a box that lies in the wrong bin stays there.
 
     Arrivals are noted as in the original: at most one per control step, and only if the box that is nearest to the
     centre of its own bin among those not noted yet is inside. A noted box that leaves its bin stays noted. The
     original asks with four boxes for a third one of each colour too and is told (0, -0.0085); such a box is farther
     from its bin than any box that is inside, so it changes nothing and is left out here.
 
-    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
+    Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Examples:
         >>> from torchrl_koap.envs import SortingEnv

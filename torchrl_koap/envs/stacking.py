@@ -53,10 +53,9 @@ class StackingEnv(ManipulationEnv):
     The first 20 columns of the observation are those of D3IL's recordings. A box has *arrived* once its centre has
     been within 6 cm (horizontally) of (0.5, 0.2), at most one box per control step. Success with ``num_boxes=3``: all
     three are within 6 cm now and their heights differ by more than 3 cm, whether or not the gripper still holds one;
-    with 1 or 2: so many boxes have arrived. There is no failure. The order of events is that of
-    :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one control step back.
+    with 1 or 2: so many boxes have arrived. There is no failure.
 
-    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
+    Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Raises:
         ValueError: for another number of boxes than 1, 2 or 3, too.

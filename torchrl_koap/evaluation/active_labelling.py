@@ -21,7 +21,7 @@ from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
-from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 
 _FEW = 5  # suggestions that are made unasked
@@ -186,8 +186,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     """
     config = SuggestConfig() if config is None else config
     set_up_torch(config.threads, "cpu")
-    load_plugins(config.plugins)
-    trained = Trained.load(run)
+    trained = Trained.load(run, plugins=config.plugins)
     task, controller = trained.task, trained.controller
     if not isinstance(controller, KoopmanInverseDynamics):
         raise ValueError(

@@ -22,7 +22,6 @@ from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
-from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.runs.weights import save_tensors
@@ -69,8 +68,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     config = EvalConfig() if config is None else config
     check_options(config)
     set_up_torch(config.threads, config.device)
-    load_plugins(config.plugins)
-    trained = Trained.load(writable_folder(run, config.out))
+    trained = Trained.load(writable_folder(run, config.out), plugins=config.plugins)
     directory, task = RunDirectory(trained.folder), trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)

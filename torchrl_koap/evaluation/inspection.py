@@ -30,7 +30,6 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.modules import KoopmanInverseDynamics, PlanningPolicy
 from torchrl_koap.runs.device import set_up_torch
-from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.tasks import Task
@@ -84,8 +83,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
     config = InspectConfig() if config is None else config
     check_rollouts(config)
     set_up_torch(config.threads, config.device)
-    load_plugins(config.plugins)
-    trained = Trained.load(run)
+    trained = Trained.load(run, plugins=config.plugins)
     task = trained.task
     if task.env is None and config.env is None and not config.latent_only:
         raise ValueError(

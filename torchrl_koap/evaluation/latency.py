@@ -18,7 +18,7 @@ from torchrl_koap.evaluation.rollouts import device_of
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules import Agent, AsynchronousAgent, PlanningPolicy
 from torchrl_koap.runs.device import set_up_torch
-from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
 
@@ -76,8 +76,7 @@ def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, An
     if config.steps < 1:
         raise ValueError(f"steps must be >= 1, got {config.steps}")
     set_up_torch(config.threads, "cpu")
-    load_plugins(config.plugins)
-    trained = Trained.load(run)
+    trained = Trained.load(run, plugins=config.plugins)
     rate = trained.task.control_hz if config.control_hz is None else config.control_hz
     policy = trained.policy()
     observations = 0.01 * np.random.default_rng(0).standard_normal((config.steps, trained.task.observation_dim))

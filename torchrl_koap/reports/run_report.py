@@ -70,12 +70,8 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
 
 
 def _subtitle(run: RunFacts) -> str:
-    shown = []
-    for option in ("controller.preset", "dataset", "run.seed"):
-        section, _, name = option.rpartition(".")
-        options = mapping(run.config.get(section)) if section else run.config
-        if _given(options, name):
-            shown.append(f"{name} {options[name]}")
+    sections = {"preset": run.config.get("controller"), "dataset": run.config, "seed": run.config.get("run")}
+    shown = [f"{name} {section[name]}" for name, section in sections.items() if _given(mapping(section), name)]
     return " · ".join([str(run.folder), *shown])
 
 

@@ -37,14 +37,13 @@ class CameraReport:
     size: tuple[int, int]  # height and width of its frames
     components: int  # columns of an embedding
     kept: float  # share of the features' variance, on trajectories that components were not fitted to
-    error: float  # what reconstructed features are off, over the features' spread
     rate: float  # frames that were embedded in a second; NaN where all of them had been before
 
     def __str__(self) -> str:
         speed = "embedded before" if np.isnan(self.rate) else f"{self.rate:.0f} frames a second"
         return (
             f"{self.size[0]} x {self.size[1]}, {self.components} components keep {self.kept:.1%} of the variance,"
-            f" reconstruction error {self.error:.2f} of the spread, {speed}"
+            f" reconstruction error {(1 - self.kept) ** 0.5:.2f} of the spread, {speed}"
         )
 
 
@@ -227,7 +226,7 @@ class _Film:
 
     def report(self, projection: Projection) -> CameraReport:
         """How much of the frames they keep that they were not fitted to."""
-        kept, error = projection.kept(self._sample(held_out=True))
+        kept = projection.kept(self._sample(held_out=True))
         rate = self._frames / self._seconds if self._frames else float("nan")
         height, width = self.encoder.size
-        return CameraReport((height, width), projection.dim, kept, error, rate)
+        return CameraReport((height, width), projection.dim, kept, rate)

@@ -220,15 +220,12 @@ class Projection(nn.Module):
             save_file(tensors, aside, self.about)
         return Path(path)
 
-    def kept(self, features: Tensor) -> tuple[float, float]:
-        """Computes the share of the variance of features ``[N, F]`` that is kept, and the relative error of what is.
-
-        The error is the root mean square of what reconstructed features are off, over that of the features' spread.
-        """
+    def kept(self, features: Tensor) -> float:
+        """Computes the share of the variance of features ``[N, F]`` that reconstructed ones keep."""
         centred = (features - self.mean).double()
         axes = torch.linalg.qr(self.components.double())[0]
         left = (centred - centred @ axes @ axes.T).square().sum() / centred.square().sum().clamp_min(1e-12)
-        return 1 - float(left), float(left) ** 0.5
+        return 1 - float(left)
 
     def forward(self, features: Tensor) -> Tensor:
         """Computes components ``[*B, d]`` of features ``[*B, F]``; refuses those of another size."""

@@ -16,12 +16,13 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from torchrl_koap.data import flatten_trajectories, save_ted
-from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport, Take, iterate_takes
+from torchrl_koap.envs.experts.demonstrations import RecordingReport, Take, iterate_takes
 from torchrl_koap.envs.experts.disturbances import share_disturbed
 from torchrl_koap.files import one_at_a_time, replacing_file
 from torchrl_koap.tasks import Task, get_task
@@ -34,11 +35,10 @@ def record_to_folder(
     task: Task,
     episodes: int,
     seed: int = 0,
-    num_threads: int = 2,
-    progress: Callable[[int, int], None] | None = None,
     *,
-    batch_size: int = BATCH_SIZE,
+    progress: Callable[[int, int], None] | None = None,
     disturbance: float | None = None,
+    **options: Any,
 ) -> RecordingReport:
     """Records demonstrations into a folder; called again with the same arguments, it goes on where it was interrupted.
 
@@ -48,9 +48,7 @@ def record_to_folder(
     start, disturbance = time.perf_counter(), share_disturbed(task, disturbance)
     task = get_task(task.source)
     request = {"task": task.name, "episodes": episodes, "seed": seed, "disturbance": disturbance}
-    iterating = functools.partial(
-        iterate_takes, task, episodes, seed, num_threads, batch_size=batch_size, disturbance=disturbance
-    )
+    iterating = functools.partial(iterate_takes, task, episodes, seed, disturbance=disturbance, **options)
     iterating()  # looks at the arguments before anything is written
     files = _Files(Path(folder), episodes)
     files.refuse_others(request)
@@ -58,7 +56,7 @@ def record_to_folder(
         done = files.begin(request)
         if progress is not None:
             progress(len(done), episodes)
-        for take in iterating(progress, done=done):
+        for take in iterating(progress=progress, done=done):
             files.add(take)
         frames, actions, logs = files.read()
         report = RecordingReport(task, seed, logs, time.perf_counter() - start, disturbance)
