@@ -129,23 +129,24 @@ def draw_bench_average(name: str, path: Path) -> Path:
     return draw_average(paper_cells_beside(name), path)
 
 
-def few_labels_table(name: str) -> str:
+def few_labels_table(name: str, retrained: str) -> str:
     """A row per task: success with the fewest labels of KOAP and what it is compared with, all seeds together.
 
-    The last column is Diffusion Policy with the most labels of the task.
+    The last column is Diffusion Policy with all labels.
 
     Args:
         name (str): file of cells without its ending.
+        retrained (str): another one, whose cells with the fewest or all labels go before those.
     """
     body = []
     for task in PAPER_TASKS:
-        shares = label_shares(name, task)
-        text = [_pooled(name, task, method, shares[0]) for method in ("koap", "koap_untrained", "linear_steps", "dp")]
-        most = f"{_pooled(name, task, 'dp', shares[-1])} with {share(shares[-1])}"
+        fewest, text = label_shares(name, task)[0], []
+        for method in ("koap", "koap_untrained", "linear_steps", "dp"):
+            text.append(_pooled(retrained if count_successes(retrained, task, method, fewest) else name, task, method))
         called = task.replace("po_", "partially observed ").replace("_unobserved_joints", ", joints hidden")
-        body.append([called.capitalize(), share(shares[0]), *text, most])
+        body.append([called.capitalize(), share(fewest), *text, _pooled(retrained, task, "dp", 1.0)])
     head = ["task", "labelled", "KOAP", "random features", "ridge regression", "Diffusion Policy"]
-    return table([*head, "Diffusion Policy, most labels"], body)
+    return table([*head, "Diffusion Policy, all labels"], body)
 
 
 def bench_rollouts(name: str) -> str:
@@ -156,7 +157,7 @@ def bench_rollouts(name: str) -> str:
 
 def bench_pooled(name: str, task: str, method: str) -> str:
     """Success of all seeds of a method with the fewest labels of a task."""
-    return _pooled(name, task, method, label_shares(name, task)[0]) + " %"
+    return _pooled(name, task, method) + " %"
 
 
 def label_shares(name: str, task: str) -> list[float]:
@@ -173,9 +174,9 @@ def count_successes(name: str, task: str, method: str, labels: float) -> Counter
     return counts
 
 
-def _pooled(name: str, task: str, method: str, labels: float) -> str:
-    """Success of all seeds of a method in whole percent with its Wilson interval."""
-    counts = count_successes(name, task, method, labels)
+def _pooled(name: str, task: str, method: str, labels: float | None = None) -> str:
+    """Success of all seeds of a method, with the fewest labels by default, in whole percent with its Wilson interval."""
+    counts = count_successes(name, task, method, labels or label_shares(name, task)[0])
     low, high = (100 * end for end in wilson_interval(counts["successes"], counts["n"]))
     return f"{100 * counts['successes'] / counts['n']:.0f} ({low:.0f}-{high:.0f})"
 
