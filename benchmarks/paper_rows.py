@@ -175,7 +175,7 @@ def count_successes(name: str, task: str, method: str, labels: float) -> Counter
 
 
 def _pooled(name: str, task: str, method: str, labels: float | None = None) -> str:
-    """Success of all seeds of a method, with the fewest labels by default, in whole percent with its Wilson interval."""
+    """Success of all seeds in whole percent with its Wilson interval; by default with the fewest labels of the task."""
     counts = count_successes(name, task, method, labels or label_shares(name, task)[0])
     low, high = (100 * end for end in wilson_interval(counts["successes"], counts["n"]))
     return f"{100 * counts['successes'] / counts['n']:.0f} ({low:.0f}-{high:.0f})"
