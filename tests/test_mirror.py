@@ -16,7 +16,6 @@ COVERED_BY = {
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
     "envs/mujoco/simulation.py": "envs/mujoco/test_controller.py",
-    "envs/registry.py": "plugins/test_plugins.py",
     "envs/scooping/expert.py": "envs/scooping/test_env.py",
     "envs/scooping/recording.py": "envs/scooping/test_env.py",
     "envs/scooping/simulation.py": "envs/scooping/test_env.py",

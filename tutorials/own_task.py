@@ -31,7 +31,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_koap import EvalConfig, LabelConfig, Task, TrainConfig, evaluate, register_task, train
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
-from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
+from torchrl_koap.envs.experts.demonstrations import record_to_folder
 from torchrl_koap.envs.experts.recording import Expert
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.runs.weights import load_tensors

@@ -19,7 +19,7 @@ from pages import (
     write_page,
 )
 
-from torchrl_koap.envs.gym import IDS
+from torchrl_koap.envs.registry import IDS
 from torchrl_koap.lookup import resolve
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.tasks import Action, Task

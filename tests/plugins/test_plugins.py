@@ -19,7 +19,7 @@ from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.envs import make_env, mode_index_of
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.envs.gym import ManipulationGymEnv
+from torchrl_koap.envs.registry import ManipulationGymEnv
 from torchrl_koap.evaluation.diagnosis import contexts_of
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.keys import validate

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The environment of a task, as ``Task.env`` names it.
+"""The environment of a task, as ``Task.env`` names it; and behind Gymnasium's interface, registered by import.
 
 What an environment has to offer, D3IL's (:class:`~torchrl_koap.envs.ManipulationEnv`) or one's own::
 
@@ -21,9 +21,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
+import numpy as np
 import torch
+from tensordict import TensorDict
 from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_koap import keys
+from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.transforms import EndEffectorNoise
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task, get_task
@@ -93,3 +98,117 @@ def mode_index_of(task: Task | str) -> Callable[[torch.Tensor], torch.Tensor]:
     if task.modes.index is None:
         return lambda mode: torch.zeros(mode.shape[:-1], dtype=torch.int64, device=mode.device)
     return resolve(task.modes.index, f"modes.index of task {task.name!r}")
+
+
+IDS = {"Avoiding-v0": "avoiding", "Aligning-v0": "aligning", "Stacking-v0": "stacking"}
+IDS |= {"Sorting4-v0": "sorting", "Sorting2-v0": "sorting_2", "Sorting6-v0": "sorting_6"}
+
+
+class ManipulationGymEnv(gymnasium.Env):
+    """One environment of a task behind Gymnasium's interface.
+
+    Observation and action are those of the batched environment in float32, and ``info`` holds
+
+    ============== ============================ ====================================================================
+    key            type                         meaning
+    ============== ============================ ====================================================================
+    ``success``    bool                         the task is done
+    ``collision``  bool                         only where an episode can end by one (Avoiding)
+    ``mode``       bool or int64 array          leaf ``mode`` of the batched environment
+    ``mode_index`` int                          number of the mode, -1 while it is not decided
+    ``context``    float64 ``[objects, 3]``     only in tasks with objects: where they start, x, y (m) and yaw (rad)
+    ============== ============================ ====================================================================
+
+    Args:
+        task (str): name of the task.
+        render_mode (str, optional): ``"rgb_array"`` or None.
+        max_steps (int, optional): control steps after which an episode is truncated. Default: that of the task.
+        width (int): and ``height``, of pictures in pixels.
+        camera (str): camera of pictures, see :meth:`~torchrl_koap.envs.base.ManipulationEnv.render`.
+
+    Raises:
+        ValueError: for an unknown task, another ``render_mode``, or actions of a wrong shape or that are not finite.
+
+    Examples:
+        >>> import gymnasium
+        >>> import torchrl_koap.envs  # registers
+        >>> env = gymnasium.make("torchrl_koap/Sorting2-v0")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation.shape, info["mode_index"], info["context"].shape
+        ((10,), -1, (2, 3))
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 29}
+
+    def __init__(
+        self,
+        task: str,
+        render_mode: str | None = None,
+        *,
+        max_steps: int | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "front",
+    ):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        facts = get_task(task)
+        self.render_mode = render_mode
+        self.metadata = self.metadata | {"render_fps": round(facts.control_hz)}
+        self.task = facts
+        steps = facts.max_steps if max_steps is None else max_steps
+        self.batched = make_env(facts, 1, max_steps=steps, dtype=torch.float64)
+        self._mode_index = mode_index_of(facts)
+        self._picture = {"width": width, "height": height, "camera": camera}
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
+        low, high = (
+            bound[0].float().numpy() for bound in (self.batched.action_spec.low, self.batched.action_spec.high)
+        )
+        self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode; ``options["context"]`` says where objects start ``[objects, 3]``, by default random ones.
+
+        Raises:
+            ValueError: for another option, or a context of a wrong shape, out of range, or of a task without objects.
+        """
+        super().reset(seed=seed)
+        options = dict(options or {})
+        context = options.pop("context", None)
+        if options:
+            raise ValueError(f"the only option of reset() is 'context', got {', '.join(map(repr, options))}")
+        if context is None and not self.task.objects:
+            return self._split(self.batched.reset())
+        contexts = draw_contexts(self.task, 1, self.np_random) if context is None else np.asarray(context)[None]
+        return self._split(self.batched.reset(contexts=contexts))
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Executes an action and runs one control step (35 ms, Stacking 30 ms)."""
+        action = torch.as_tensor(np.asarray(action, dtype=np.float32))[None]
+        data = self.batched.step(TensorDict({keys.ACTION: action}, [1]))["next"]
+        observation, info = self._split(data)
+        return observation, data["reward"].item(), data["terminated"].item(), data["truncated"].item(), info
+
+    def render(self) -> np.ndarray | None:
+        """Draws the scene, uint8 [height, width, 3]; None without ``render_mode``."""
+        return self.batched.render(**self._picture) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Frees graphics memory."""
+        self.batched.close()
+
+    def _split(self, data) -> tuple[np.ndarray, dict[str, Any]]:
+        info = {
+            keys.SUCCESS: data[keys.SUCCESS].item(),
+            keys.MODE: data[keys.MODE][0].numpy(),
+            "mode_index": self._mode_index(data[keys.MODE]).item(),
+        }
+        if keys.COLLISION in data.keys():
+            info[keys.COLLISION] = data[keys.COLLISION].item()
+        if self.task.objects:
+            info[keys.CONTEXT] = data[keys.CONTEXT][0].numpy()
+        return data[keys.OBSERVATION][0].float().numpy(), info
+
+
+for _id, _task in IDS.items():
+    gymnasium.register(f"torchrl_koap/{_id}", f"{__name__}:ManipulationGymEnv", kwargs={"task": _task})
