@@ -86,7 +86,8 @@ def controllers_table() -> str:
         body.append([f"`{task}`", text, *(f"{rate(rows)} of {sum(int(row['n']) for row in rows)}" for rows in found)])
         body[-1].insert(3, f"`{other}`")
     cells = [
-        count_successes("table_1", "stacking_unobserved_joints", name, 0.01) for name in ("koap", "command_regression")
+        count_successes("retrained", "stacking_unobserved_joints", name, 0.01)
+        for name in ("koap", "command_regression")
     ]
     told = [f"{percent(counts, 0)} of {counts['n']}" for counts in cells]
     body.append(["`stacking_unobserved_joints`", "1 % of windows", told[0], "`command_regression`", told[1]])

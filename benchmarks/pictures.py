@@ -192,7 +192,7 @@ def _controllers() -> list[Bar]:
             counts = (sum(int(row[key]) for row in rows) for key in ("successes", "n"))
             bars.append((f"{task}: {method}", *_interval(*counts)))
     for method in ("koap", "command_regression"):
-        counts = count_successes("table_1", "stacking_unobserved_joints", method, 0.01)
+        counts = count_successes("retrained", "stacking_unobserved_joints", method, 0.01)
         bars.append((f"joints hidden: {method}", *_interval(counts["successes"], counts["n"])))
     return bars
 
