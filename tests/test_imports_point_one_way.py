@@ -2,6 +2,7 @@
 """Which room may import which; a value that needs another arrow belongs into another room."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -47,6 +48,17 @@ def imports(node: ast.AST, inside: bool = False) -> Iterator[tuple[str, bool]]:
 def test_only_rooms_and_four_files_are_at_the_top():
     names = {path.name for path in PACKAGE.iterdir() if path.name != "__pycache__"}
     assert names == {"__init__.py", "py.typed", *(f"{name}.py" for name in BASE), *(set(MAY_IMPORT) - BASE)}
+
+
+@pytest.mark.parametrize("folder", ["tutorials", "benchmarks", "examples"])
+def test_scripts_import_what_the_package_has(folder):
+    for file in sorted((PACKAGE.parent / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "torchrl_koap":
+                module = importlib.import_module(node.module)
+                missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                for name in missing:  # a module of a room
+                    importlib.import_module(f"{node.module}.{name}")
 
 
 @pytest.mark.parametrize("room", MAY_IMPORT)

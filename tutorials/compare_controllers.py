@@ -28,7 +28,7 @@ from torch import nn
 from torchrl_koap import fit, get_task
 from torchrl_koap.data import LabelBudget, cut_windows, select_state
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.evaluation.action_errors import episodes_outside, first_actions
+from torchrl_koap.evaluation.data_errors import episodes_outside, first_actions
 
 task = get_task("avoiding")
 demonstrations, _ = record_demonstrations("avoiding", episodes=48)

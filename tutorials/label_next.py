@@ -24,8 +24,8 @@ import torchrl_koap
 from torchrl_koap import get_task
 from torchrl_koap.data import LabelBudget, select_state
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.evaluation.action_errors import first_actions
 from torchrl_koap.evaluation.active_labelling import rank_trajectories
+from torchrl_koap.evaluation.data_errors import first_actions
 from torchrl_koap.evaluation.latent_space import infer_steps
 
 task = get_task("avoiding")
