@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Camera demonstrations, networks and projections that ``koap embed`` is given, damaged in every way."""
 
-import os
-import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,9 +13,8 @@ from fault_ledger import Fault, Place, check, edit_json, meet, table
 pytest.importorskip("pyarrow")
 
 EMBED = ("embed", *WORDS)
-OWN_WEIGHTS = (*EMBED, "--network", "{network}/weights.pth")
 INFO, FIRST = "meta/info.json", "data/chunk-000/file-000.parquet"
-WEIGHTS, PROJECTION = "weights.pth", "projection.safetensors"
+PROJECTION = "projection.safetensors"
 
 
 def damaged(part: str, file: str, damage: Callable[[Path], object]) -> Callable[[Place], None]:
@@ -56,15 +53,6 @@ def cell(name: str, value: Any) -> Callable[[dict[str, Any]], Any]:
     return lambda content: content[name].__setitem__(0, value)
 
 
-def torch_file(content: Any) -> Callable[[Place], None]:
-    def do(place: Place) -> None:
-        import torch
-
-        torch.save(content, place.get("network") / WEIGHTS)
-
-    return do
-
-
 def projection(change: Callable[[dict[str, Any], dict[str, str]], Any]) -> Callable[[Place], None]:
     """Rewrites the projection after a change of its tensors and its description."""
 
@@ -79,10 +67,6 @@ def projection(change: Callable[[dict[str, Any], dict[str, str]], Any]) -> Calla
         save_file(tensors, path, about)
 
     return do
-
-
-def _write(place: Place, name: str, content: bytes) -> None:
-    (place.get("network") / name).write_bytes(content)
 
 
 def _png(size: int, channels: int = 3) -> bytes:
@@ -210,11 +194,10 @@ def in_projection() -> Iterator[tuple[str, str, Callable[[dict[str, Any], dict[s
 
 def faults() -> Iterator[Fault]:
     for name, damage in DAMAGE.items():
-        for part, file in (("frames", INFO), ("frames", FIRST), ("network", WEIGHTS), ("network", PROJECTION)):
+        for part, file in (("frames", INFO), ("frames", FIRST), ("network", PROJECTION)):
             stem = Path(file).name
-            words = OWN_WEIGHTS if file == WEIGHTS else EMBED
             says = "episodes are missing: 0" if (file, name) == (FIRST, "missing") else stem.replace(".", r"\.")
-            yield Fault(f"{stem} {name}", words, says, damaged(part, file, damage))
+            yield Fault(f"{stem} {name}", EMBED, says, damaged(part, file, damage))
     for name in ("codebase_version", "data_path", "total_episodes"):
         yield Fault(f"info.json without {name}", EMBED, damage=info(without(name)), accepted=True)
     yield Fault("info.json without features", EMBED, "feature", info(without("features")))
@@ -230,10 +213,6 @@ def faults() -> Iterator[Fault]:
     unharmed = seen(lambda folder: None)
     yield Fault("another camera", (*SEEN, "--camera", "tip"), "unknown camera 'tip'; did you mean 'top'", unharmed)
     yield Fault("too many components", (*SEEN[:-1], "99"), "99 components need more", unharmed)
-    code = pickle.dumps(os.system)
-    yield Fault("weights are code", OWN_WEIGHTS, "weights", lambda place: _write(place, WEIGHTS, code))
-    for name, content in {"a list": [1], "a number": 3, "numbers by name": {"conv1.weight": 3}}.items():
-        yield Fault(f"weights are {name}", OWN_WEIGHTS, "weights|state_dict", torch_file(content))
     for name, says, change in in_projection():
         yield Fault(f"projection {name}", EMBED, says, projection(change))
 

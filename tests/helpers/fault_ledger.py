@@ -205,7 +205,6 @@ def make_camera_template(root: Path) -> None:
             (root / "filmed" / str(number) / "top" / f"{index:06d}.png").write_bytes(encode_png(frame))
     fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
     fitted.about = FrozenImageEncoder(backbone, size=width).identity
-    torch.save({"conv.weight": torch.zeros(3)}, network / "weights.pth")
     fitted.save(network / "projection.safetensors")
 
 

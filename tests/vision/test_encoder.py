@@ -120,18 +120,15 @@ def test_networks_may_be_modules_files_and_without_maps(tmp_path):
         load_backbone("builtins:int")
 
 
-def test_weights_that_are_missing_or_damaged(tmp_path, monkeypatch):
-    with pytest.raises(WeightsError, match="there is no file"):
-        load_backbone(tmp_path / "none.pth")
-    (tmp_path / "text.pth").write_text("no weights")
-    with pytest.raises(WeightsError, match="is no file of weights"):
-        load_backbone(tmp_path / "text.pth")
-    torch.save([1], tmp_path / "list.pth")
-    with pytest.raises(WeightsError, match="holds no state_dict"):
-        load_backbone(tmp_path / "list.pth")
-    with pytest.raises(ValueError, match="no_such_network"):
-        load_backbone("tiny_network:no_such_network")
+def test_networks_that_are_missing(monkeypatch):
+    for name, said in {
+        "none.pth": "wanted an import string",
+        "tiny_network:no_such_network": "no_such_network",
+    }.items():
+        with pytest.raises(ValueError, match=said):
+            load_backbone(name)
     monkeypatch.setattr(backbones, "_PACKAGES", ("no_such_package_of_weights",))
+    backbones._efficientnet.cache_clear()
     with pytest.raises(WeightsError, match=r"torchrl_koap\[vision\]"):
         load_backbone()
 
@@ -140,13 +137,6 @@ def test_a_projection_of_other_weights_is_refused(tmp_path):
     file = fitted().save(tmp_path / "own.safetensors")
     with pytest.raises(WeightsError, match="fitted behind the weights"):
         load_encoder(file, OTHER)
-
-
-@needs_weights
-def test_weights_of_another_network_are_refused(tmp_path):
-    torch.save({"head.weight": torch.zeros(2)}, tmp_path / "other.pth")
-    with pytest.raises(WeightsError, match="another network"):
-        load_backbone(tmp_path / "other.pth")
 
 
 @needs_weights

@@ -37,8 +37,8 @@ class Embed(Command):
         out: folder to write: OUT/ted, and OUT/cameras with what policies embed frames by.
         camera: which cameras (default: all).
         components: principal components per camera, fitted to the frames (a task with embeddings has its own number).
-        network: "package.module:name" or "file.py:name" of a network of your own, or a file of EfficientNet-Lite0's
-            weights (default: the weights of the extra "vision").
+        network: "package.module:name" or "file.py:name" of a network of your own (default: EfficientNet-Lite0 of the
+            extra "vision").
         task: a task with embeddings among its columns, such as "scooping" (default: that of the first source).
         projection: file of principal components to take instead (default: those of the task that come with the
             package, else they are fitted).

