@@ -30,8 +30,8 @@ def packed(mode):
 
 def test_parity_with_the_original_from_its_state():
     recorded = recordings_of("sorting")
-    env = SortingEnv(4, max_steps=1000, dtype=torch.float64, contexts=contexts_of(recorded, 4))
-    env.reset()
+    env = SortingEnv(4, max_steps=1000, dtype=torch.float64)
+    env.reset(contexts=contexts_of(recorded, 4))
     start_recorded(env, recorded)
     touched = [False] * 4
     worst = {"tcp": np.zeros(4), "objects": np.zeros(4)}
@@ -61,7 +61,7 @@ def test_parity_with_the_original_from_its_state():
 @pytest.mark.parametrize("num_boxes", [2, 4, 6])
 def test_all_numbers_of_boxes(num_boxes):
     table = evaluation_contexts("sorting" if num_boxes == 4 else f"sorting_{num_boxes}", 2)
-    env = SortingEnv(2, num_boxes=num_boxes, contexts=table, dtype=torch.float64)
+    env = SortingEnv(2, num_boxes=num_boxes, dtype=torch.float64)
     check_env_specs(env)
     first = env.reset(contexts=table)
     assert first["observation"].shape == (2, 4 + 3 * num_boxes)

@@ -38,7 +38,7 @@ class ManipulationEnv(EnvBase):
     :meth:`_check` and :meth:`_update_mode`; ``rows`` are indices of environments.
 
     A task with objects has *contexts*, where they are when an episode starts (:mod:`torchrl_koap.envs.contexts`): drawn
-    at random at every reset, taken from a table in turn, or handed over by ``reset(contexts=...)``.
+    at random at every reset, or handed over by ``reset(contexts=...)``.
 
     What a task's table of keys does not list is the same everywhere::
 
@@ -57,13 +57,11 @@ class ManipulationEnv(EnvBase):
         dtype (torch.dtype): floating type of observation, action and reward.
 
     Keyword Args:
-        contexts (array, optional): table ``[C, objects, 3]``; the ``j``-th reset of environment ``i`` takes row
-            ``(i + j num_envs) mod C``. Default: random ones.
         task (Task, optional): a variant of the class's own task.
 
     Raises:
-        ValueError: for sizes below 1, a non-floating dtype, contexts of a wrong shape or out of range, and actions of
-            a wrong shape or that are not finite.
+        ValueError: for sizes below 1, a non-floating dtype, and in use for contexts of a wrong shape or out of range,
+            and actions of a wrong shape or that are not finite.
 
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv  # a task of this base
@@ -93,7 +91,6 @@ class ManipulationEnv(EnvBase):
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
         *,
-        contexts=None,
         task: Task | None = None,
     ):
         max_steps = self.MAX_STEPS if max_steps is None else max_steps
@@ -107,8 +104,6 @@ class ManipulationEnv(EnvBase):
         self.max_steps = max_steps
         self.sims: Any = self._simulations(num_envs, num_threads)
         self._dtype = dtype
-        self._context_table = None if contexts is None else check_contexts(self.task, contexts)
-        self._num_resets = np.zeros(num_envs, dtype=np.int64)
         self._episode = episode = self._episode_arrays(num_envs)
         self._observation, self._commands, self._mode = episode["observation"], episode["commands"], episode["mode"]
         self._success, self._collision, self._seen = episode["success"], episode["collision"], episode["seen"]
@@ -139,15 +134,13 @@ class ManipulationEnv(EnvBase):
     def _make_specs(self) -> None:
         shape, device, entries = self.batch_size, self.device, self._mode.shape[1]
         flag = {"n": 1, "shape": (*shape, 1), "device": device, "dtype": torch.bool}
-        if self.MODE_VALUES is None:
-            mode = Binary(n=entries, shape=(*shape, entries), device=device, dtype=torch.bool)
-        else:
-            mode = Bounded(-1, self.MODE_VALUES - 1, (*shape, entries), device=device, dtype=torch.int64)
         leaves = {
             keys.OBSERVATION: Unbounded((*shape, self.task.observation_dim), device=device, dtype=self._dtype),
             keys.SUCCESS: Binary(**flag),
-            keys.MODE: mode,
+            keys.MODE: Binary(**flag | {"n": entries, "shape": (*shape, entries)}),
         }
+        if self.MODE_VALUES is not None:
+            leaves[keys.MODE] = Bounded(-1, self.MODE_VALUES - 1, (*shape, entries), device=device, dtype=torch.int64)
         if self.COLLIDES:
             leaves[keys.COLLISION] = Binary(**flag)
         if self.task.objects:
@@ -216,15 +209,11 @@ class ManipulationEnv(EnvBase):
             contexts = check_contexts(self.task, contexts)
             if len(contexts) != len(rows):
                 raise ValueError(f"one context per environment to reset: wanted {len(rows)}, got {len(contexts)}")
-        elif self._context_table is not None:
-            turn = rows + self._num_resets[rows] * self.batch_size[0]
-            contexts = self._context_table[turn % len(self._context_table)]
         elif self.task.objects:
             contexts = draw_contexts(self.task, len(rows), self.generator)
         else:
             return
         self._contexts[rows] = contexts
-        self._num_resets[rows] += 1
 
     def _begin_episode(self, rows: np.ndarray) -> None:
         self._success[rows] = self._collision[rows] = False
@@ -271,17 +260,13 @@ class ManipulationEnv(EnvBase):
         return action
 
     def _leaves(self) -> TensorDictBase:
-        terminated, truncated = self._success | self._collision, self._steps >= self.max_steps
-        leaves = {
-            keys.OBSERVATION: self._tensor(self._observation, self._dtype),
-            keys.SUCCESS: self._tensor(self._success[:, None]),
-            keys.MODE: self._tensor(self._mode),
-            "terminated": self._tensor(terminated[:, None]),
-            "truncated": self._tensor(truncated[:, None]),
-            "done": self._tensor(self.over[:, None]),
-        }
+        flags = {keys.SUCCESS: self._success, "done": self.over, "terminated": self._success | self._collision}
+        flags["truncated"] = self._steps >= self.max_steps
         if self.COLLIDES:
-            leaves[keys.COLLISION] = self._tensor(self._collision[:, None])
+            flags[keys.COLLISION] = self._collision
+        leaves = {name: self._tensor(flag[:, None]) for name, flag in flags.items()}
+        leaves[keys.OBSERVATION] = self._tensor(self._observation, self._dtype)
+        leaves[keys.MODE] = self._tensor(self._mode)
         if self.task.objects:
             leaves[keys.CONTEXT] = self._tensor(self._contexts, self._dtype)
         return TensorDict(leaves, batch_size=self.batch_size, device=self.device)

@@ -113,8 +113,9 @@ def test_targets_that_are_far_away_are_approached_at_a_limited_speed():
 
 
 def test_scores_tell_the_starts_apart():
-    env = ScoopingEnv(num_envs=2, embed=False, contexts=np.array([[[0.5, 0.22, 0]], [[0.33, 0, 0]]]), max_steps=2)
-    episodes = list(env.rollout(2))
+    env = ScoopingEnv(num_envs=2, embed=False, max_steps=2)
+    start = env.reset(contexts=np.array([[[0.5, 0.22, 0]], [[0.33, 0, 0]]]))
+    episodes = list(env.rollout(2, auto_reset=False, tensordict=start))
     starts = {"success from left": [False], "success from near": [False]}
     assert scores({}, episodes, None) == {"rates": {"spoon over the bowl": [False, False], **starts}}
 
