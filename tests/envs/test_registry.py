@@ -76,7 +76,7 @@ def test_bad_options():
 
 
 def test_same_episode_as_the_batched_environment():
-    env, batched = gymnasium.make("torchrl_koap/Avoiding-v0", max_steps=60), AvoidingEnv(1, max_steps=60)
+    env, batched = gymnasium.make("torchrl_koap/Avoiding-v0"), AvoidingEnv(1)
     observation, info = env.reset(seed=1)
     tensordict = batched.reset()
     np.testing.assert_array_equal(observation, tensordict["observation"][0])

@@ -122,9 +122,7 @@ class ManipulationGymEnv(gymnasium.Env):
     Args:
         task (str): name of the task.
         render_mode (str, optional): ``"rgb_array"`` or None.
-        max_steps (int, optional): control steps after which an episode is truncated. Default: that of the task.
-        width (int): and ``height``, of pictures in pixels.
-        camera (str): camera of pictures, see :meth:`~torchrl_koap.envs.base.ManipulationEnv.render`.
+        width, height (int): of pictures, in pixels.
 
     Raises:
         ValueError: for an unknown task, another ``render_mode``, or actions of a wrong shape or that are not finite.
@@ -140,26 +138,16 @@ class ManipulationGymEnv(gymnasium.Env):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 29}
 
-    def __init__(
-        self,
-        task: str,
-        render_mode: str | None = None,
-        *,
-        max_steps: int | None = None,
-        width: int = 480,
-        height: int = 480,
-        camera: str = "front",
-    ):
+    def __init__(self, task: str, render_mode: str | None = None, *, width: int = 480, height: int = 480):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         facts = get_task(task)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(facts.control_hz)}
         self.task = facts
-        steps = facts.max_steps if max_steps is None else max_steps
-        self.batched = make_env(facts, 1, max_steps=steps, dtype=torch.float64)
+        self.batched = make_env(facts, 1, max_steps=facts.max_steps, dtype=torch.float64)
         self._mode_index = mode_index_of(facts)
-        self._picture = {"width": width, "height": height, "camera": camera}
+        self._size = {"width": width, "height": height}
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
         low, high = (
             bound[0].float().numpy() for bound in (self.batched.action_spec.low, self.batched.action_spec.high)
@@ -191,7 +179,7 @@ class ManipulationGymEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Draws the scene, uint8 [height, width, 3]; None without ``render_mode``."""
-        return self.batched.render(**self._picture) if self.render_mode == "rgb_array" else None
+        return self.batched.render(**self._size, camera="front") if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Frees graphics memory."""
