@@ -38,14 +38,13 @@ class WindowTable:
         labelled (Tensor): bool ``[M]``, whether an inner frame, ``history - 1 .. window - 2``, has an action label and
             neither that frame nor the one after it is padded.
         window (int): frames per window.
-        num_steps (int): number of steps of the data set.
 
     Examples:
         >>> import torch
         >>> from torchrl_koap.data import WindowTable, flatten_trajectories
         >>> table = WindowTable.build(flatten_trajectories([torch.rand(6, 2)] * 2, [torch.rand(5, 1)] * 2), 4)
-        >>> table.starts.tolist(), table.last.tolist(), table.num_steps
-        ([0, 1, 5, 6], [4, 4, 9, 9], 10)
+        >>> table.starts.tolist(), table.last.tolist()
+        ([0, 1, 5, 6], [4, 4, 9, 9])
         >>> table.frames(torch.tensor([1]))[0]
         tensor([[1, 2, 3, 4]])
     """
@@ -55,7 +54,6 @@ class WindowTable:
     last: Tensor
     labelled: Tensor
     window: int
-    num_steps: int
 
     @classmethod
     def build(
@@ -101,7 +99,7 @@ class WindowTable:
             low = torch.maximum(starts + history - 1, first)
             high = torch.minimum(starts + window - 2, last - 1)
             labelled = before[(high + 1).clamp_min(0)] > before[low.clamp_max(steps)]
-        return cls(starts, first, last, labelled, window, steps)
+        return cls(starts, first, last, labelled, window)
 
     def frames(self, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Gives the storage index of every frame of windows, padded at the ends of their trajectories.
