@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from torchrl_koap.evaluation.findings import EXPERIMENTS, describe_inspection, latent_faults, unit_circle_sides
+from torchrl_koap.evaluation.findings import EXPERIMENTS, describe_inspection, latent_faults
 from torchrl_koap.tasks import get_task
 
 
@@ -32,10 +32,6 @@ def test_faults(measured, said):
     assert len(found) == len(said)
     for clause, words in zip(found, said, strict=True):
         assert words in clause
-
-
-def test_sides_of_the_circle():
-    assert unit_circle_sides([1.0011, 1.0009, 0.9991, 0.9989]) == ["outside", "on", "on", "inside"]
 
 
 @pytest.mark.parametrize(

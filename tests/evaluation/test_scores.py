@@ -94,27 +94,10 @@ def test_stacked_boxes_by_hand():
     assert set(first) == {"rates", "stacked_1_entropy"} and set(first["rates"]) == {"one box stacked"}
 
 
-@pytest.mark.parametrize(
-    ("task", "success", "entropy", "wanted"),
-    [
-        ("avoiding", 0.5, 1.0, 0.6),
-        ("aligning", 0.5, 1.0, 0.75),
-        ("sorting", 0.5, 0.75, 0.25),
-        ("po_sorting", 0.5, 0.75, 0.25),
-        ("aligning", 0.5, None, None),
-        ("sorting_6", 0.5, None, None),
-    ],
-)
-def test_the_figure_that_d3il_ranks_by(task, success, entropy, wanted):
-    found = task_scores(get_task(task), {"rates": {"success": {"rate": success}}, "mode_entropy": entropy}, [], [])
-    assert found.get("d3il_score") == (None if wanted is None else pytest.approx(wanted))
-
-
-def test_the_figure_of_stacking_is_the_sum_of_its_rates():
+def test_rates_of_stacking_join_the_success():
     episodes = [stack_of((0, 1, 2), True), stack_of((0, 2), False), stack_of((1,), False), stack_of((), False)]
     success = {"rates": {"success": {"rate": 0.25}}}
     found = task_scores(get_task("stacking"), success, episodes, [0, 0, 1, 1])
-    assert found["d3il_score"] == pytest.approx(0.75 + 0.5 + 0.25)
     assert list(found["rates"]) == ["success", "one box stacked", "two boxes stacked", "three boxes stacked"]
     low, high = wilson_interval(1, 4)
     assert found["rates"]["three boxes stacked"] == {"rate": 0.25, "low": low, "high": high, "episodes": 4}

@@ -24,7 +24,7 @@ from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 
-_MOST_STATES = 4000  # visited, and demonstrated, whose distances are measured
+_STATES, _MOST_STATES = ("visited", "demonstrated"), 4000  # of each at most, whose distances are measured
 RECORDED_FUTURE = "recorded_future"
 RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end
 
@@ -160,8 +160,8 @@ def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *
 def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:
     """Measures how far visited states are from the nearest demonstrated one, and demonstrated ones, in spreads.
 
-    Every second demonstration is compared with the others, so that both figures are distances to strangers: median and
-    95 % quantile. Nothing is measured if there is a single demonstration.
+    Every second demonstration is compared with the others, so that both figures are distances to strangers: their 95 %
+    quantiles. Nothing is measured if there is a single demonstration.
     """
     every = data["episode"] % 2 == 0
     known, held_out = data["state"][every], data["state"][~every]
@@ -175,9 +175,4 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -
         torch.cat([torch.cdist(part / scale, known / scale).amin(1) for part in states.split(2048)])
         for states in sample
     ]
-    return {
-        "visited_median": figures[0].median().item(),
-        "visited_95": figures[0].quantile(0.95).item(),
-        "demonstrated_median": figures[1].median().item(),
-        "demonstrated_95": figures[1].quantile(0.95).item(),
-    }
+    return {f"{name}_95": figure.quantile(0.95).item() for name, figure in zip(_STATES, figures, strict=True)}

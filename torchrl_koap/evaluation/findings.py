@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from torchrl_koap.tasks import Task
@@ -12,7 +12,6 @@ from torchrl_koap.tasks.columns import thousandths
 EXPERIMENTS = ("planner_alone", "controller_alone", "both")  # of ``koap inspect``, in the simulator
 MODELS = ("koopman", "reconstruction", "linear", "copy_last")  # whose multi-step errors are compared
 OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"  # entry of figures that read labels of no budget
-ON_THE_CIRCLE = 1e-3  # eigenvalues whose magnitude is nearer to 1 lie on the unit circle, in texts and pictures alike
 NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 GOOD = 0.9  # a success rate of a part that is not at fault
 MORE = "train longer (--steps) or record more"  # what to do about plans
@@ -20,12 +19,6 @@ KIND = "check --action-kind and --robot, or label a recording that moves it"  # 
 _NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, leave it"
 _LEFT = 0.1  # share of recorded paths that a controller may leave
 _WORSE = 2.0  # from here on a latent model's error is no longer that of a comparable model
-
-
-def unit_circle_sides(magnitudes: Sequence[float]) -> list[str]:
-    """Tells whether eigenvalues of these magnitudes lie ``"inside"``, ``"on"`` or ``"outside"`` the unit circle."""
-    low, high = 1 - ON_THE_CIRCLE, 1 + ON_THE_CIRCLE
-    return ["outside" if size > high else "inside" if size < low else "on" for size in magnitudes]
 
 
 def error_unit(part: str, task: Task) -> tuple[str, float]:

@@ -16,31 +16,13 @@ from torch import Tensor
 
 from torchrl_koap.data import cut_windows
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, unit_circle_sides
+from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.modules.ridge import ridge
 
 HORIZON = 10  # control steps that are predicted
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
-
-
-def spectrum(eigenvalues: Tensor) -> dict[str, Any]:
-    r"""Tells where the eigenvalues ``[m]`` of an operator lie, and in how many steps its slowest parts fade to 1/e.
-
-    The decay times are :math:`-1 / \ln |\lambda|` of the five slowest of those inside the unit circle.
-    """
-    eigenvalues = eigenvalues.detach()
-    size = eigenvalues.abs().double().sort(descending=True).values
-    sides = unit_circle_sides(size.tolist())
-    inside = size[[side == "inside" for side in sides]]
-    return {
-        "spectral_radius": size[0].item(),
-        **{side: sides.count(side) for side in ("inside", "on", "outside")},
-        "slowest_decay_steps": (-1 / inside[:5].log()).tolist(),
-        "real": eigenvalues.real.tolist(),
-        "imag": eigenvalues.imag.tolist(),
-    }
 
 
 @torch.no_grad()
@@ -180,7 +162,7 @@ def analyse_latent(
     labelled: Tensor,
     parts: Mapping[str, Sequence[int]],
 ) -> dict[str, Any]:
-    """Measures spectrum, multi-step errors (fewer steps where trajectories are short) and what a linear probe explains.
+    """Measures eigenvalues, multi-step errors (of fewer steps where trajectories are short) and what a probe explains.
 
     The controller is in evaluation mode, on the device of the flat data ``[N]``, which have all labels that there are,
     as the controller sees them; ``labelled`` are those in the budget, bool ``[N]``, ``parts`` columns of the state by
@@ -192,7 +174,8 @@ def analyse_latent(
         ``note`` where fewer than two trajectories have labels. Of data that lack labels the probe takes half of the
         labelled trajectories.
     """
-    result: dict[str, Any] = {"eigenvalues": spectrum(controller.operator.eigenvalues())}
+    eigenvalues = controller.operator.eigenvalues().detach()
+    result: dict[str, Any] = {"eigenvalues": {"real": eigenvalues.real.tolist(), "imag": eigenvalues.imag.tolist()}}
     fit_on = split_trajectories(data[EPISODE], labelled)
     reach = controller.num_window_frames - 1 - controller.num_past
     horizon = min(HORIZON, max(1, int(trajectory_lengths(data).min()) - reach))

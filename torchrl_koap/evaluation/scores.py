@@ -100,8 +100,8 @@ def task_scores(
 ) -> dict[str, Any]:
     """Returns the figures of :func:`score` with those that a task adds, by the function that ``Task.score`` names.
 
-    ``d3il_score`` among them is the single figure D3IL ranks methods by, where it is defined. What the function returns
-    as ``rates``, a name in words to a bool per rollout, joins the success in ``rates``, with an interval.
+    What the function returns as ``rates``, a name in words to a bool per rollout, joins the success in ``rates``, with
+    an interval.
     """
     rule = resolve(task.score, f"score of task {task.name!r}")
     found = {} if rule is None else dict(rule(result, episodes, contexts))
@@ -110,13 +110,12 @@ def task_scores(
 
 
 def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
-    """Tells how many boxes were brought to the zone of Stacking, in how many orders, and D3IL's figure.
+    """Tells how many boxes were brought to the zone of Stacking, in how many orders.
 
-    These are ``rates`` of one, two and three boxes, entropies of the first one, two and three letters (bases 3, 6, 6)
-    over contexts, and ``d3il_score``, the sum of the three rates.
+    These are ``rates`` of one, two and three boxes, and entropies of the first one, two and three letters (bases 3, 6,
+    6) over contexts.
     """
-    found = _stacked(episodes, contexts, most=3)
-    return found | {"d3il_score": sum(sum(good) / len(good) for good in found["rates"].values())}
+    return _stacked(episodes, contexts, most=3)
 
 
 def first_box_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:

@@ -11,12 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, error_unit, unit_circle_sides
+from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, error_unit
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, WARNING, put_legend, tidy
 from torchrl_koap.tasks import Task
 
+ON_THE_CIRCLE = 1e-3  # eigenvalues whose magnitude is nearer to 1 lie on the unit circle
 SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
 EXPERIMENTS = {
     "planner_alone": "planner alone\n(plans that come true)",
@@ -110,11 +111,12 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
 def _draw_plane(axes: Axes, values: np.ndarray) -> None:
     """Eigenvalues in the complex plane; an inset magnifies them where they crowd."""
     angle = np.linspace(0, 2 * np.pi, 2000)
-    side = np.array(unit_circle_sides(np.abs(values)))
+    size = np.abs(values)
+    side = np.where(size > 1 + ON_THE_CIRCLE, "outside", np.where(size < 1 - ON_THE_CIRCLE, "inside", "on"))
     axes.fill(np.cos(angle), np.sin(angle), color=PALE, zorder=0)
     axes.axhline(0, color=FAINT, linewidth=0.6, zorder=0.5)
     axes.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
-    reach = 1.1 * min(max(1.0, float(np.abs(values).max())), 4.0)  # the title counts those beyond
+    reach = 1.1 * min(max(1.0, float(size.max())), 4.0)  # the title counts those beyond
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1, xlabel="real part", ylabel="imaginary part")
     if reach < 2:
         axes.set(xticks=(-1, -0.5, 0, 0.5, 1), yticks=(-1, -0.5, 0, 0.5, 1))
@@ -135,7 +137,7 @@ def _draw_plane(axes: Axes, values: np.ndarray) -> None:
             style = {"s": 20, "color": color, "alpha": 0.7, "linewidths": 0, "zorder": 2 + list(SIDES).index(name)}
             panel.scatter(here.real, here.imag, **style)
     counts = [f"{int((side == name).sum())} {name}" for name in SIDES]
-    radius = f"{len(values)} eigenvalues, radius {np.abs(values).max():.5g}"
+    radius = f"{len(values)} eigenvalues, radius {size.max():.5g}"
     tidy(axes, f"{radius}\n{', '.join(counts)} the unit circle")
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,13 +33,6 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
     return (distance <= ALIGNED_DISTANCE) & (cosine >= math.cos(ROTATION_TOLERANCE * math.pi))
 
 
-def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
-    """Computes D3IL's figure ``d3il_score``, mean of success and entropy; none where no context had two rollouts."""
-    if result["mode_entropy"] is None:
-        return {}
-    return {"d3il_score": 0.5 * (result["rates"]["success"]["rate"] + result["mode_entropy"])}
-
-
 register_task(
     Task(
         name="aligning",
@@ -64,7 +56,6 @@ register_task(
             index="torchrl_koap.envs.aligning:mode_index",
             entropy="contexts",
         ),
-        score="torchrl_koap.tasks.aligning:score",
         env="torchrl_koap.envs.aligning:AligningEnv",
         expert="torchrl_koap.envs.experts.aligning:AligningExpert",
         scene=Scene(

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from torch import Tensor
 
@@ -46,11 +44,6 @@ def mode_of_path(path: np.ndarray) -> int:
     return mode
 
 
-def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
-    """Computes D3IL's figure ``d3il_score``: 0.8 success + 0.2 entropy."""
-    return {"d3il_score": 0.8 * result["rates"]["success"]["rate"] + 0.2 * result["mode_entropy"]}
-
-
 def _cylinders() -> tuple[Shape, ...]:
     shapes = []
     for _, x, y, radius, _ in OBSTACLES:
@@ -81,7 +74,6 @@ register_task(
             index="torchrl_koap.envs.avoiding:mode_index",
             of_path="torchrl_koap.tasks.avoiding:mode_of_path",
         ),
-        score="torchrl_koap.tasks.avoiding:score",
         env="torchrl_koap.envs.avoiding:AvoidingEnv",
         expert="torchrl_koap.envs.experts.avoiding:AvoidingExpert",
         scene=Scene(

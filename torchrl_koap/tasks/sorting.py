@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -65,13 +64,6 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
     return in_bins(torch.stack([state[..., task.state_slices[f"{box}_xy"]] for box in task.objects], -2)).all(-1)
 
 
-def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
-    """Computes ``d3il_score``: success less the divergence of the modes from equally frequent ones, as recorded."""
-    if result["mode_entropy"] is None:
-        return {}
-    return {"d3il_score": result["rates"]["success"]["rate"] - (1 - result["mode_entropy"])}
-
-
 @functools.cache
 def arrival_orders(num_boxes: int) -> tuple[tuple[int, ...], ...]:
     """Lists every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes."""
@@ -107,7 +99,6 @@ def _sorting(num_boxes: int) -> Task:
             index="torchrl_koap.envs.sorting:mode_index",
             entropy="solved_contexts",
         ),
-        score="torchrl_koap.tasks.sorting:score",
         env="torchrl_koap.envs.sorting:SortingEnv",
         env_options={"num_boxes": num_boxes},
         expert="torchrl_koap.envs.experts.sorting:SortingExpert",
