@@ -151,11 +151,6 @@ class SuggestConfig:
         dataset: where the data set of the training is now (default: where it was).
         threads: torch threads.
         plugins: modules that register tasks or methods, besides those that the run was trained with.
-
-    Examples:
-        >>> from torchrl_koap.evaluation import SuggestConfig
-        >>> SuggestConfig(count=3).threads
-        1
     """
 
     count: int | None = None

@@ -45,11 +45,6 @@ class InspectConfig(RolloutConfig):
 
     Attributes:
         latent_only: look into the latent space alone: seconds, without the experiments in the simulator.
-
-    Examples:
-        >>> from torchrl_koap.evaluation import InspectConfig
-        >>> InspectConfig(latent_only=True).episodes
-        30
     """
 
     episodes: int = 30

@@ -33,11 +33,6 @@ class LabelConfig:
 
     Raises:
         ValueError: for a number out of range, or two ways to choose at once.
-
-    Examples:
-        >>> from torchrl_koap import LabelConfig
-        >>> LabelConfig(count=5).unit
-        'trajectory'
     """
 
     fraction: float | None = None
@@ -75,11 +70,6 @@ class PlannerConfig:
 
     Raises:
         ValueError: for a number out of range.
-
-    Examples:
-        >>> from torchrl_koap import PlannerConfig
-        >>> PlannerConfig(steps=2, width=8).network is None
-        True
     """
 
     steps: int | None = None
@@ -111,11 +101,6 @@ class ControllerConfig:
 
     Raises:
         ValueError: for a number out of range.
-
-    Examples:
-        >>> from torchrl_koap import ControllerConfig
-        >>> ControllerConfig(steps=0).columns is None
-        True
     """
 
     preset: str | None = None
@@ -146,11 +131,6 @@ class RunConfig:
 
     Raises:
         ValueError: for a number out of range, or an unknown device, precision or logger.
-
-    Examples:
-        >>> from torchrl_koap import RunConfig
-        >>> RunConfig(seed=3).device
-        'cpu'
     """
 
     seed: int = 0

@@ -72,11 +72,6 @@ class Machines:
     Raises:
         ValueError: for an unknown launcher, no workers, or an address that is of no use; for one that is not installed,
             naming its extra.
-
-    Examples:
-        >>> from torchrl_koap.studies.launchers import Machines
-        >>> Machines(workers=4).launcher
-        'local'
     """
 
     workers: int | None = None

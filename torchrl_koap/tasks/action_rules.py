@@ -36,11 +36,6 @@ class Action:
         column (int, optional): state column that a ``"delta"`` moves, that an ``"absolute"`` action is the target of
             (controllers then decode the distance to it), or in which a ``"gripper"`` tells its width.
         constant (float, optional): what it always is, whatever is decoded. Default: it differs.
-
-    Examples:
-        >>> from torchrl_koap.tasks import Action
-        >>> Action("rad", "absolute", column=3).unit
-        'rad'
     """
 
     unit: str = ""

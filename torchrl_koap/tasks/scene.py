@@ -24,11 +24,6 @@ class Shape:
 
     Raises:
         ValueError: for another kind.
-
-    Examples:
-        >>> from torchrl_koap.tasks.scene import Shape
-        >>> Shape("circle", (0.5, -0.1), (0.03, 0.03), "obstacle").half
-        (0.03, 0.03)
     """
 
     kind: str
@@ -64,11 +59,6 @@ class Body:
         half (tuple of float): half its width and half its depth (m).
         front (bool): its far side is emphasised, where its orientation matters.
         still (bool): it stays where it starts.
-
-    Examples:
-        >>> from torchrl_koap.tasks.scene import Body
-        >>> Body("mug", position="mug_xy", color="blue").label
-        'mug'
     """
 
     name: str

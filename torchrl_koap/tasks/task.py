@@ -45,11 +45,6 @@ class Defaults:
             another one that is asked for by name comes with its own.
         controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``.
         execution (dict): fields of :class:`~torchrl_koap.Execution`.
-
-    Examples:
-        >>> from torchrl_koap.tasks.task import Defaults
-        >>> Defaults(demonstrations=50, planner={"steps": 4000}).method
-        'koap'
     """
 
     method: str = "koap"
