@@ -13,6 +13,7 @@ COVERED_BY = {
     "commands/doctor.py": "commands/test_cli.py",
     "commands/run_commands.py": "commands/test_eval.py",
     "commands/subcommands.py": "commands/test_cli.py",
+    "data/formats/arrow.py": "data/formats/test_lerobot.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
     "envs/mujoco/simulation.py": "envs/mujoco/test_controller.py",

@@ -10,9 +10,6 @@ from tiny_runs import TINY, write_demonstrations
     ("options", "message"),
     [
         (("--task", "avoidin"), "unknown task 'avoidin'; did you mean 'avoiding'?"),
-        (("--method", "kaop"), "unknown method 'kaop'; did you mean 'koap'?"),
-        (("--labels.count", "None", "--labels.fraction", "0.01"), "a label fraction of 0.01 selects none of the 8"),
-        (("--labels.fraction", "0.5"), "labels: give one of fraction, count and episodes, got fraction and count"),
         (("--labels", "few"), "--labels must be a number of trajectories such as 5, or a share such as 0.02"),
         (("--labels.count", "9"), "9 labelled trajectories asked for, there are 8"),
         (("--dataset", "nowhere"), "dataset 'nowhere' is no folder"),

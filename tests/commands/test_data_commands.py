@@ -32,7 +32,6 @@ def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):
     [
         ((), "arm is a data set of this library already: name another format by --to"),
         (("--to", "npz", "--control-hz", 5), "control_hz .*: not an option for a data set of this library"),
-        (("--to", "npz", "--observations", "q1"), "observations .*: not an option"),
         (("--to", "npz", "--robot", "q1"), "--robot was given, but format 'npz' does not hold it"),
         (("--to", "npz", "--action-kind", "delta"), "--action-kind was given"),
     ],

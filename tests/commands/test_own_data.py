@@ -15,19 +15,16 @@ from torchrl_koap.modules import Agent
 TINY = ("--steps", 20, "--planner.batch-size", 8, "--planner.width", 8, "--controller.steps", 20)
 
 
-def test_train_and_eval_end_with_what_comes_next(arm, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert koap("train", "--dataset", arm, "--out", out, *TINY, "--planner.network", "mlp") == 0
-    assert capsys.readouterr().out.splitlines()[-1].split(maxsplit=1) == ["next", f"koap eval {out}"]
-    assert koap("eval", out) == 0
-    assert capsys.readouterr().out.splitlines()[-1].split() == ["report", str(out / "index.html")]
-
-
 @pytest.fixture(scope="module")
 def run(arm):
     out = arm.parent / "run"
     assert koap("train", "--dataset", arm, "--out", out, *TINY, "--planner.network", "mlp") == 0
     return out
+
+
+def test_an_evaluation_ends_with_its_report(run, capsys):
+    assert koap("eval", run) == 0
+    assert capsys.readouterr().out.splitlines()[-1].split() == ["report", str(run / "index.html")]
 
 
 def test_a_policy_acts_on_the_users_observations(run):
@@ -57,6 +54,7 @@ def test_absolute_targets(arrays, tmp_path, capsys):
     assert koap(*command, "--action-kind", "absolute") == 0
     assert "absolute targets" not in capsys.readouterr().out
     assert koap("train", "--dataset", tmp_path / "arm", "--out", tmp_path / "run", "--method", "linear", *TINY) == 0
+    assert capsys.readouterr().out.splitlines()[-1].split(maxsplit=1) == ["next", f"koap eval {tmp_path / 'run'}"]
     data, _ = load_ted(tmp_path / "arm" / "ted")
     agent = Agent(load_policy(tmp_path / "run", limits=float("inf")))
     agent.reset()

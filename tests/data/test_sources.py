@@ -101,12 +101,3 @@ def test_a_call_without_data_names_both_commands():
         ValueError, match="koap demos --task sorting --out DEMOS.*koap train --task sorting --dataset DEMOS"
     ):
         find_task_of(None, "sorting")
-
-
-def test_raw_files_are_never_written(tmp_path):
-    folder = write_demonstrations(tmp_path / "raw", episodes=2)
-    before = {file.name: (file.read_bytes(), file.stat().st_mtime_ns) for file in folder.iterdir()}
-    calls = []
-    open_dataset(folder, progress=lambda *done: calls.append(done))
-    assert before == {file.name: (file.read_bytes(), file.stat().st_mtime_ns) for file in folder.iterdir()}
-    assert calls == [(1, 2)]

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """AligningEnv: parity with recordings of the original, contexts, success rule, partial resets, pictures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

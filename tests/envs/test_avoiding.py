@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """AvoidingEnv: parity with recordings of the original, order of events, bad actions."""
 
-from __future__ import annotations
-
 import json
 import pickle
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Simulated actions come true, and the present is left as it was."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

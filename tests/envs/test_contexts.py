@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Contexts: ranges, repeatability, the shipped table, D3IL's own files, and what is said about wrong ones."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import pickle

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Environments of Gymnasium side by side: seeds, ends and successes of their own."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The Gymnasium registration behaves like the batched environment it wraps."""
 
-from __future__ import annotations
-
 import warnings
 
 import gymnasium

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """SortingEnv: parity with recordings of the original, contexts, rules of success and order, numbers of boxes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """StackingEnv: parity with recordings of the original, what counts as success, gripper, contexts, partial steps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

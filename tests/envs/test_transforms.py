@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Partial observability: dropped parts, noise of a stated size, the same in specs, rollouts and any batch."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -64,19 +64,15 @@ SAYS = {
     "--tasks": "task",
     "--datasets": "dataset",
     "--methods": "method",
-    "--units": "unit",
     "--planners": "planners|n0nsense",
-    "--data-share": "share of the data|data[-_]share",
 }
 
 
-def plain(kind: Any) -> tuple[Any, bool]:
-    """The type that the words of an option are read as, and whether it takes several of them."""
+def plain(kind: Any) -> Any:
+    """The type that the words of an option are read as."""
     if get_origin(kind) in (Union, types.UnionType):
         kind = next(part for part in get_args(kind) if part is not type(None))
-    if get_origin(kind) is tuple:
-        return get_args(kind)[0], True
-    return kind, False
+    return get_args(kind)[0] if get_origin(kind) is tuple else kind
 
 
 def options(command: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -95,7 +91,7 @@ def faults() -> Iterator[Fault]:
     for command in get_args(Subcommand):
         name = command.__name__.lower()
         for option, kind in options(command):
-            kind, _ = plain(kind)
+            kind = plain(kind)
             for value in WRONG[kind]:
                 call = f"{option} {value}"
                 if call in RIGHT.get(name, ()) or option in RIGHT.get(name, ()) or option in EMPTY:
@@ -110,8 +106,6 @@ def faults() -> Iterator[Fault]:
             yield Fault(f"right {call}", (name, *BASE[name], *call.split()), accepted=True)
 
 
-if __name__ != "__main__":
-
-    @pytest.mark.parametrize("fault", table(faults()))
-    def test_wrong_values_of_an_option_are_refused_by_name(fault, place):
-        check(fault, meet(fault, place))
+@pytest.mark.parametrize("fault", table(faults()))
+def test_wrong_values_of_an_option_are_refused_by_name(fault, place):
+    check(fault, meet(fault, place))

@@ -18,7 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from camera_sets import write_camera_set
+from filmed_data import write_filmed
 from tiny_runs import TINY, koap, write_demonstrations
+
+from torchrl_koap.tasks import get_task
 
 LONGEST = 60  # s; a fault that takes longer counts as a hang
 EVERY = 25  # of so many faults one is met in `make test`, all of them in `make faults`
@@ -156,7 +160,6 @@ def make_template(root: Path) -> Path:
     import numpy as np
 
     from torchrl_koap.data import open_dataset, save_ted
-    from torchrl_koap.tasks import get_task
 
     data = write_demonstrations(root / "data")
     run = ("--out", root / "run", "--dataset", data, *TINY, "--quiet")
@@ -179,33 +182,21 @@ def make_camera_template(root: Path) -> None:
     import numpy as np
     import torch
 
-    from torchrl_koap.data.formats.writers import LeRobotWriter, encode_png
-    from torchrl_koap.tasks import get_task
+    from torchrl_koap.data.formats.writers import encode_png
     from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
 
-    task, (network, width) = get_task("scooping"), (root / "network", 32)
-    network.mkdir()
+    write_camera_set(root / "frames", "robot")
+    (root / "network").mkdir()
     torch.manual_seed(0)
-    backbone = load_backbone("tiny_network:random_layer")
-    about = {"state_names": "xyz", "action_names": task.action_names, "embodiment": "robot", "task": "scoop"}
-    writer = LeRobotWriter(root / "frames", fps=10, camera="observation.images.third_person", **about)
-    generator = np.random.default_rng(0)
-    for length in (4, 6):
-        frames = generator.integers(0, 256, (length + 1, width, width, 3), dtype=np.uint8)
-        action = generator.normal(size=(length, task.action_dim))
-        writer.add(generator.normal(size=(length + 1, 3)), action, frames=frames)
-    writer.close()
-    for number in range(2):  # recordings with two cameras beside them
-        states = generator.normal(size=(20, 2)).cumsum(0)
-        (root / "filmed" / str(number) / "top").mkdir(parents=True)
-        np.savez(root / "filmed" / f"{number}.npz", states=states, actions=np.diff(states, axis=0), control_hz=10.0)
-        frames = generator.integers(0, 256, (20, width, width, 3), dtype=np.uint8)
-        np.save(root / "filmed" / str(number) / "wrist.npy", frames)
-        for index, frame in enumerate(frames):
-            (root / "filmed" / str(number) / "top" / f"{index:06d}.png").write_bytes(encode_png(frame))
-    fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
-    fitted.about = FrozenImageEncoder(backbone, size=width).identity
-    fitted.save(network / "projection.safetensors")
+    fitted = Projection.fit(torch.randn(200, 4 * 36), get_task("scooping").observation_dim - 3)
+    fitted.about = FrozenImageEncoder(load_backbone("tiny_network:random_layer"), size=8).identity
+    fitted.save(root / "network" / "projection.safetensors")
+    write_filmed(root / "filmed", trajectories=2)
+    for file in (root / "filmed").glob("*/top.npy"):  # one of the cameras wrote pictures
+        (file.parent / "top").mkdir()
+        for index, frame in enumerate(np.load(file)):
+            (file.parent / "top" / f"{index:06d}.png").write_bytes(encode_png(frame))
+        file.unlink()
 
 
 @contextlib.contextmanager

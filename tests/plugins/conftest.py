@@ -1,4 +1,4 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The modules here are imported by the tests that need them, not collected: importing registers task or method."""
+"""The module here is imported by the tests that need it, not collected: importing registers a method."""
 
-collect_ignore = ["arm_data.py", "nearest_neighbour.py"]
+collect_ignore = ["nearest_neighbour.py"]

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Tasks from outside the package: the tutorial's with simulator and expert, and one with data alone."""
+"""A task from outside the package with simulator and expert, the tutorial's, and one with data alone."""
 
-import json
-import subprocess
 import sys
 import types
 from pathlib import Path
@@ -13,6 +11,7 @@ import pytest
 import torch
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from small_controllers import plain_task
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.data.trajectories import trajectory_lengths
@@ -26,22 +25,17 @@ from torchrl_koap.keys import validate
 from torchrl_koap.reports.pictures import all_pictures
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.scenes import BLUE, bodies_of, draw_scene
-from torchrl_koap.tasks import TASKS, Task, get_task
+from torchrl_koap.tasks import TASKS, get_task, register_task
 
-HERE = Path(__file__).parent
-TUTORIAL = HERE.parents[1] / "tutorials" / "own_task.py"
+TUTORIAL = Path(__file__).parents[2] / "tutorials" / "own_task.py"
 NAME = "push_past_a_post"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def plugins():
-    """Both tasks, registered by import, for the tests of this file alone."""
+def plugin():
+    """The task, registered by import, for the tests of this file alone."""
     known = dict(TASKS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(HERE))
-        import arm_data
-
-        TASKS[arm_data.TASK.name] = arm_data.TASK
         own = types.ModuleType("own_task")
         patch.setitem(sys.modules, "own_task", own)
         definitions = TUTORIAL.read_text().partition("# Everything else is there")[0]
@@ -119,36 +113,13 @@ def test_gymnasium_knows_it():
 
 
 def test_a_robot_without_simulator():
-    task = get_task("arm_data")
-    assert task.action_dim == 7 and len(task.delta_actions) == 7 and task.action_units[0] == "rad"
-    assert task.tool_columns is None and task.tool_position is None and task.gripper is None
-    assert task.state_dim == 9 and task.state_names[-2:] == ("cup_x", "cup_y") and task.num_modes == 1
-    for ask in (lambda: make_env(task), lambda: record_demonstrations("arm_data", episodes=1)):
-        with pytest.raises(ValueError, match="task 'arm_data' has no (environment|scripted expert)"):
-            ask()
-    with pytest.raises(ValueError, match="task 'arm_data' has no goal"):
+    task = register_task(plain_task(9, 7))
+    assert task.tool_columns is None and task.tool_position is None and task.gripper is None and task.num_modes == 1
+    for ask in (make_env, lambda known: record_demonstrations(known.name, episodes=1)):
+        with pytest.raises(ValueError, match="task 'plain' has no (environment|scripted expert)"):
+            ask(task)
+    with pytest.raises(ValueError, match="task 'plain' has no goal"):
         task.goal_reached(torch.zeros(1, 9))
-    with pytest.raises(ValueError, match="task 'arm_data' has no contexts"):
+    with pytest.raises(ValueError, match="task 'plain' has no contexts"):
         evaluation_contexts(task)
     draw_scene(Figure().add_subplot(), task)
-
-
-@pytest.mark.parametrize("name", [NAME, "arm_data"])
-def test_it_survives_json(name):
-    task = get_task(name)
-    assert Task.from_json(json.loads(json.dumps(task.to_json()))) == task
-
-
-def test_no_file_of_the_package_knows_them():
-    package = HERE.parents[1] / "torchrl_koap"
-    assert not [file.name for file in package.rglob("*.py") if "puck" in file.read_text()]
-
-
-def test_a_fresh_process_needs_the_import_alone():
-    code = (
-        "import arm_data, sys; assert 'mujoco' not in sys.modules;"
-        "from torchrl_koap.tasks import get_task; print(get_task('arm_data').action_units[0])"
-    )
-    paths = f"{HERE}:{HERE.parents[1]}"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={"PYTHONPATH": paths})
-    assert found.stdout.strip() == "rad", found.stderr

@@ -114,15 +114,3 @@ def test_a_half_written_checkpoint_is_taken_away_by_the_next_one_who_works_there
     rest.write_bytes(b"half"), (rest.parent / "planner.safetensors").write_bytes(b"whole")
     with RunDirectory(tmp_path).locked("koap train"):
         assert [path.name for path in rest.parent.iterdir()] == ["planner.safetensors"]
-
-
-def test_one_at_a_time_works_in_a_folder(tmp_path):
-    run = RunDirectory(tmp_path / "run")
-    with run.locked("koap train"):
-        with (
-            pytest.raises(RunDirectoryError, match=f"another `koap train` is working in {run.path}"),
-            RunDirectory(run.path).locked("koap train"),
-        ):
-            pytest.fail("both are in")
-    with run.locked("koap train"):
-        assert (run.path / ".lock").exists()

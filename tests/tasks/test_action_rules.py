@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The gripper's number from widths: labels of recordings and commands of plans follow one rule."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

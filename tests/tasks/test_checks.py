@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Facts of a task that do not fit each other are named, all at once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

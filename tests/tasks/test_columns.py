@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Observation columns to state columns, the layouts of all tasks, and angles as points on the unit circle."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

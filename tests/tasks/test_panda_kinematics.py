@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Kinematics in torch equal those of the simulator."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

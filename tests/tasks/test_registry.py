@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tasks are found by name: registered ones, and those of installed packages."""
 
-from __future__ import annotations
-
 import importlib.metadata
 
 import pytest

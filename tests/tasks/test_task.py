@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Facts of the tasks are those of docs/appendix/d3il.md, survive JSON, and name modes and goals as environments do."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

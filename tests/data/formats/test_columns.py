@@ -25,16 +25,6 @@ def test_a_flag_ends_an_episode(name, kind):
     assert found.skipped == (name,) and found.sources == ("run[0]", "run[1]")
 
 
-@pytest.mark.parametrize("ends", [ENDS, np.array([3, 6])])
-def test_archives_say_where_episodes_end(ends, tmp_path):
-    np.savez(tmp_path / "all.npz", observations=X[:, None], actions=X[:, None], episode_ends=ends, control_hz=20.0)
-    assert [len(frames) for frames in read_recordings(tmp_path).states] == [3, 3]
-    np.savez(tmp_path / "all.npz", observations=X[:, None], actions=X[:, None], which=[0, 0, 0, 1, 1, 1])
-    with pytest.raises(DataError, match="'which' may say which episode a frame is of"):
-        read_recordings(tmp_path, control_hz=20)
-    assert read_recordings(tmp_path, control_hz=20, drop_columns=["which"]).skipped == ("which",)
-
-
 def test_a_counter_splits_and_sorts():
     assert [len(frames) for frames in read(frame_index=[0, 1, 2, 0, 1, 2]).states] == [3, 3]
     np.testing.assert_array_equal(read(frame_index=[2, 0, 1, 3, 5, 4]).states[0][:, 0], X[[1, 2, 0, 3, 5, 4]])
@@ -166,16 +156,23 @@ def test_episodes_may_have_names_instead_of_numbers(named, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "values"),
-    [("episode_ends", [2, 6]), ("episode_ends", [1, 5]), ("episode_lengths", [2, 4]), ("episode_starts", [0, 2])],
+    [
+        ("episode_ends", [2, 6]),
+        ("episode_ends", [1, 5]),
+        ("episode_ends", [0, 1, 0, 0, 0, 1]),
+        ("episode_lengths", [2, 4]),
+        ("episode_starts", [0, 2]),
+    ],
 )
-def test_archives_may_count_where_episodes_end(name, values, tmp_path):
+def test_archives_say_where_episodes_end(name, values, tmp_path):
     np.savez(tmp_path / "a.npz", states=X[:, None], actions=X[:, None], control_hz=20.0, **{name: values})
     found = read_recordings(tmp_path)
     assert [frames[:, 0].tolist() for frames in found.states] == [X[:2].tolist(), X[2:].tolist()]
     np.savez(tmp_path / "a.npz", states=X[:, None], actions=X[:, None], control_hz=20.0, other=values)
-    if name != "episode_starts":  # anything may count from 0
+    if len(values) == 2 and values[0]:  # anything may count from 0
         with pytest.raises(DataError, match="'other' may say which episode a frame is of"):
             read_recordings(tmp_path)
+        assert read_recordings(tmp_path, drop_columns=["other"]).skipped == ("other",)
 
 
 def test_a_clock_that_starts_again_and_flags_of_starts():
@@ -196,6 +193,7 @@ def test_episodes_of_one_frame_are_left_out_and_listed():
         (b"0.1,0.2\n0.3,0.4\n", "its first row holds numbers, wanted the names of the columns"),
         ("x,y\n1,2\n3,4\n".encode("utf-16"), "it is no text in UTF-8: save it as CSV UTF-8"),
         (b"x,done\n1,no\n2,yes\n", "column 'done' is the end of episodes and holds no numbers"),
+        (b"x,done\n1,0.5\n2,1\n", "column 'done' of the ends of episodes must be 0 or 1: name it otherwise"),
     ],
 )
 def test_tables_that_cannot_be_understood(content, message, tmp_path):

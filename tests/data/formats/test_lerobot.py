@@ -25,12 +25,14 @@ FEATURES = {
 def write(root, *, actions="all", features=None, rows=6, change=None, version="v3.0", lacking=()):
     """Two episodes of a seven-joint arm; ``actions`` is "all", "none", "missing" or a list of rows without one.
 
+    Its columns are lists of every kind.
+
     In format 2.1 every episode has a file of its own; those ``lacking`` have no column of actions.
     """
     state = np.linspace(0, 1, 2 * rows * 7).reshape(-1, 7)
     columns = {
-        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32())),
-        "observation.force": pa.array(np.arange(2.0 * rows)),
+        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32(), 7)),
+        "observation.force": pa.array([[row] for row in range(2 * rows)], pa.large_list(pa.int16())),
         "episode_index": pa.array(np.repeat([0, 1], rows)),
         "frame_index": pa.array(np.tile(np.arange(rows), 2)),
     }

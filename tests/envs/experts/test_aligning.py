@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The simulated player for Aligning: it succeeds in the asked mode and moves like a hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The simulated player: takes the asked mode, and lets go behind the finish line."""
 
-from __future__ import annotations
-
 import numpy as np
 from expert_test_base import ExpertTestBase, first_attempts
 
@@ -26,19 +24,6 @@ def test_gaps_lie_between_the_cylinders():
 def test_most_first_attempts_take_the_asked_mode():
     found, _ = first_attempts("avoiding", list(range(24)) * 2, None, [(11, index) for index in range(48)])
     assert sum(not attempt.fault for attempt in found) >= 42
-
-
-def test_it_stops_for_a_cylinder_ahead():
-    """Shown that it stands right before the first cylinder, the player never decides to go on forwards."""
-    expert = AvoidingExpert([0] * 8, None, range(8))
-    expert._habits.pause[:] = 0
-    expert._habits.misjudgement[:] = expert._habits.tremor[:] = 0.0
-    expert.act(np.tile([0.5, -0.16, 0.5, -0.16], (8, 1)))
-    assert (expert._decisions[:, 0, 1] == 0).all() and expert._blocked.all()
-    expert = AvoidingExpert([0] * 8, None, range(8))
-    expert._habits.pause[:] = 0
-    expert.act(np.tile([0.42, -0.2, 0.42, -0.2], (8, 1)))
-    assert (expert._decisions[:, 0, 1] > 0.005).all()
 
 
 def test_it_lingers_behind_the_line_and_finishes():

@@ -1,13 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Recorded demonstrations: right modes, right rows, repeatable; written as they come, interrupted at no cost."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
 import torch
+from command_calls import contents
 
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.data.trajectories import trajectory_lengths
@@ -152,10 +151,6 @@ COUNT = 3
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "demos"
     return folder, record_to_folder(folder, TASK, COUNT, seed=3, num_threads=1)
-
-
-def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_the_data_are_those_of_a_recording_in_memory(whole):

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Disturbances of scripted operators: what they do to actions, who is disturbed, what the recording says of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

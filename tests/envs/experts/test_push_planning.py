@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Pushing model and planner: closed forms, symmetry, and plans that arrive."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

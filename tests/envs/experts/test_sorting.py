@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The simulated player of Sorting: brings the boxes in the asked order."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from expert_test_base import ContextExpertTestBase, first_attempts

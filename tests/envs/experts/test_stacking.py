@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """StackingExpert: takes the wanted order and plays through the environment alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

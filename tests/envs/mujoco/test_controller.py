@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The compiled controller against MuJoCo's kinematics, NumPy's linear algebra and the recorded substeps."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Pictures, their cameras, and what is said where none can be drawn."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

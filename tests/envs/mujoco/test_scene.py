@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The arm's numbers, its variants and the errors of a missing mesh package."""
 
-from __future__ import annotations
-
 import importlib.util
 from types import SimpleNamespace
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scooping: physics, outcome, absolute targets, an expert that succeeds, and a bowl that stands anywhere."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
