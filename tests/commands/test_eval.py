@@ -55,26 +55,18 @@ def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstration
     assert "is not there" in result["action_errors"]["outside_budget"]["note"]
 
 
-@pytest.mark.parametrize("chosen", ["n0nsense", "disable"])
-def test_a_film_that_cannot_be_made_is_left_out(copied_run, chosen, monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", chosen)
-    with pytest.warns(UserWarning, match=f"^film.gif was not made: .*{chosen}"):
+def test_a_film_that_cannot_be_made_is_left_out(copied_run, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "n0nsense")
+    with pytest.warns(UserWarning, match="^film.gif was not made: .*n0nsense"):
         assert koap("eval", copied_run, "--episodes", 1, "--threads", 1, "--quiet") == 0
     assert "film.gif was not made" in (copied_run / "index.html").read_text()
     made = {file.name for file in (copied_run / "plots").iterdir()}
     assert {"rollouts.gif", "rollouts.png"} <= made and "film.gif" not in made
 
 
-@pytest.mark.parametrize(
-    ("options", "wanted"),
-    [
-        (("--strategy", "open_loop", "--blend", "0"), {"strategy": "open_loop", "blend": 0.0}),
-        (("--temperature", "0.5", "--gain", "1.5"), {"temperature": 0.5, "gain": 1.5}),
-        (("--replan-interval", "2"), {"replan_interval": 2}),
-        (("--limits", "inf"), {"limits": "inf"}),
-    ],
-)
-def test_options_of_an_evaluation(copied_run, no_report, options, wanted):
+def test_options_of_an_evaluation(copied_run, no_report):
+    wanted = {"strategy": "open_loop", "blend": 0.0, "temperature": 0.5, "replan_interval": 2, "limits": "inf"}
+    options = (word for name, value in wanted.items() for word in (f"--{name.replace('_', '-')}", value))
     assert koap("eval", copied_run, "--episodes", 1, "--threads", 1, *options) == 0
     result = json.loads((copied_run / "eval.json").read_text())
     assert {key: result["execution"][key] for key in wanted} == wanted and result["episodes"] == 1

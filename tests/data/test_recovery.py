@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-from counted_windows import moving_windows
 from tensordict import TensorDict
 
 from torchrl_koap.data import RecoveryAugmentation
@@ -60,19 +59,6 @@ def test_joints_follow_the_tool_aside_and_come_back_with_it():
     moved = (found - state)[:, 1, :7]
     idle = moved - (torch.linalg.pinv(jacobian) @ jacobian @ moved[..., None])[..., 0]
     assert idle.norm(dim=-1).max() < 1e-4 * moved.norm(dim=-1).mean()
-
-
-@pytest.mark.parametrize("under_way", [False, True])
-def test_actions_follow_the_way_back(under_way):
-    """Actions that move the state stay its differences; labels that are hidden stay hidden."""
-    windows = moving_windows()
-    moved = RecoveryAugmentation(0.1, under_way=under_way, columns=[0, 1], moved_by=[0, 1])(windows.clone())
-    torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :2].diff(dim=1))
-    assert moved["action"][:, -1].isnan().all() and not torch.equal(moved["action"][:, :-1], windows["action"][:, :-1])
-    torch.manual_seed(3)
-    with_actions = RecoveryAugmentation(0.1, columns=[0, 1], moved_by=[0, 1])(windows.clone())["state"]
-    torch.manual_seed(3)
-    assert torch.equal(with_actions, RecoveryAugmentation(0.1, columns=[0, 1])(windows.clone())["state"])
 
 
 def changed(widths, share=1.0, **options):

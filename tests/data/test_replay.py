@@ -24,11 +24,6 @@ def test_data_sets_of_this_library(demonstrations, tmp_path):
     assert (D3ILExperienceReplay("avoiding", tmp_path / "demos").data == data).all()
 
 
-def test_unknown_tasks(demonstrations):
-    with pytest.raises(ValueError, match="did you mean 'avoiding'"):
-        D3ILExperienceReplay("avoidng", demonstrations)
-
-
 def test_label_budget_at_loading(demonstrations):
     dataset = D3ILExperienceReplay("avoiding", demonstrations, label_budget=LabelBudget(count=1, seed=3))
     hidden = ~dataset.data["has_action"].squeeze(-1)

@@ -1,12 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scenes are moved and turned as a whole, and alike objects exchanged."""
 
+import functools
+
 import pytest
 import torch
 from counted_windows import moving_windows
 from tensordict import TensorDict
 
-from torchrl_koap.data import ObjectPermutation, RandomPlanarTransform
+from torchrl_koap.data import ObjectPermutation, RandomPlanarTransform, RecoveryAugmentation
 
 
 def windows(count=64, width=8):
@@ -54,14 +56,20 @@ def test_alike_objects_are_exchanged_whole_and_all_the_time_of_a_window():
     assert len(orders) == 6
 
 
-def test_actions_turn_with_the_scene():
-    """Actions that move the state stay its differences; labels that are hidden stay hidden."""
+PLANAR = functools.partial(RandomPlanarTransform, [(0, 1)], [], shift=0.1, turn=0.5)
+RECOVERY = functools.partial(RecoveryAugmentation, 0.1, columns=[0, 1])
+
+
+@pytest.mark.parametrize(
+    ("augment", "option"),
+    [(PLANAR, "turned_actions"), (RECOVERY, "moved_by"), (functools.partial(RECOVERY, under_way=True), "moved_by")],
+    ids=["turned", "recovery", "recovery under way"],
+)
+def test_actions_that_move_the_state_stay_its_differences(augment, option):
+    """Labels that are hidden stay hidden, and states are drawn as without actions."""
     windows = moving_windows()
-    turn = {"shift": 0.1, "turn": 0.5}
-    moved = RandomPlanarTransform([(0, 1), (2, 3)], [], **turn, turned_actions=[0, 1])(windows.clone())
+    moved = augment(**{option: [0, 1]})(windows.clone())
     torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :2].diff(dim=1))
     assert moved["action"][:, -1].isnan().all() and not torch.equal(moved["action"][:, :-1], windows["action"][:, :-1])
-    torch.manual_seed(3)
-    with_actions = RandomPlanarTransform([(0, 1)], [], **turn, turned_actions=[0, 1])(windows.clone())["state"]
-    torch.manual_seed(3)
-    assert torch.equal(with_actions, RandomPlanarTransform([(0, 1)], [], **turn)(windows.clone())["state"])
+    moving_windows()  # draws again from the same seed
+    assert torch.equal(moved["state"], augment()(windows.clone())["state"])

@@ -3,11 +3,10 @@
 
 import json
 
-import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, make_demonstrations, save_ted, select_state
+from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, select_state
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import LayoutError
@@ -47,11 +46,6 @@ def test_partially_labelled_data(tmp_path):
     loaded, _ = load_ted(path)
     assert torch.equal(loaded["action"].isnan(), data["action"].isnan())
     assert torch.equal(loaded["observation"].nan_to_num(7), data["observation"].nan_to_num(7))
-
-
-def test_a_task_of_plain_facts_comes_along(tmp_path):
-    data, task = make_demonstrations([np.zeros((9, 2))], control_hz=30, action_dim=7, name="doctest_bench_arm")
-    assert load_ted(save_ted(data, tmp_path / "ted", task))[1] == task
 
 
 def test_save_refuses(tmp_path):

@@ -165,5 +165,3 @@ def test_bad_numbers_and_tasks_without_contexts():
     for call in (lambda: draw_contexts("avoiding", 1), lambda: evaluation_contexts("avoiding")):
         with pytest.raises(ValueError, match="'avoiding' has no contexts"):
             call()
-    with pytest.raises(ValueError, match="did you mean 'aligning'"):
-        draw_contexts("alining", 1)

@@ -228,22 +228,16 @@ def with_nan(robot):
     ("change", "problems"),
     [
         (lambda c: c.pop("red-box2"), ["missing key 'red-box2'"]),
+        (lambda c: c.update({"red-box2": 3}), ["'red-box2' is no dictionary of arrays"]),
         (lambda c: c["blue-box1"].pop("quat"), ["missing key 'blue-box1/quat'"]),
-        (lambda c: c["robot"].pop("c_pos"), ["missing key 'robot/c_pos'"]),
-        (
-            lambda c: c["blue-box2"]["pos"].__setitem__((2, 1), np.nan),
-            ["'blue-box2/pos' is NaN or infinite in 1 values, first in row 2"],
-        ),
         (broken(c_pos=with_nan), ["'robot/c_pos' is NaN or infinite in 1 values, first in row 3"]),
         (broken(c_pos=lambda r: r["c_pos"] / 0), ["'robot/c_pos' is NaN or infinite"]),
         (lambda c: c["red-box1"].update(quat=np.zeros((5, 3))), ["'red-box1/quat' must have shape (T, 4), got (5, 3)"]),
-        (broken(c_pos=lambda r: r["c_pos"][:, :2]), ["'robot/c_pos' must have shape (T, 3), got (5, 2)"]),
         (broken(gripper_width=lambda r: r["c_pos"]), ["'robot/gripper_width' must have shape (T,), got (5, 3)"]),
         (broken(c_pos=lambda r: r["c_pos"].tolist()), ["'robot/c_pos' must be an array (T, 3), got list"]),
         (broken(c_pos=lambda r: r["c_pos"].astype("U8")), ["'robot/c_pos' must hold real numbers, got dtype <U8"]),
         (broken(c_pos=lambda r: r["c_pos"] + 1j), ["'robot/c_pos' must hold real numbers, got dtype complex128"]),
         (lambda c: c["red-box1"].update(pos=np.zeros((4, 3))), ["unequal lengths: blue-box1/pos 5"]),
-        (lambda c: (c.pop("red-box1"), c.pop("blue-box2")), ["missing key 'red-box1'", "missing key 'blue-box2'"]),
         (
             lambda c: (broken(j_pos=lambda r: r["j_pos"] * np.nan)(c), c["red-box1"].pop("quat"), c.pop("blue-box1")),
             ["'robot/j_pos' is NaN or infinite in 35 values", "missing key 'red-box1/quat'", "missing key 'blue-box1'"],
