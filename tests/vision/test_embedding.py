@@ -116,12 +116,8 @@ def embedder_of(size):
 def test_bad_data_are_refused_by_camera_trajectory_and_frame(tmp_path):
     own = write_own(tmp_path)
     file = tmp_path / "raw" / "07" / "top.npy"
-    frames = np.load(file)
-    np.save(file, frames[:, :8])
+    np.save(file, np.load(file)[:, :8])
     with pytest.raises(DataError, match=r"camera 'top' of 7 cannot be used: frame 0 is 8 x 24, .* others are 16 x 24"):
-        embed(own, tmp_path / "seen")
-    np.save(file, frames[:12])
-    with pytest.raises(DataError, match=r"camera 'top' of 7 cannot be used: frame 12 is missing: .* has 12"):
         embed(own, tmp_path / "seen")
     assert not (tmp_path / "seen" / "ted").exists()
     with pytest.raises(ValueError, match="one projection cannot be for 2 cameras"):

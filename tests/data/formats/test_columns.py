@@ -138,22 +138,6 @@ def test_all_clocks_are_looked_at():
     assert read(control_hz=None, **parted).control_hz == pytest.approx(4)
 
 
-@pytest.mark.parametrize("named", ["csv", "npz", "parquet"])
-def test_episodes_may_have_names_instead_of_numbers(named, tmp_path):
-    which = np.array(["reach", "push"]).repeat(3)
-    if named == "csv":
-        rows = [f"{x},{name},{x}" for x, name in zip(X, which, strict=True)]
-        (tmp_path / "a.csv").write_text("\n".join(["x,episode,action", *rows]))
-    elif named == "npz":
-        np.savez(tmp_path / "a.npz", states=X[:, None], actions=X[:, None], episode=which)
-    else:
-        parquet = pytest.importorskip("pyarrow.parquet")
-        columns = {"x": X, "episode": which.tolist(), "action": X}
-        parquet.write_table(pytest.importorskip("pyarrow").table(columns), tmp_path / "a.parquet")
-    found = read_recordings(tmp_path, control_hz=20)
-    np.testing.assert_array_equal(np.stack(found.states)[..., 0], X.reshape(2, 3))
-
-
 @pytest.mark.parametrize(
     ("name", "values"),
     [

@@ -91,3 +91,11 @@ def test_numbers_of_every_type_mean_what_they_are(kind, dtype, tmp_path, monkeyp
         wanted = np.stack([states[name] for name in found.state_names], 1).astype(np.float64)
         np.testing.assert_array_equal(frames, wanted)
         assert frames.dtype == np.float64
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_episodes_may_have_names_instead_of_numbers(kind, tmp_path):
+    states, actions = columns(0)
+    named = states | {"episode": np.array(["reach", "push"]).repeat(20)}
+    found = read_recordings(WRITERS[kind](tmp_path, [(named, actions)]))
+    np.testing.assert_array_equal(np.stack(found.states)[..., 0], states["q0"].reshape(2, 20))
