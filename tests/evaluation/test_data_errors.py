@@ -163,7 +163,7 @@ def forked(count=20, steps=30):
 
 
 def test_both_ways_of_a_fork_are_no_mistake_and_units_stay_apart():
-    found = plan_errors(Planner(1.0), forked(), ARM, samples=16)
+    found = plan_errors(Planner(1.0), forked(), ARM)
     joint, force = found["unit"]
     assert (joint["unit"], joint["columns"], force["unit"]) == ("rad", ["q"], "N")
     assert joint["standing_still"]["energy_score"]["per_step"] == pytest.approx([1, 2, 3, 4])

@@ -179,7 +179,7 @@ def test_the_decoder_of_the_run_is_judged_beside_the_probe():
     labelled = data["episode"] == 1
     result = analyse_latent(controller, data, labelled, PARTS)[OUTSIDE_THE_BUDGET]
     assert result["probe_r2"] == pytest.approx([1, 1], abs=1e-6) and result["decoder_r2"] == pytest.approx([1, 1])
-    assert (result["labels_read"], result["held_out_steps"]) == (4 * 18, 2 * 18)
+    assert (result["labels_read"], result["held_out_trajectories"]) == (4 * 18, 2)
     assert result["held_out_in_budget"] == 0
     nn.init.zeros_(controller.action_decoder.linear.weight)
     worse = analyse_latent(controller, data, data["episode"] >= 0, PARTS)[OUTSIDE_THE_BUDGET]

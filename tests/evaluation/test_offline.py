@@ -20,7 +20,7 @@ from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Action, Task
 
-FEW = EvalConfig(samples=4, threads=1)
+FEW = EvalConfig(threads=1)
 
 
 @pytest.fixture(autouse=True)
@@ -74,7 +74,7 @@ def test_latent_space_and_suggestions(run):
 
 
 def test_the_command_says_it_in_words(run, capsys):
-    assert main(["eval", str(run), "--samples", "2", "--threads", "1", "--no-report"]) == 0
+    assert main(["eval", str(run), "--threads", "1", "--no-report"]) == 0
     out = capsys.readouterr().out
     rows = dict(re.split("  +", line, maxsplit=1) for line in out.splitlines())
     assert " mrad; energy score; standing still " in rows["plan error, 14 columns"]
@@ -112,7 +112,7 @@ def test_columns_of_several_units_and_a_method_without_a_closed_form(tmp_path):
 def test_a_policy_of_its_own_is_judged_by_its_first_actions(tmp_path, capsys):
     arm = save_arm(tmp_path / "arm", labelled=6, joints=2)
     run = train_arm(tmp_path / "run", arm, method="dp", labels=LabelConfig(count=3), planner={"steps": 30})
-    assert main(["eval", str(run), "--samples", "3", "--threads", "1"]) == 0
+    assert main(["eval", str(run), "--threads", "1"]) == 0
     assert re.search(r"action error, 2 columns .* labels outside the budget\n", capsys.readouterr().out)
     result = json.loads((run / "eval.json").read_text())
     outside = result["action_errors"]["outside_budget"]
@@ -147,7 +147,7 @@ def test_a_data_set_that_has_moved_or_changed(tmp_path):
     arm.rename(tmp_path / "elsewhere")
     with pytest.raises(RunDirectoryError, match=r"arm' of .*run is not there \(moved.*--dataset"):
         evaluate(run, FEW)
-    moved = EvalConfig(samples=2, threads=1, dataset=str(tmp_path / "elsewhere"))
+    moved = EvalConfig(threads=1, dataset=str(tmp_path / "elsewhere"))
     assert evaluate(run, moved)["plan_errors"]["trajectories"] == 2
     shutil.rmtree(tmp_path / "elsewhere")
     save_arm(tmp_path / "elsewhere", joints=2, labelled=4)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from toy_episodes import episode_of, number
 
-from torchrl_koap.evaluation.scores import first_box_scores, outcome_of, score, stacking_scores, task_scores
+from torchrl_koap.evaluation.scores import outcome_of, score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, wilson_interval
 from torchrl_koap.tasks import get_task
 
@@ -77,32 +77,14 @@ def stack_of(letters, success):
     return episode
 
 
-def test_stacked_boxes_by_hand():
-    episodes = [stack_of((0, 1, 2), True), stack_of((0, 2, 1), True), stack_of((1, 0, 2), False), stack_of((), False)]
-    result = stacking_scores({}, episodes, [0, 0, 1, 1])
-    assert {name: sum(good) for name, good in result["rates"].items()} == {
-        "one box stacked": 3,
-        "two boxes stacked": 3,
-        "three boxes stacked": 2,
-    }
-    # context 0: same first box, two orders of two, two orders of three; context 1: one episode, none in the last
-    two = conditional_entropy([[0, 1]], 6)
-    assert result["stacked_1_entropy"] == 0
-    assert result["stacked_2_entropy"] == pytest.approx(two / 2)
-    assert result["stacked_3_entropy"] == pytest.approx(two)
-    first = first_box_scores({}, episodes, [0, 0, 1, 1])
-    assert set(first) == {"rates", "stacked_1_entropy"} and set(first["rates"]) == {"one box stacked"}
-
-
 def test_rates_of_stacking_join_the_success():
     episodes = [stack_of((0, 1, 2), True), stack_of((0, 2), False), stack_of((1,), False), stack_of((), False)]
     success = {"rates": {"success": {"rate": 0.25}}}
     found = task_scores(get_task("stacking"), success, episodes, [0, 0, 1, 1])
-    assert list(found["rates"]) == ["success", "one box stacked", "two boxes stacked", "three boxes stacked"]
-    low, high = wilson_interval(1, 4)
-    assert found["rates"]["three boxes stacked"] == {"rate": 0.25, "low": low, "high": high, "episodes": 4}
-    first = task_scores(get_task("stacking_1"), success, episodes, [0, 0, 1, 1])
-    assert list(first["rates"]) == ["success", "one box stacked"]
+    assert list(found["rates"]) == ["success", "one box stacked", "two boxes stacked"]
+    assert found["rates"]["one box stacked"]["rate"] == 0.75
+    low, high = wilson_interval(2, 4)
+    assert found["rates"]["two boxes stacked"] == {"rate": 0.5, "low": low, "high": high, "episodes": 4}
 
 
 def test_without_modes_there_is_no_entropy():

@@ -163,7 +163,7 @@ def arm(tmp_path_factory):
         planner = few if cell.method == "dp" else PlannerConfig(source=root / "planner")
         known = {"method": cell.method, "planner": planner, "controller": ControllerConfig(steps=20)}
         config = TrainConfig(out=root / cell.folder, dataset=dataset, labels=LabelConfig(fraction=1.0), **known)
-        make(root / cell.folder, config, EvalConfig(threads=1, samples=2))
+        make(root / cell.folder, config, EvalConfig(threads=1))
     return root, [cell_row(root, cell, **ROW) for cell in OFFLINE]
 
 

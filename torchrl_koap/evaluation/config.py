@@ -61,7 +61,6 @@ class EvalConfig(RolloutConfig):
             turn; from 2 on the entropy of the modes per context is known.
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
-        samples: for a task without an environment: plans that are sampled in each recorded situation.
 
     Examples:
         >>> from torchrl_koap.evaluation import EvalConfig, evaluate
@@ -71,7 +70,6 @@ class EvalConfig(RolloutConfig):
     rollouts_per_context: int = 1
     batch_size: int | None = None
     contexts_file: Path | None = None
-    samples: int = 16
 
 
 def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
@@ -114,7 +112,7 @@ def check_rollouts(config: RolloutConfig) -> None:
 def check_options(config: EvalConfig) -> None:
     """Refuses evaluation options that fit no run, before a run is loaded; the message names the option."""
     check_rollouts(config)
-    for name in ("batch_size", "rollouts_per_context", "samples"):
+    for name in ("batch_size", "rollouts_per_context"):
         value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")

@@ -44,13 +44,11 @@ def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
     }
 
 
-def plan_errors(
-    planner: StatePlanner, data: TensorDictBase, task: Task, *, samples: int = SAMPLES, seed: int = 0
-) -> dict[str, Any]:
+def plan_errors(planner: StatePlanner, data: TensorDictBase, task: Task, *, seed: int = 0) -> dict[str, Any]:
     """Scores a planner on trajectories that it has not seen, beside standing still and constant velocity.
 
-    There are ``samples`` plans in each of at most :data:`SITUATIONS`, spread evenly over all steps that have a whole
-    recorded future.
+    There are :data:`SAMPLES` plans in each of at most :data:`SITUATIONS`, spread evenly over all steps whose whole
+    future is recorded.
 
     Returns:
         dict: ``situations``, ``horizon``, ``samples``, ``unit``: a row per unit of the state columns with their names
@@ -65,7 +63,7 @@ def plan_errors(
     past, future = planner.split_window(states[:, history - planner.history :])
     episode = windows["episode"][:, -1].cpu()
     device = next(iter(planner.state_dict().values())).device
-    models = {"planner": sample_sequences(planner, past.to(device), samples=samples, seed=seed).cpu()}
+    models = {"planner": sample_sequences(planner, past.to(device), samples=SAMPLES, seed=seed).cpu()}
     models |= {name: plan[None] for name, plan in baseline_plans(states[:, :history], horizon).items()}
     groups = unit_groups(task.state_units)
 
@@ -77,7 +75,7 @@ def plan_errors(
     return {
         "situations": len(past),
         "horizon": horizon,
-        "samples": samples,
+        "samples": SAMPLES,
         "relative": relative(torch.ones_like(episode, dtype=torch.bool)),
         "unit": [
             {"unit": unit, "columns": [task.state_names[column] for column in columns]}
@@ -202,17 +200,11 @@ def errors_left_out(
 
 
 def errors_of_chunks(
-    policy: DiffusionPolicy,
-    data: TensorDictBase,
-    labelled: TensorDictBase,
-    task: Task,
-    *,
-    samples: int = SAMPLES,
-    seed: int = 0,
+    policy: DiffusionPolicy, data: TensorDictBase, labelled: TensorDictBase, task: Task, *, seed: int = 0
 ) -> dict[str, Any]:
     """Errors of sampled actions on the trajectories that have labels of which none was in the budget.
 
-    Judged is the mean of the first actions of ``samples`` chunks, in as many situations as plans are judged in; the
+    Judged is the mean of the first actions of :data:`SAMPLES` chunks, in as many situations as plans are judged in; the
     ridge is a linear policy of the same frames. Arguments, all columns of the state included, and result as of
     :func:`errors_outside_budget`.
     """
@@ -236,7 +228,7 @@ def errors_of_chunks(
     past = windows["state"][:, :history].float()
     true, seen = (moved(part["action"][:, now], part["state"]) for part in (windows, known))
     device = next(iter(policy.state_dict().values())).device
-    sampled = sample_sequences(policy, past.to(device), samples=samples, seed=seed)[:, :, 0].mean(0).cpu()
+    sampled = sample_sequences(policy, past.to(device), samples=SAMPLES, seed=seed)[:, :, 0].mean(0).cpu()
     condition, asked = (
         policy.encode_history(frames.float().to(device)).cpu() for frames in (known["state"][:, :history], past)
     )

@@ -181,8 +181,7 @@ def analyse_latent(
     horizon = min(HORIZON, max(1, int(trajectory_lengths(data).min()) - reach))
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
     errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)
-    sizes = {"steps": horizon, "fitted_trajectories": len(fit_on), "held_out_trajectories": held_out}
-    result["multi_step"] = sizes | errors
+    result["multi_step"] = {"steps": horizon, "held_out_trajectories": held_out} | errors
     steps = infer_steps(controller, data)
     known = steps[HAS_ACTION]
     if not known.all():  # the data lack labels themselves
@@ -198,7 +197,6 @@ def analyse_latent(
         own = explained(decoded, action[~fit])
     result[OUTSIDE_THE_BUDGET] = {
         "labels_read": len(steps),
-        "held_out_steps": int((~fit).sum()),
         "held_out_trajectories": len(steps[EPISODE][~fit].unique()),
         "held_out_in_budget": int((~torch.isin(budget, fit_on)).sum()),
         "probe_r2": probe(latent, action, steps[EPISODE], fit),

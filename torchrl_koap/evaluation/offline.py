@@ -41,12 +41,11 @@ def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, An
     """
     data = trained.data(config.dataset)
     labelled, _ = trained.hide_labels(data)
-    asked = {"samples": config.samples, "seed": config.seed}
-    plan = _plans(trained, data, **asked)
+    plan = _plans(trained, data, config.seed)
     if trained.planner is not None:
         outside, tensors = _outside_budget(trained, data, labelled)
     else:
-        outside, tensors = errors_of_chunks(trained.controller, data, labelled, trained.task, **asked), {}
+        outside, tensors = errors_of_chunks(trained.controller, data, labelled, trained.task, seed=config.seed), {}
     action = {"outside_budget": outside, "left_out": _left_out(trained, labelled, outside)}
     loop = check_loop(trained, data, labelled, execution=config.execution, seed=config.seed)
     return {
@@ -90,13 +89,13 @@ def _summary_of(action: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _plans(trained: Trained, data: TensorDictBase, **options: Any) -> dict[str, Any]:
+def _plans(trained: Trained, data: TensorDictBase, seed: int) -> dict[str, Any]:
     if trained.planner is None:
         return {"note": f"method {trained.config.method!r} samples actions: it makes no plans"}
     if not trained.held_out:
         return {"note": "no trajectory was held out from the planner (--planner.held-out; two trajectories at least)"}
     _, unseen, _ = split_held_out(data, trained.held_out)
-    return {"trajectories": len(trained.held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
+    return {"trajectories": len(trained.held_out)} | plan_errors(trained.planner, unseen, trained.task, seed=seed)
 
 
 def _outside_budget(
