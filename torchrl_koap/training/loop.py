@@ -64,30 +64,15 @@ def train_phase(
     replay: bool = False,
     progress: Callable[[int, dict[str, float]], None] | None = None,
 ) -> dict[str, float]:
-    """Minimises the sum of all ``loss_*`` entries with AdamW.
+    """Minimises the sum of all ``loss_*`` entries of a TorchRL ``LossModule`` with AdamW, in ``num_steps`` updates.
 
-    A gradient far longer than those before it is shortened (:func:`limit_outlier`).
-
-    Args:
-        phase (str): name in the log and of the checkpoint, ``"planner"`` or ``"controller"``.
-        loss_module (nn.Module): a TorchRL ``LossModule``.
-        sample (callable): returns a batch; draws from torch's global generator.
-
-    Keyword Args:
-        num_steps (int): updates.
-        learning_rate (float): peak of :func:`warmup_cosine`.
-        weight_decay (float): decoupled weight decay.
-        warmup (int): updates of warm-up.
-        target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
-        best (BestWeights, optional): scores the averages, keeps good ones and ends the training early.
-        run, logger, resume: as of :class:`Phases`. On a CPU a training goes on bit for bit.
-        log_every, checkpoint_every (int): updates per row of the log, and per checkpoint (default: 500).
-        replay (bool): on CUDA, record an update once as a graph and replay it. The loss must take the same path for
-            every batch, as denoising losses do. Defaults to False.
-        progress (callable, optional): called with the number of updates done and the last logged values.
-
-    Returns:
-        dict: the last logged values, with ``updates`` and ``iterations_per_second`` of the whole phase.
+    The rate is that of :func:`warmup_cosine`, and a gradient far longer than those before it is shortened
+    (:func:`limit_outlier`). ``target_update`` is stepped after every update; ``best`` scores the averages, keeps good
+    ones and ends the training early. ``sample`` returns a batch, by torch's global generator. ``run``, ``logger`` and
+    ``resume`` are as of :class:`Phases`: on a CPU a training goes on bit for bit. ``replay`` records an update once as
+    a CUDA graph: the loss must take the same path for every batch, as denoising losses do. ``progress`` is called with
+    the number of updates done and the last logged values. These are returned, with ``updates`` and
+    ``iterations_per_second`` of the whole phase.
 
     Raises:
         DivergedError: if a loss is not finite where it is logged, or a parameter is not where a checkpoint is due;
