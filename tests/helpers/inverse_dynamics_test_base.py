@@ -38,30 +38,6 @@ def recorded(batch, span):
     return ~(padded[..., span.start : span.stop] | padded[..., span.start + 1 : span.stop + 1])
 
 
-def few_labels():
-    """1280 windows of x_{t+1} = 0.9 x_t + a_t, of which the first 32 have labels."""
-    generator = torch.Generator().manual_seed(0)
-    action = torch.randn(1280, 12, 2, generator=generator)
-    states = [torch.randn(1280, 2, generator=generator)]
-    for t in range(11):
-        states.append(0.9 * states[-1] + action[:, t])
-    data = TensorDict({"state": torch.stack(states, 1), "action": action}, [1280])
-    data["has_action"] = torch.zeros(1280, 12, 1, dtype=torch.bool)
-    data["has_action"][:32] = True
-    return data
-
-
-def train(network, data, *stages):
-    """Trains by a loss on some of the first windows each: ``(loss, updates, windows)``."""
-    generator = torch.Generator().manual_seed(0)
-    for loss, updates, rows in stages:
-        optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
-        for _ in range(updates):
-            sum(loss(data[torch.randint(rows, (32,), generator=generator)]).values()).backward()
-            optimizer.step()
-            optimizer.zero_grad()
-
-
 def reached(network, loss):
     """Names of the parts that a loss has gradients for."""
     network.zero_grad()

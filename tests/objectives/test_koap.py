@@ -124,12 +124,22 @@ def in_plain_loops(network, batch, clamped):
 
 @pytest.mark.parametrize("clamped", [False, True])
 @pytest.mark.parametrize("kind", NETWORKS)
-def test_values_in_plain_loops(kind, clamped):
+def test_values_and_gradients_in_plain_loops(kind, clamped):
+    """Gradients also of the target g(x_{t+1}), which is not detached, as in KOAP's first public code."""
     network, batch = make_network(kind, clamped=clamped), make_batch(4)
-    expected = in_plain_loops(network, batch, clamped)
+    parameters, expected = dict(network.named_parameters()), in_plain_loops(network, batch, clamped)
     losses = KOAPLoss(network, koopman_coeff=0.5, action_coeff=3.0)(batch)
     for key, factor in (("loss_reconstruction", 1.0), ("loss_koopman", 0.5), ("loss_action", 3.0)):
-        torch.testing.assert_close(losses[key], factor * expected[key].mean())
+        wanted = factor * expected[key].mean()
+        torch.testing.assert_close(losses[key], wanted)
+        gradients = (
+            torch.autograd.grad(value, parameters.values(), retain_graph=True, allow_unused=True)
+            for value in (losses[key], wanted)
+        )
+        for name, one, other in zip(parameters, *gradients, strict=True):
+            zeros = torch.zeros_like(parameters[name])
+            one, other = (zeros if gradient is None else gradient for gradient in (one, other))
+            assert torch.allclose(one, other, rtol=1e-3, atol=1e-5), (key, name)
     elements = KOAPLoss(network, reduction="none")(batch)
     torch.testing.assert_close(elements["loss_koopman"].flatten(), expected["loss_koopman"])
     assert elements["loss_koopman"].shape == elements["loss_action"].shape == (4, len(span(clamped)))
@@ -151,21 +161,6 @@ def test_single_losses_are_the_terms_of_the_sum_and_read_no_more(loss_class, red
         assert torch.equal(value, together(batch)[key])
     with pytest.raises(KeyError, match="state.*there are"):
         single(batch.exclude("state"))
-
-
-@pytest.mark.parametrize("kind", NETWORKS)
-def test_gradients_in_plain_loops(kind):
-    """Also of the target g(x_{t+1}), which is not detached, as in KOAP's first public code."""
-    network, batch = make_network(kind), make_batch(3)
-    parameters = dict(network.named_parameters())
-    expected = in_plain_loops(network, batch, False)
-    for key, value in KOAPLoss(network)(batch).items():
-        left = torch.autograd.grad(value, parameters.values(), retain_graph=True, allow_unused=True)
-        right = torch.autograd.grad(expected[key].mean(), parameters.values(), retain_graph=True, allow_unused=True)
-        for name, one, other in zip(parameters, left, right, strict=True):
-            zeros = torch.zeros_like(parameters[name])
-            one, other = (zeros if gradient is None else gradient for gradient in (one, other))
-            assert torch.allclose(one, other, rtol=1e-3, atol=1e-5), (key, name)
 
 
 # labels

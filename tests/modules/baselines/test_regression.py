@@ -19,16 +19,13 @@ class TestLinearInverseDynamics(InverseDynamicsTestBase):
         return LinearInverseDynamics(3, 2, num_past=2, look_ahead=(2, 3), **normalizers(), **options)
 
 
-def linear_windows(*batch, frames=12, look_ahead=5, num_past=2, dtype=torch.float64, seed=0):
+def linear_windows(*batch, seed=0):
     """Actions that are a fixed affine map of x_{t-2}, x_{t-1}, x_t, x_{t+5}, where these lie in the window."""
-    generator = torch.Generator().manual_seed(seed)
-    state = torch.randn(*batch, frames, 3, generator=generator, dtype=torch.float64)
-    true = torch.randn(2, 4 * 3, generator=torch.Generator().manual_seed(99), dtype=torch.float64)
-    action = torch.full((*batch, frames, 2), torch.nan, dtype=torch.float64)
-    for t in range(num_past, frames - look_ahead):
-        read = torch.cat([state[..., t - 2, :], state[..., t - 1, :], state[..., t, :], state[..., t + 5, :]], -1)
-        action[..., t, :] = read @ true.T + torch.tensor([0.5, -2.0])
-    return TensorDict({"state": state.to(dtype), "action": action.to(dtype)}, batch)
+    generator, fixed = torch.Generator().manual_seed(seed), torch.Generator().manual_seed(99)
+    state = torch.randn(*batch, 12, 3, generator=generator, dtype=torch.float64)
+    true = torch.randn(2, 4 * 3, generator=fixed, dtype=torch.float64)
+    read = torch.cat([state.roll(shift, -2) for shift in (2, 1, 0, -5)], -1)
+    return TensorDict({"state": state, "action": read @ true.T + torch.tensor([0.5, -2.0])}, batch)
 
 
 def test_ridge_recovers_a_linear_system_and_generalises():
@@ -52,8 +49,6 @@ def test_ridge_reads_no_action_outside_the_mask():
     models[1].fit_labels(poisoned, mask)
     for name, value in models[0].state_dict().items():
         assert torch.equal(value, models[1].state_dict()[name]), name
-    with pytest.raises(ValueError, match="no labelled frame lies in frames 2..6"):
-        models[0].fit_labels(windows, torch.zeros_like(mask))
 
 
 def make_windows(columns=3, num=80):

@@ -8,14 +8,7 @@ from small_samplers import chunk_policy, small_planner
 from torchrl.collectors import Collector
 from toy_gym import reach
 
-from torchrl_koap.modules import (
-    Agent,
-    Execution,
-    PlanningPolicy,
-    PolicyEnv,
-    make_koopman_inverse_dynamics,
-    make_policy,
-)
+from torchrl_koap.modules import Agent, Execution, PlanningPolicy, PolicyEnv, make_koopman_inverse_dynamics, make_policy
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 STEPS = 13

@@ -10,16 +10,13 @@ import torch
 from small_samplers import chunk_policy, small_planner
 
 from torchrl_koap.modules import Execution, make_koopman_inverse_dynamics, make_policy
-from torchrl_koap.modules.execution.export import FACTS, SUFFIXES, ExportError, export_policy, exportable, relative_gap
+from torchrl_koap.modules.execution.export import FACTS, ExportError, export_policy, exportable, relative_gap
 
 needs_onnx = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
     reason="ONNX is not installed (extra 'onnx')",
 )
-COLUMNS = {
-    "observations": {"cx": "m", "cy": "m", "x": "m", "y": "m"},
-    "actions": {"dx": "m", "dy": "m", "grip": ""},
-}
+COLUMNS = {"observations": {"cx": "m", "cy": "m", "x": "m", "y": "m"}, "actions": {"dx": "m", "dy": "m", "grip": ""}}
 
 
 def policy(ranges=None, **execution):
@@ -54,9 +51,15 @@ def test_the_stateless_policy_is_the_open_loop_one():
     torch.testing.assert_close(actions[:, 0], whole.act(observed, plan, 0))
 
 
-def test_a_policy_comes_back_from_its_file(tmp_path):
-    what = exportable(policy(), columns=COLUMNS)
-    loaded = export_policy(what, tmp_path / "policy.pt2")
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """What is exported, its file, and what that holds."""
+    what, path = exportable(policy(), columns=COLUMNS), tmp_path_factory.mktemp("exported") / "policy.pt2"
+    return what, path, export_policy(what, path)
+
+
+def test_a_policy_comes_back_from_its_file(exported):
+    what, _, loaded = exported
     other = [value + 0.1 for value in what.batch(7)]  # the batch is dynamic
     with torch.no_grad():
         torch.testing.assert_close(loaded(*other), what.module(*other), atol=1e-5, rtol=1e-5)
@@ -104,10 +107,9 @@ def test_onnx_is_called_as_its_metadata_say(tmp_path):
     assert np.abs(actions[..., 0]).max() == pytest.approx(usual) and float(facts["control_hz"]) == 30.0
 
 
-def test_facts_are_in_the_file_of_torch_export(tmp_path):
-    export_policy(exportable(policy(), columns=COLUMNS), tmp_path / "a.pt2")
+def test_facts_are_in_the_file_of_torch_export(exported):
     found = {FACTS: ""}
-    torch.export.load(tmp_path / "a.pt2", extra_files=found)
+    torch.export.load(exported[1], extra_files=found)
     facts = json.loads(found[FACTS])
     assert facts["inputs"]["observations"] == {
         "shape": ["batch", 5, 4],
@@ -141,4 +143,3 @@ def test_faults(tmp_path):
         export_policy(what, tmp_path / "x", kind="onxx")
     with pytest.raises(ExportError, match="differs from the policy by"):
         export_policy(what, tmp_path / "x.pt2", tolerance=-1.0)
-    assert set(SUFFIXES) == {"torch", "onnx", "aoti"}

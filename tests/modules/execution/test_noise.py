@@ -4,18 +4,10 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from toy_gym import reach
 
+from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.evaluation.rollouts import roll_out
-from torchrl_koap.modules import (
-    Agent,
-    Execution,
-    MLPDenoiser,
-    PolicyEnv,
-    StatePlanner,
-    make_koopman_inverse_dynamics,
-    make_policy,
-)
+from torchrl_koap.modules import Agent, Execution, MLPDenoiser, StatePlanner, make_koopman_inverse_dynamics, make_policy
 from torchrl_koap.modules.execution.policy_env import NoiseStreams, NoiseTransform
 
 
@@ -43,32 +35,6 @@ class Still(StatePlanner):
         return noise
 
 
-@pytest.mark.parametrize("horizon", [14, 16, 5])
-@pytest.mark.parametrize("temperature", [1.0, 0.5])
-def test_agent_environment_and_evaluation_act_alike_bit_for_bit(horizon, temperature):
-    """Horizons times columns that are no multiple of 16 included, in which torch fills tensors."""
-    torch.manual_seed(0)
-    planner = Still(MLPDenoiser(4, 8, horizon=horizon, width=8), state_dim=4, horizon=horizon, num_steps=2)
-    policy = make_policy(
-        planner,
-        make_koopman_inverse_dynamics(4, 2),
-        state_of=range(4),
-        max_steps=7,
-        execution=Execution(replan_interval=2, temperature=temperature),
-    )
-
-    env = PolicyEnv(reach(), policy)
-    env.set_seed(3)
-    with torch.no_grad():
-        rollout = env.rollout(6, policy)
-    agent = Agent(policy, seed=3)
-    agent.reset()
-    streams = NoiseStreams([3], policy.noise_shape, block=7)
-    for step, row in enumerate(rollout):
-        assert torch.equal(row["noise"], streams.draw()[0])  # what roll_out hands the episode of seed 3
-        assert torch.equal(agent.act(row["observation"]), row["action"]), step
-
-
 @pytest.mark.parametrize("given", [True, False])
 def test_the_temperature_is_a_factor_of_the_start_noise(given):
     planner = Still(MLPDenoiser(4, 8, horizon=14, width=8), state_dim=4)
@@ -83,8 +49,6 @@ def test_the_temperature_is_a_factor_of_the_start_noise(given):
 
 
 def test_the_episode_of_a_seed_in_an_evaluation_is_that_of_an_agent():
-    from torchrl_koap.envs import AvoidingEnv
-
     torch.manual_seed(0)
     planner = StatePlanner(MLPDenoiser(2, 4, horizon=13, width=8), state_dim=2, horizon=13, num_steps=2)
     planner.fit_normalizers(0.01 * torch.randn(50, 15, 2).cumsum(1))

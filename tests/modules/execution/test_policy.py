@@ -8,11 +8,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from toy_policies import CountingPlanner, CountingSampler, EchoController, EpisodesOfRandomLength, state_number
 
-from torchrl_koap.modules import (
-    Execution,
-    PlanningPolicy,
-    policy_transforms,
-)
+from torchrl_koap.modules import Execution, PlanningPolicy, policy_transforms
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 LENGTHS = ((5, 3, 11), (9,), (1, 2, 7, 4), (12, 6), (4, 4, 8))

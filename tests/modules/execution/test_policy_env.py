@@ -26,10 +26,6 @@ def open_loop():
     return feedback(strategy="open_loop")
 
 
-def cold():
-    return feedback(temperature=0.5)
-
-
 def chunks():
     return chunk_policy(range(4))
 
@@ -69,8 +65,9 @@ def test_the_seed_fixes_everything(make_policy, layout):
     env.close()
 
 
-@pytest.mark.parametrize("collected", [False, True])
-@pytest.mark.parametrize("make_policy", [feedback, open_loop, cold, chunks])
+@pytest.mark.parametrize(
+    ("make_policy", "collected"), [(feedback, False), (feedback, True), (open_loop, False), (chunks, True)]
+)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout, collected):
     env = LAYOUTS[layout](make_policy)
@@ -109,7 +106,7 @@ PARALLEL = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make_policy", [feedback, open_loop, cold, chunks])
+@pytest.mark.parametrize("make_policy", [feedback, open_loop, chunks])
 @pytest.mark.parametrize("layout", PARALLEL)
 def test_environments_in_processes_give_the_numbers_of_a_serial_one(make_policy, layout):
     _in_processes(make_policy, layout)

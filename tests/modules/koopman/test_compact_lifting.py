@@ -3,12 +3,10 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from torchrl_koap.modules import make_koopman_inverse_dynamics
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting, NoiseAdjustedComponents, isomap
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
-from torchrl_koap.objectives import KOAPLoss
 
 
 def turning(count=400, length=17, bodies=1):
@@ -146,19 +144,6 @@ class TestCompactLifting:
         with pytest.raises(ValueError, match="expected states with 24 columns"):
             CompactLifting(24, 2).encode(torch.randn(3, 25))
 
-    def test_the_model_of_the_preset(self):
-        model = make_koopman_inverse_dynamics(24, 2, preset="semi_supervised", num_features=16)
-        windows = embedded(turning().sin())
-        model.prepare(windows)
-        batch = TensorDict({"state": windows, "action": torch.zeros(400, 17, 2)}, [400])
-        batch["has_action"] = torch.zeros(400, 17, 1, dtype=torch.bool)
-        losses = KOAPLoss(model)(batch)
-        sum(losses[name] for name in ("loss_reconstruction", "loss_koopman")).backward()
-        for network in (model.lifting.small, model.lifting.large):
-            assert network.encoder[0].weight.grad is not None
-        model.finish(windows)
-        assert int(model.lifting.kept.sum()) in (2, 4)
-
     def test_narrow_states_are_kept_as_they_are(self):
         model = make_koopman_inverse_dynamics(4, 2, preset="semi_supervised")
         assert model.lifting.keeps_state
@@ -189,14 +174,6 @@ def test_a_rolled_sheet_is_laid_flat():
     points, place = roll()
     assert explained(points, place) < 0.5  # no linear map does
     assert explained(isomap(points, 2), place) > 0.98
-
-
-def test_a_place_behind_many_bumps_is_found():
-    place = uniform(800, 1)
-    bumps = (-0.5 * ((place - torch.linspace(-0.1, 1.1, 40)) / 0.05) ** 2).exp()
-    assert explained(isomap(bumps, 1), place) > 0.98
-    values, vectors = torch.linalg.eigh((bumps - bumps.mean(0)).T @ (bumps - bumps.mean(0)))
-    assert explained(bumps @ vectors[:, -1:], place) < 0.85  # the first principal component is folded
 
 
 def test_coordinates_have_unit_spread_the_widest_first_and_what_is_not_there_is_zero():

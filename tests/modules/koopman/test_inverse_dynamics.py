@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The inverse dynamics model: inference path, normalisers, keys, rollouts, fitting, saving, composition."""
+"""The inverse dynamics model: inference path, normalisers, keys, fitting, saving, composition."""
 
 import inverse_dynamics_test_base as base
 import pytest
@@ -23,14 +23,13 @@ STATE_NORMALIZER = {"offset": torch.tensor([1.0, -2.0, 0.5]), "scale": torch.ten
 ACTION_NORMALIZER = {"offset": torch.tensor([0.3, -0.1]), "scale": torch.tensor([0.01, 3.0])}
 
 
-def make_model(*, normalizers=True, seed=0, parts=None, input_dim=None, **options):
+def make_model(*, normalizers=True, seed=0, parts=None, **options):
     torch.manual_seed(seed)
-    latent_dim = 4 if input_dim is None else input_dim
     made = {
-        "latent_action": LatentActionMLP(3, latent_dim, hidden_dims=(8,), look_ahead=3, relative=True),
-        "action_decoder": LinearActionDecoder(latent_dim, 2),
+        "latent_action": LatentActionMLP(3, 4, hidden_dims=(8,), look_ahead=3, relative=True),
+        "action_decoder": LinearActionDecoder(4, 2),
         "lifting": KoopmanLifting(3, 4, hidden_dims=(8,)),
-        "operator": KoopmanOperator(4, input_dim=input_dim),
+        "operator": KoopmanOperator(4),
     } | (parts or {})
     if normalizers:
         options = {
@@ -68,25 +67,6 @@ def test_parts_with_other_keys_in_a_model_with_other_keys():
     assert set(td.keys()) == {"agent", "u"} and other.out_keys == ["u", ("agent", "command")]
     data = TensorDict({"agent": {"window": state, "command": torch.randn(4, 9, 2)}}, [4])
     assert other.fit_labels(data, torch.ones(4, 9, dtype=torch.bool))["labels_used"] == 4 * 5
-
-
-@pytest.mark.parametrize("input_dim", [None, 6])
-def test_rollout_is_repeated_multiplication(input_dim):
-    model = make_model(input_dim=input_dim).double()
-    if input_dim:
-        torch.nn.init.normal_(model.operator.input)
-    matrix = model.operator.weight
-    b = torch.eye(4).double() if input_dim is None else model.operator.input
-    lifted = torch.randn(2, 3, 4).double()
-    latent = torch.randn(2, 3, 7, input_dim or 4).double()
-    rolled = model.rollout_latent(lifted, latent)
-    assert rolled.shape == (2, 3, 7, 4)
-    for t in range(7):
-        expected = lifted @ torch.linalg.matrix_power(matrix, t + 1).T
-        for s in range(t + 1):
-            expected = expected + latent[..., s, :] @ (torch.linalg.matrix_power(matrix, t - s) @ b).T
-        torch.testing.assert_close(rolled[..., t, :], expected)
-    torch.testing.assert_close(model.predict_next(lifted, latent[..., 0, :]), rolled[..., 0, :])
 
 
 # fitting

@@ -73,20 +73,6 @@ def test_the_condition_is_the_planners(relative, features):
     assert make_policy().relative is False
 
 
-def test_sampling_solves_and_decodes():
-    """A denoiser that predicts the clean actions, whatever the noise, from the condition alone."""
-
-    class Constant(nn.Module):
-        def forward(self, x, time, condition):
-            return condition[..., None, 2:4].expand(*x.shape[:-1], 2) * torch.arange(1, x.shape[-2] + 1)[:, None]
-
-    policy = DiffusionPolicy(Constant(), state_dim=2, action_dim=2, horizon=3, solver="ddim")
-    policy.action_normalizer.offset.copy_(torch.tensor([1.0, 2.0]))
-    policy.action_normalizer.scale.copy_(torch.tensor([10.0, 100.0]))
-    actions = policy.sample(torch.tensor([[[9.0, 9.0], [0.5, 0.25]]]))
-    torch.testing.assert_close(actions, torch.tensor([[[6.0, 27.0], [11.0, 52.0], [16.0, 77.0]]]))
-
-
 def test_wrong_actions_and_hidden_labels_are_explained():
     policy = make_policy(num_steps=3)
     with pytest.raises(ValueError, match=r"actions must be \[\*M, 3\] \(action_dim\), got \[9, 2\]"):

@@ -60,10 +60,10 @@ def diffusers():
 OPTIONS = {"num_train_timesteps": 50, "prediction_type": "sample", "beta_schedule": "squaredcos_cap_v2"}
 
 
-def follow(scheduler, x, **options):
+def follow(scheduler, x):
     for time in scheduler.timesteps:
         output = smooth_network(x, x.new_full(x.shape[:1], float(time)))
-        x = scheduler.step(output, time, x, return_dict=False, **options)[0]
+        x = scheduler.step(output, time, x, return_dict=False)[0]
     return x
 
 
@@ -74,28 +74,19 @@ def test_levels_agree_with_diffusers(diffusers):
     torch.testing.assert_close(noisy, oracle.add_noise(sample, noise, time), atol=1e-5, rtol=0)
 
 
+DPM = {"algorithm_type": "dpmsolver++", "solver_order": 2, "solver_type": "midpoint", "final_sigmas_type": "zero"}
+ORACLES = {
+    "ddim": ("DDIMScheduler", {"clip_sample": False}),
+    "dpm++2m": ("DPMSolverMultistepScheduler", DPM | {"lower_order_final": True}),
+}
+
+
 @pytest.mark.parametrize("num_steps", [50, 10, 5])
-def test_ddim_agrees_with_diffusers(diffusers, num_steps):
-    oracle = diffusers.DDIMScheduler(**OPTIONS, clip_sample=False, timestep_spacing="trailing")
+@pytest.mark.parametrize("solver", ORACLES)
+def test_solvers_agree_with_diffusers(diffusers, solver, num_steps):
+    name, options = ORACLES[solver]
+    oracle = getattr(diffusers, name)(**OPTIONS, **options, timestep_spacing="trailing")
     oracle.set_timesteps(num_steps)
     noise = torch.randn(6, 14, 2, dtype=torch.float64)
-    expected = follow(oracle, noise)
-    got = NoiseSchedule().solve(smooth_network, noise, num_steps, "ddim")
-    torch.testing.assert_close(got, expected, atol=1e-4, rtol=1e-4)
-
-
-@pytest.mark.parametrize("num_steps", [20, 10, 5])
-def test_dpm_solver_agrees_with_diffusers(diffusers, num_steps):
-    oracle = diffusers.DPMSolverMultistepScheduler(
-        **OPTIONS,
-        algorithm_type="dpmsolver++",
-        solver_order=2,
-        solver_type="midpoint",
-        final_sigmas_type="zero",
-        lower_order_final=True,
-        timestep_spacing="trailing",
-    )
-    oracle.set_timesteps(num_steps)
-    noise = torch.randn(6, 14, 2, dtype=torch.float64)
-    got = NoiseSchedule().solve(smooth_network, noise, num_steps, "dpm++2m")
+    got = NoiseSchedule().solve(smooth_network, noise, num_steps, solver)
     torch.testing.assert_close(got, follow(oracle, noise), atol=1e-4, rtol=1e-4)
