@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-from small_samplers import small_planner
 from torchrl.envs import TransformedEnv
 from toy_episodes import episode_of, number
 from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
@@ -15,7 +14,7 @@ from torchrl_koap.envs.transforms import EndEffectorNoise
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
-from torchrl_koap.modules import Execution, make_koopman_inverse_dynamics, make_policy
+from torchrl_koap.modules import make_policy
 
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
 
@@ -51,20 +50,6 @@ def test_results_do_not_depend_on_the_batch_size(together, batch_size):
         assert (one["observation"] - other["observation"]).abs().max() < 1e-4
         assert (one["next", "observation"] - other["next", "observation"]).abs().max() < 1e-4
     assert finished == [min(done, 8) for done in range(batch_size, 8 + batch_size, batch_size)]
-
-
-@pytest.mark.parametrize("strategy", ["feedback", "open_loop"])
-def test_real_networks_do_not_depend_on_it_either(strategy):
-    planner = small_planner(num_steps=3)
-    planner.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1))
-    controller = make_koopman_inverse_dynamics(2, 2)
-    torch.nn.init.normal_(controller.action_decoder.linear.weight, std=1e-3)
-    policy = make_policy(planner.eval(), controller.eval(), state_of=(2, 3), execution=Execution(strategy))
-    together, apart = (roll_out(policy, AvoidingEnv, SEEDS[:3], max_steps=9, batch_size=size) for size in (None, 1))
-    for one, other in zip(apart, together, strict=True):
-        assert (one["next", "observation"] - other["next", "observation"]).abs().max() < 1e-4
-        assert (one["action"] - other["action"]).abs().max() < 1e-4
-    assert not torch.allclose(together[0]["action"], together[1]["action"])
 
 
 def test_observation_noise_of_an_episode_depends_on_its_seed_alone():
@@ -135,15 +120,6 @@ def test_pictures_get_padded_paths_and_the_plans_that_were_made():
     assert torch.equal(tensors["state_plan"][0].flip(-1), tensors["plan"][0])
     plain = rollouts_to_tensors([episode_of(3, plans=False)], position=slice(2, 4), mode_index=number, interval=4)
     assert plain["plan"].shape[:2] == (1, 0) and plain["plan_step"].shape == (1, 0)
-
-
-def test_plans_of_a_rollout_start_where_the_arm_was(together):
-    tensors = rollouts_to_tensors(together, position=slice(2, 4), mode_index=mode_index, interval=4)
-    for episode in range(8):
-        for index, step in enumerate(tensors["plan_step"][episode].tolist()):
-            if step >= 0:
-                ahead = tensors["plan"][episode, index, 0] - tensors["position"][episode, step]
-                assert ahead[1].item() == pytest.approx(0.009, abs=1e-5)
 
 
 def test_latency_is_measured_per_plan_and_per_step():
