@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap import ControllerConfig, PlannerConfig, TrainConfig, train
+from torchrl_koap import ControllerConfig, PlannerConfig, TrainConfig, Trained, fit, train
 from torchrl_koap.data import make_demonstrations, save_ted
 
 TINY = {"planner": {"steps": 20, "batch_size": 8, "width": 8}, "controller": {"steps": 20}}
@@ -27,6 +27,15 @@ def record(count: int = 10, steps: int = 40, joints: int = 7, *, seed: int = 0):
         states.append(np.array(frames))
         actions.append(np.array(commands))
     return states, actions
+
+
+def fit_walks(columns: int, **description) -> Trained:
+    """Two updates on random walks; the robot is the first two columns, whose steps one walk has as actions."""
+    random = np.random.default_rng(0)
+    states = [random.normal(size=(40, columns)).cumsum(0) for _ in range(3)]
+    actions = [np.diff(states[0][:, :2], axis=0), None, None]
+    data, task = make_demonstrations(states, actions, control_hz=30, robot=[0, 1], **description)
+    return fit(data, task, method="linear", planner={"steps": 2, "width": 8}, progress=False)
 
 
 def save_arm(

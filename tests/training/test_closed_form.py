@@ -9,9 +9,22 @@ from torchrl_koap.data import LabelBudget, cut_windows, flatten_trajectories, se
 from torchrl_koap.modules.ridge import INPUT_NOISE, ridge
 from torchrl_koap.training.closed_form import fit_closed_form
 
-MODULES = ("koopman.inverse_dynamics", "baselines.regression")
 LENGTHS = (25, 18, 31, 40, 22)
 CONTROLLERS = [("koap", "default"), ("koap", "paper"), ("koap", "absolute"), ("linear", "default")]
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """Inputs, targets, groups and result of every ridge regression."""
+    made = []
+
+    def noted(inputs, targets, **options):
+        made.append((inputs, targets, options["groups"], ridge(inputs, targets, **options)))
+        return made[-1][-1]
+
+    for module in ("koopman.inverse_dynamics", "baselines.regression"):
+        monkeypatch.setattr(f"torchrl_koap.modules.{module}.ridge", noted)
+    return made
 
 
 def numbered(lengths=LENGTHS):
@@ -33,21 +46,14 @@ def numbered(lengths=LENGTHS):
         LabelBudget(),
     ],
 )
-def test_every_label_with_full_look_ahead_is_used_exactly_once(monkeypatch, method, preset, budget):
+def test_every_label_with_full_look_ahead_is_used_exactly_once(fits, method, preset, budget):
     data = numbered()
     labelled, _ = budget.apply(data)
     torch.manual_seed(0)
     controller = controller_of(method, labelled, preset=preset)
-    seen = []
-
-    def spy(inputs, targets, **options):
-        seen.append((controller.raw_action(targets, inputs), options["groups"]))
-        return ridge(inputs, targets, **options)
-
-    for module in MODULES:
-        monkeypatch.setattr(f"torchrl_koap.modules.{module}.ridge", spy)
     report = fit_closed_form(controller, labelled)
-    ((actions, groups),) = seen
+    ((inputs, targets, groups, _),) = fits
+    actions = controller.raw_action(targets, inputs)
     look_ahead = controller.num_window_frames - 1 - controller.num_past
     left = torch.cat([torch.arange(n, 0, -1) for n in LENGTHS])  # steps that are left in the trajectory, this included
     wanted = labelled["has_action"].squeeze(-1) & (left > look_ahead)
@@ -57,25 +63,17 @@ def test_every_label_with_full_look_ahead_is_used_exactly_once(monkeypatch, meth
 
 
 @pytest.mark.parametrize("method", ["koap", "linear", "pca"])
-def test_no_penalty_is_below_that_of_the_errors_of_plans(monkeypatch, method):
+def test_no_penalty_is_below_that_of_the_errors_of_plans(fits, method):
     generator = torch.Generator().manual_seed(0)
     frames = [torch.randn(91, 2, generator=generator).cumsum(0) * 0.01 for _ in range(6)]
     data = select_state(flatten_trajectories(frames, [frame[1:] - frame[:-1] for frame in frames]), (0, 1))
     torch.manual_seed(0)
     controller = controller_of(method, data)
-    seen = []
-
-    def spy(*args, **options):
-        seen.append(ridge(*args, **options))
-        return seen[-1]
-
-    for module in MODULES:
-        monkeypatch.setattr(f"torchrl_koap.modules.{module}.ridge", spy)
     windows = cut_windows(data, controller.num_window_frames, pad_before=controller.num_past)["state"]
     controller.prepare(windows), controller.finish(windows)
     report = fit_closed_form(controller, data)
     assert report["labels_used"] > 400
-    assert all(min(fit.errors) == pytest.approx(INPUT_NOISE * report["labels_used"]) for fit in seen)
+    assert all(min(fit.errors) == pytest.approx(INPUT_NOISE * report["labels_used"]) for *_, fit in fits)
 
 
 @pytest.mark.parametrize(("preset", "through_zero"), [("default", True), ("paper", False)])

@@ -7,27 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filmed_data import write_filmed
+from offline_runs import fit_walks
 from tiny_runs import koap
 
-from torchrl_koap import Agent, fit, load_policy
-from torchrl_koap.data import make_demonstrations
+from torchrl_koap import Agent, load_policy
 from torchrl_koap.training.lerobot_folder import WEIGHTS, number_features, write_lerobot_folder
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
 
 NAMES = ("x", "y", "environment_state_0", "environment_state_tip")
 
 
-def made(names=NAMES):
-    random = np.random.default_rng(0)
-    states = [random.normal(size=(40, len(names))).cumsum(0) for _ in range(3)]
-    actions = [np.diff(states[0][:, :2], axis=0), None, None]
-    data, task = make_demonstrations(states, actions, control_hz=30, state_names=names, robot=[0, 1])
-    return fit(data, task, method="linear", planner={"steps": 2, "width": 8}, progress=False)
-
-
 @pytest.fixture(scope="module")
 def trained():
-    return made()
+    return fit_walks(4, state_names=NAMES)
 
 
 def read(file):

@@ -9,6 +9,7 @@ from small_controllers import controller_of
 from small_samplers import a_system
 from tensordict import TensorDict
 
+from torchrl_koap.data import flatten_trajectories, select_state
 from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Action, Task, get_task
 from torchrl_koap.training import response as response_fit
@@ -30,28 +31,15 @@ def columns(**options) -> ResponseModel:
 def recordings(episodes: int = 6, length: int = 60, noise: float = 0.0) -> TensorDict:
     """Fully labelled flat data of the system, each episode at a place of its own: observation is command, position."""
     torch.manual_seed(0)
-    parts = []
-    for episode in range(episodes):
+    frames, actions = [], []
+    for _ in range(episodes):
         action = (0.01 * torch.randn(length, 2, dtype=torch.float64)).cumsum(0) * 0.3
-        start = torch.randn(2, dtype=torch.float64)
-        moved = a_system().predict(start.expand(3, 2), start, torch.zeros(2, 2, dtype=torch.float64), action)
-        position = torch.cat([start.unsqueeze(0), moved[:-1]])
-        command = torch.cat([start.unsqueeze(0), start + action[:-1].cumsum(0)])
-        position = position + noise * torch.randn(length, 2, dtype=torch.float64) if noise else position
-        parts.append(
-            TensorDict(
-                {
-                    "state": position,
-                    "observation": torch.cat([command, position], -1),
-                    "action": action,
-                    "has_action": torch.ones(length, 1, dtype=torch.bool),
-                    "episode": torch.full((length,), episode),
-                    "step_count": torch.arange(length),
-                },
-                length,
-            )
-        )
-    return torch.cat(parts)
+        start = torch.randn(1, 2, dtype=torch.float64)
+        moved = a_system().predict(start.expand(3, 2), start[0], torch.zeros(2, 2, dtype=torch.float64), action)
+        position, command = torch.cat([start, moved]), torch.cat([start, start + action.cumsum(0)])
+        frames.append(torch.cat([command, position + noise * torch.randn_like(position)], -1))
+        actions.append(action)
+    return select_state(flatten_trajectories(frames, actions, dtype=torch.float64), (2, 3))
 
 
 def test_the_system_is_found_from_one_labelled_trajectory():

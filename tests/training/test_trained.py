@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from offline_runs import fit_walks
 from tiny_runs import TINY, koap
 
-from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, fit, load_policy
-from torchrl_koap.data import make_demonstrations
+from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, load_policy
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
 PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
@@ -24,12 +24,7 @@ def actions(policy, path=PATH):
 
 @pytest.fixture(scope="module")
 def own():
-    random = np.random.default_rng(0)
-    states = [random.normal(size=(40, 3)).cumsum(0) for _ in range(3)]
-    data, task = make_demonstrations(
-        states, [np.diff(states[0][:, :2], axis=0), None, None], control_hz=30, name="my_arm", robot=[0, 1]
-    )
-    trained = fit(data, task, method="linear", planner={"steps": 2, "width": 8}, progress=False)
+    trained = fit_walks(3, name="my_arm")
     return replace(trained, config=replace(trained.config, execution=ExecutionConfig(replan_interval=3, blend=0.5)))
 
 
