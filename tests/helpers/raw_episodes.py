@@ -19,13 +19,6 @@ def write_raw_episode(path, robot, objects=None, context=None):
     return path
 
 
-def turned(*degrees, sign=1.0):
-    """Quaternions of a rotation about z, one row per angle."""
-    half = np.radians(np.array(degrees)) / 2
-    zeros = np.zeros_like(half)
-    return sign * np.stack([np.cos(half), zeros, zeros, np.sin(half)], 1)
-
-
 def pose(positions, quat):
     return {"pos": np.array(positions, dtype=float), "quat": quat}
 
@@ -34,8 +27,11 @@ def made_up(task, rows=5, seed=0):
     """Any episode of a task, with everything that is logged."""
     rng = np.random.default_rng(seed)
     robot = {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
-    names = CONVERTERS[get_task(task).source].objects
-    objects = {name: pose(rng.normal(size=(rows, 3)), turned(*rng.uniform(-80, 80, rows))) for name in names}
+    objects = {}
+    for name in CONVERTERS[get_task(task).source].objects:
+        half = np.radians(rng.uniform(-80, 80, rows)) / 2  # turned about z
+        quat = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+        objects[name] = pose(rng.normal(size=(rows, 3)), quat)
     return RawEpisode(robot=robot, objects=objects)
 
 

@@ -2,7 +2,6 @@
 """Raw episodes become the columns of docs/appendix/d3il.md; D3IL's folders and lists; files of another task."""
 
 import dataclasses
-import math
 import os
 import pickle
 from pathlib import Path
@@ -10,16 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from raw_episodes import made_up, pose, turned, write_folder, write_raw_episode
+from raw_episodes import made_up, pose, write_folder, write_raw_episode
 
 from torchrl_koap.data import open_dataset
-from torchrl_koap.data.d3il.conversion import CONVERTERS, RawEpisode, find_raw_files, read_raw
+from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files, read_raw
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
-
-ROOT3 = math.sqrt(3)
-
 
 D3IL = [name for name, task in TASKS.items() if task.source in CONVERTERS]
 
@@ -33,68 +29,48 @@ def same(array, wanted):
     np.testing.assert_allclose(array, wanted, rtol=1e-12, atol=1e-14)
 
 
-def test_avoiding():
-    robot = {
-        "des_c_pos": np.array([[0.5, -0.28, 0.12], [0.508, -0.28, 0.13], [0.508, -0.272, 0.14]]),
-        "c_pos": np.array([[0.51, -0.29, 0.2], [0.52, -0.3, 0.3], [0.53, -0.31, 0.4]]),
-    }
-    frames, actions = convert("avoiding", RawEpisode(robot=robot))
-    same(frames, [[0.5, -0.28, 0.51, -0.29], [0.508, -0.28, 0.52, -0.3], [0.508, -0.272, 0.53, -0.31]])
-    same(actions, [[0.008, 0.0], [0.0, 0.008]])
+def placed(box, size=2):
+    """Position and tangent of the yaw of a box."""
+    return box["pos"][:, :size], np.tan(2 * np.arctan2(box["quat"][:, 3], box["quat"][:, 0]))
 
 
-def test_aligning():
-    robot = {
-        "des_c_pos": np.array([[0.5, -0.35, 0.25], [0.508, -0.35, 0.25], [0.508, -0.342, 0.24]]),
-        "c_pos": np.array([[0.51, -0.36, 0.26], [0.52, -0.37, 0.27], [0.53, -0.38, 0.28]]),
-    }
-    objects = {  # in another order than that of the columns
-        "target-box": pose([[0.45, 0.25, 0.0]] * 3, turned(90, 90, 90)),
-        "push-box": pose([[0.4, -0.2, 0.01], [0.41, -0.21, 0.02], [0.42, -0.22, 0.03]], turned(0, 60, 120)),
-    }
-    frames, actions = convert("aligning", RawEpisode(robot=robot, objects=objects))
-    half = math.sqrt(0.5)
-    target = [0.45, 0.25, 0.0, half, 0, 0, half]
-    box = [[0.4, -0.2, 0.01, 1, 0, 0, 0], [0.41, -0.21, 0.02, ROOT3 / 2, 0, 0, 0.5]]
-    box.append([0.42, -0.22, 0.03, 0.5, 0, 0, ROOT3 / 2])
-    same(frames[0], [0.5, -0.35, 0.25, 0.51, -0.36, 0.26, *box[0], *target])
-    same(frames[1], [0.508, -0.35, 0.25, 0.52, -0.37, 0.27, *box[1], *target])
-    same(frames[2], [0.508, -0.342, 0.24, 0.53, -0.38, 0.28, *box[2], *target])
-    same(actions, [[0.008, 0.0, 0.0], [0.0, 0.008, -0.01]])
-
-
-def test_sorting():
-    robot = {
-        "des_c_pos": np.array([[0.5, -0.3, 0.25], [0.51, -0.31, 0.26]]),
-        "c_pos": np.array([[0.52, -0.32, 0.27], [0.53, -0.33, 0.28]]),
-    }
-    objects = {
-        "blue-box2": pose([[0.6, 0.05, 0.13], [0.61, 0.06, 0.13]], turned(30, -30)),
-        "blue-box1": pose([[0.62, -0.02, 0.13], [0.63, -0.03, 0.13]], turned(-60, 120)),
-        "red-box1": pose([[0.41, -0.12, 0.13], [0.42, -0.13, 0.13]], turned(45, 135, sign=-1)),
-        "red-box2": pose([[0.43, 0.07, 0.13], [0.44, 0.08, 0.13]], turned(0, 180)),
-    }
-    frames, actions = convert("sorting", RawEpisode(robot=robot, objects=objects))
-    wanted = [
-        [0.5, -0.3, 0.52, -0.32, 0.41, -0.12, 1, 0.43, 0.07, 0, 0.62, -0.02, -ROOT3, 0.6, 0.05, 1 / ROOT3],
-        [0.51, -0.31, 0.53, -0.33, 0.42, -0.13, -1, 0.44, 0.08, 0, 0.63, -0.03, -ROOT3, 0.61, 0.06, -1 / ROOT3],
+# columns of an observation by docs/appendix/d3il.md, from the arrays of the robot and of the objects
+REDS, BLUES = (tuple(f"{colour}-box{number}" for number in (1, 2, 3)) for colour in ("red", "blue"))
+HAND = ("des_c_pos", "c_pos")
+COLUMNS = {
+    "avoiding": lambda robot, objects: [robot[name][:, :2] for name in HAND],
+    "aligning": lambda robot, objects: [
+        *(robot[name] for name in HAND),
+        *(objects[name][part] for name in ("push-box", "target-box") for part in ("pos", "quat")),
+    ],
+    "stacking": lambda robot, objects: [
+        *(robot[name] for name in ("des_j_pos", "gripper_width")),
+        *(part for colour in ("red", "green", "blue") for part in placed(objects[f"{colour}-box"], 3)),
+        *(robot[name] for name in ("j_pos", "gripper_width", "c_pos")),
+    ],
+}
+for _name, _half in {"sorting_2": 1, "sorting": 2, "sorting_6": 3}.items():
+    COLUMNS[_name] = lambda robot, objects, half=_half: [
+        *(robot[name][:, :2] for name in HAND),
+        *(part for name in (*REDS[:half], *BLUES[:half]) for part in placed(objects[name])),
     ]
-    same(frames, wanted)
-    same(actions, [[0.01, -0.01]])
 
 
-@pytest.mark.parametrize("num_boxes", [2, 6])
-def test_the_boxes_of_other_sortings_follow_by_colour(num_boxes):
-    task, half = f"sorting_{num_boxes}", num_boxes // 2
-    boxes = [*(f"red-box{index + 1}" for index in range(half)), *(f"blue-box{index + 1}" for index in range(half))]
+@pytest.mark.parametrize("task", COLUMNS)
+def test_columns_of_every_task(task):
     episode = made_up(task)
-    assert set(episode.objects) == set(boxes)
-    frames, actions = convert(task, episode)
-    assert frames.shape == (5, 4 + 3 * num_boxes) and actions.shape == (4, 2)
-    for index, box in enumerate(boxes):
-        same(frames[:, 4 + 3 * index : 6 + 3 * index], episode.objects[box]["pos"][:, :2])
-        yaw = 2 * np.arctan2(episode.objects[box]["quat"][:, 3], episode.objects[box]["quat"][:, 0])
-        same(frames[:, 6 + 3 * index], np.tan(yaw))
+    wanted = np.column_stack(COLUMNS[task](episode.robot, episode.objects))
+    in_another_order = dict(reversed(episode.objects.items()))
+    frames, actions = convert(task, dataclasses.replace(episode, objects=in_another_order))
+    same(frames, wanted)
+    moved = len(get_task(task).delta_actions)
+    same(actions[:, :moved], np.diff(wanted[:, :moved], axis=0))
+
+
+def test_while_the_gripper_opens_its_action_means_open():
+    episode = made_up("stacking", rows=4)
+    episode.robot["gripper_width"][:] = [0.06, 0.07, 0.079, 0.07]
+    same(convert("stacking", episode)[1][:, 7], [0.08, 0.08, 0.07])
 
 
 def test_the_yaw_of_a_tilted_box_is_the_original_s():
@@ -109,34 +85,6 @@ def test_the_yaw_of_a_tilted_box_is_the_original_s():
     yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y * y + z * z))
     same(frames[:, 6], np.tan([yaw, yaw]))
     assert 1 < 50 - np.degrees(yaw) < 3
-
-
-@pytest.mark.parametrize("target", [False, True])
-def test_stacking(target):
-    rows = np.arange(3.0)[:, None]
-    robot = {
-        "des_j_pos": rows * [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7] + [1, 2, 3, 4, 5, 6, 7],
-        "j_pos": rows * 0.01 + [11, 12, 13, 14, 15, 16, 17],
-        "gripper_width": np.array([0.06, 0.07, 0.079]),
-        "c_pos": rows * 0.001 + [0.5, 0.0, 0.3],
-    }
-    objects = {
-        "blue-box": pose([[0.57, -0.1, 0.011]] * 3, turned(-45, -45, -45)),
-        "green-box": pose([[0.4, -0.05, 0.012]] * 3, turned(60, 60, 60)),
-        "red-box": pose([[0.41, -0.2, 0.013], [0.42, -0.19, 0.02], [0.43, -0.18, 0.03]], turned(0, 45, 30)),
-    }
-    if target:
-        objects["target-box"] = pose([[0.5, 0.2, 0.0]] * 3, turned(7, 7, 7))
-    frames, actions = convert("stacking", RawEpisode(robot=robot, objects=objects))
-    boxes = [0.4, -0.05, 0.012, ROOT3, 0.57, -0.1, 0.011, -1]
-    assert frames.shape == (3, 31)
-    wanted = [1, 2, 3, 4, 5, 6, 7, 0.06, 0.41, -0.2, 0.013, 0, *boxes, 11, 12, 13, 14, 15, 16, 17, 0.06, 0.5, 0, 0.3]
-    same(frames[0], wanted)
-    wanted = [1.1, 2.2, 3.3, 4.4, 5.5, 6.6, 7.7, 0.07, 0.42, -0.19, 0.02, 1, *boxes]
-    wanted += [11.01, 12.01, 13.01, 14.01, 15.01, 16.01, 17.01, 0.07, 0.501, 0.001, 0.301]
-    same(frames[1], wanted)
-    # seven changes, and what tells the gripper to open: more than the width that it is about to have
-    same(actions, [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.08], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.08]])
 
 
 @pytest.mark.parametrize("task", D3IL)
