@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
+from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.keys import REQUIRED, LayoutError, validate
 from torchrl_koap.modules import (
     KoopmanLifting,
@@ -18,27 +19,11 @@ from torchrl_koap.modules import (
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 
 
-def flat(lengths=(3, 1, 4), obs=4, act=2, dtype=torch.float32):
-    n = sum(lengths)
+def flat(lengths=(3, 1, 4), dtype=torch.float32):
     generator = torch.Generator().manual_seed(0)
-    done = torch.zeros(n, 1, dtype=torch.bool)
-    done[torch.tensor(lengths).cumsum(0) - 1] = True
-    return TensorDict(
-        {
-            "observation": torch.randn(n, obs, generator=generator, dtype=dtype),
-            "action": torch.randn(n, act, generator=generator, dtype=dtype),
-            "has_action": torch.ones(n, 1, dtype=torch.bool),
-            "episode": torch.cat([torch.full((length,), i) for i, length in enumerate(lengths)]),
-            "step_count": torch.cat([torch.arange(length) for length in lengths]),
-            "next": {
-                "observation": torch.randn(n, obs, generator=generator, dtype=dtype),
-                "done": done,
-                "terminated": done.clone(),
-                "truncated": torch.zeros_like(done),
-            },
-        },
-        [n],
-    )
+    frames = [torch.randn(length + 1, 4, generator=generator) for length in lengths]
+    actions = [torch.randn(length, 2, generator=generator) for length in lengths]
+    return flatten_trajectories(frames, actions, dtype=dtype)
 
 
 def problems(data, **kwargs):
