@@ -88,41 +88,6 @@ EPISODE = {
     "frames with alpha": ("shape|colours", cell(CAMERA, {"bytes": _png(8, 4), "path": ""})),
     "state of another width": (STATE, cell(STATE, [1.0])),
 }
-CONVERT = ("convert", "{filmed}", "--out", "{out}")
-SEEN = ("embed", "{seen}", "--out", "{out}", "--network", "tiny_network:random_layer", "--components", "3")
-TOP, WRIST = "01/top/000007.png", "01/wrist.npy"
-
-
-# frames beside own arrays: what is said where they are converted, and where they are embedded after it; the damage
-FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
-    "a frame missing": (
-        "01.npz.*'top': frame 7 is missing",
-        "'top' of 1.*frame 7 is missing",
-        lambda folder: (folder / TOP).unlink(),
-    ),
-    "no array": (*("wrist.npy holds no array of numbers",) * 2, lambda folder: (folder / WRIST).write_bytes(b"array")),
-    "another size": (
-        None,
-        "'top' of 1.*frame 7 is 8 x 8, the camera's others are 16 x 24",
-        lambda folder: (folder / TOP).write_bytes(_png(8)),
-    ),
-}
-
-
-def filmed(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
-    return lambda place: damage(place.get("filmed")) and None
-
-
-def seen(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
-    """Damage after the frames were converted."""
-
-    def do(place: Place) -> None:
-        from torchrl_koap.data import read_recordings, save_demonstrations
-
-        save_demonstrations(place.get("seen"), read_recordings(place.get("filmed")))
-        damage(place.get("filmed"))
-
-    return do
 
 
 def in_projection() -> Iterator[tuple[str, str, Callable[[dict[str, Any], dict[str, str]], Any]]]:
@@ -151,14 +116,6 @@ def faults() -> Iterator[Fault]:
         yield Fault(f"features {name}", EMBED, "camera|feature", info(put("features", value)))
     for name, (says, change) in EPISODE.items():
         yield Fault(name, EMBED, says, columns(change))
-    for name, (early, late, damage) in FILMED.items():
-        says = {} if early is None else {"says": early}
-        yield Fault(f"filmed {name}", CONVERT, damage=filmed(damage), accepted=early is None, **says)
-        yield Fault(f"seen {name}", SEEN, late, seen(damage))
-    yield Fault("seen nothing wrong", SEEN, damage=seen(lambda folder: None), accepted=True)
-    unharmed = seen(lambda folder: None)
-    yield Fault("another camera", (*SEEN, "--camera", "tip"), "unknown camera 'tip'; did you mean 'top'", unharmed)
-    yield Fault("too many components", (*SEEN[:-1], "99"), "99 components need more", unharmed)
     for name, says, change in in_projection():
         yield Fault(f"projection {name}", EMBED, says, projection(change))
 

@@ -19,7 +19,6 @@ from typing import Any
 
 import pytest
 from camera_sets import write_camera_set
-from filmed_data import write_filmed
 from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.tasks import get_task
@@ -56,8 +55,8 @@ class Place:
 
     Args:
         root (Path): an empty folder.
-        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, ``filmed`` arrays,
-            camera ``frames`` and a ``network`` for them; not written to.
+        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, camera
+            ``frames`` and the projection of a ``network`` for them; not written to.
     """
 
     root: Path
@@ -158,8 +157,10 @@ def table(faults: Iterable[Fault], every: int = EVERY) -> list[Any]:
 def make_template(root: Path) -> Path:
     """A trained run with checkpoints, an evaluation and a log, and data of every kind."""
     import numpy as np
+    import torch
 
     from torchrl_koap.data import open_dataset, save_ted
+    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
 
     data = write_demonstrations(root / "data")
     run = ("--out", root / "run", "--dataset", data, *TINY, "--quiet")
@@ -173,30 +174,13 @@ def make_template(root: Path) -> Path:
         generator = np.random.default_rng(index)
         states = generator.normal(size=(40, 3)).cumsum(0)
         np.savez(root / "arrays" / f"{index}.npz", states=states, actions=np.diff(states[:, :2], axis=0))
-    make_camera_template(root)
-    return root
-
-
-def make_camera_template(root: Path) -> None:
-    """Demonstrations that a camera saw, and a projection fitted behind a network of one's own."""
-    import numpy as np
-    import torch
-
-    from torchrl_koap.data.formats.writers import encode_png
-    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
-
     write_camera_set(root / "frames", "robot")
     (root / "network").mkdir()
     torch.manual_seed(0)
     fitted = Projection.fit(torch.randn(200, 4 * 36), get_task("scooping").observation_dim - 3)
     fitted.about = FrozenImageEncoder(load_backbone("tiny_network:random_layer"), size=8).identity
     fitted.save(root / "network" / "projection.safetensors")
-    write_filmed(root / "filmed", trajectories=2)
-    for file in (root / "filmed").glob("*/top.npy"):  # one of the cameras wrote pictures
-        (file.parent / "top").mkdir()
-        for index, frame in enumerate(np.load(file)):
-            (file.parent / "top" / f"{index:06d}.png").write_bytes(encode_png(frame))
-        file.unlink()
+    return root
 
 
 @contextlib.contextmanager
@@ -227,7 +211,7 @@ def _in_time() -> Iterator[None]:
 
 
 def _filled(word: str, place: Place) -> str:
-    for name in ("run", "data", "ted", "arrays", "filmed", "seen", "frames", "network", "out"):
+    for name in ("run", "data", "ted", "arrays", "frames", "network", "out"):
         if f"{{{name}}}" in word:
             word = word.replace(f"{{{name}}}", str(place.get(name)))
     return word

@@ -120,6 +120,8 @@ def test_bad_data_are_refused_by_camera_trajectory_and_frame(tmp_path):
     with pytest.raises(DataError, match=r"camera 'top' of 7 cannot be used: frame 0 is 8 x 24, .* others are 16 x 24"):
         embed(own, tmp_path / "seen")
     assert not (tmp_path / "seen" / "ted").exists()
+    with pytest.raises(ValueError, match="unknown camera 'tip'; did you mean 'top'"):
+        embed(own, tmp_path / "seen", cameras=["tip"])
     with pytest.raises(ValueError, match="one projection cannot be for 2 cameras"):
         embed(own, tmp_path / "seen", projection=Projection(torch.zeros(4), torch.zeros(4, 2)))
     with pytest.raises(DataError, match="`koap convert` it, or name its --task"):
