@@ -7,8 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from env_test_base import EnvTestBase, act, assert_starts_as_recorded, recordings_of, replay, start_recorded
-from shared_data import HUMAN
+from env_test_base import HUMAN, EnvTestBase, act, assert_starts_as_recorded, recordings_of, replay, start_recorded
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv

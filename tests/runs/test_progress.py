@@ -45,19 +45,14 @@ def counted(steps=5):
     return bar.n
 
 
-@pytest.mark.parametrize("room", [0, 3])
-def test_a_full_device_gets_no_bar_and_the_work_goes_on(monkeypatch, room):
-    monkeypatch.setattr(sys, "stderr", Full(room))
-    assert counted() == 5
+CLOSED = io.StringIO()
+CLOSED.close()
 
 
-def test_a_closed_or_missing_terminal(monkeypatch):
-    closed = io.StringIO()
-    closed.close()
-    monkeypatch.setattr(sys, "stderr", closed)
-    assert counted() == 5
-    monkeypatch.setattr(sys, "stderr", None)
-    counted()
+@pytest.mark.parametrize("stream", [Full(0), Full(3), CLOSED, None], ids=["full", "soon full", "closed", "missing"])
+def test_the_work_goes_on_where_no_bar_can_be_shown(monkeypatch, stream):
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert counted() == 5 * (stream is not None)
 
 
 def test_bars_are_shown_on_stderr_unless_they_are_turned_off(capsys):

@@ -1,37 +1,28 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Minari data sets on this machine."""
 
-import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Dict, Tuple
 from recording_writers import store_minari
 
 from torchrl_koap.data.formats.minari import read_minari
 from torchrl_koap.files import DataError
 
-
-class Slider:
-    """Spaces of a point on a line with a camera."""
-
-    observation_space = gymnasium.spaces.Dict(
-        {"place": gymnasium.spaces.Box(-9, 9, (1,)), "camera": gymnasium.spaces.Box(0, 255, (2, 2, 3), np.uint8)}
-    )
-    action_space = gymnasium.spaces.Box(-1, 1, (1,))
-
-
 PLACES = [np.full(1, 0.5 * step, np.float32) for step in range(7)]
+
+
+def write(root, space, observations):
+    """Two episodes of a point on a line."""
+    episode = observations, [np.full(1, 0.5, np.float32)] * 6
+    return store_minari(root, "slider/test-v0", space, Box(-1, 1, (1,)), [episode] * 2)
 
 
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    camera = [np.zeros((2, 2, 3), np.uint8)] * 7
-    return write(tmp_path, Slider.observation_space, {"place": PLACES, "camera": camera})
-
-
-def write(root, space, observations):
-    episode = observations, [np.full(1, 0.5, np.float32)] * 6
-    return store_minari(root, "slider/test-v0", space, Slider.action_space, [episode] * 2)
+    space = Dict({"place": Box(-9, 9, (1,)), "camera": Box(0, 255, (2, 2, 3), np.uint8)})
+    return write(tmp_path, space, {"place": PLACES, "camera": [np.zeros((2, 2, 3), np.uint8)] * 7})
 
 
 def test_a_data_set_as_arrays(dataset):
@@ -52,8 +43,8 @@ def test_an_unknown_data_set_and_rate(dataset):
 @pytest.mark.parametrize("width", [1, 2])
 def test_observations_that_are_a_tuple(width, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    spaces = [gymnasium.spaces.Box(-9, 9, (size,)) for size in (1, width)]
-    name = write(tmp_path, gymnasium.spaces.Tuple(spaces), (PLACES, [np.repeat(place, width) for place in PLACES]))
+    space = Tuple([Box(-9, 9, (size,)) for size in (1, width)])
+    name = write(tmp_path, space, (PLACES, [np.repeat(place, width) for place in PLACES]))
     found = read_minari(name, control_hz=25)
     assert found.state_names == (("0", "1") if width == 1 else ("0", "1_0", "1_1"))
     np.testing.assert_array_equal(found.states[0], np.repeat(PLACES, 1 + width, 1))
