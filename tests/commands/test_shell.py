@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import warnings
+from unittest.mock import Mock
 
 import pytest
 from tiny_runs import TINY, write_demonstrations
@@ -53,19 +54,13 @@ def test_empty_words_are_refused(words, capsys):
 
 
 def test_out_of_memory_is_one_line(monkeypatch, capsys):
-    def full(arguments):
-        raise MemoryError
-
-    monkeypatch.setattr(cli, "_run", full)
+    monkeypatch.setattr(cli, "_run", Mock(side_effect=MemoryError))
     assert cli.main(["doctor"]) == 1
     assert capsys.readouterr().err.startswith("koap: out of memory; try fewer episodes")
 
 
 def test_a_fault_of_ours_keeps_its_traceback(monkeypatch):
-    def wrong(arguments):
-        raise TypeError("ours")
-
-    monkeypatch.setattr(cli, "_run", wrong)
+    monkeypatch.setattr(cli, "_run", Mock(side_effect=TypeError("ours")))
     with pytest.raises(TypeError, match="ours"):
         cli.main(["doctor"])
 

@@ -13,7 +13,7 @@ from tiny_runs import TINY, koap, read_csv
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training.method import Method, Phase
-from torchrl_koap.training.methods import METHODS, register_method
+from torchrl_koap.training.methods import METHODS, get_method, register_method
 
 NAME = "nearest_neighbour"
 PLUGINS = Path(__file__).parents[1] / "plugins"
@@ -27,11 +27,14 @@ def forget():
 
 @pytest.fixture(autouse=True)
 def search_path(monkeypatch):
-    """Search path without the plugin, put back afterwards."""
+    """Search path and methods without the plugin, put back afterwards."""
     forget()
+    known = dict(METHODS)
     monkeypatch.setattr(sys, "path", [*sys.path])
     yield sys.path
     forget()
+    METHODS.clear()
+    METHODS.update(known)
 
 
 @pytest.fixture(scope="module")
@@ -110,18 +113,7 @@ def test_a_plugin_that_fails_is_named_with_its_error(tmp_path, monkeypatch):
         load_plugins(["no_package.inside"])
 
 
-@pytest.fixture
-def methods(monkeypatch):
-    """The table, put back afterwards."""
-    for name in METHODS:
-        monkeypatch.setitem(METHODS, name, METHODS[name])
-    before = dict(METHODS)
-    yield METHODS
-    for name in set(METHODS) - set(before):
-        del METHODS[name]
-
-
-def test_what_is_no_method_is_refused(methods):
+def test_what_is_no_method_is_refused():
     loss, build = METHODS["dd"].phases[0].loss, METHODS["dd"].build
     register_method(Method("mine", "of mine", build))
     with pytest.raises(ValueError, match="there is a method 'mine' already"):
@@ -139,10 +131,8 @@ def test_what_is_no_method_is_refused(methods):
     assert "other" not in METHODS
 
 
-def test_installed_packages_announce_methods(methods, tmp_path, monkeypatch):
+def test_installed_packages_announce_methods(tmp_path, monkeypatch):
     """An entry point of the group torchrl_koap.methods is imported when a name is not known."""
-    from torchrl_koap.training.methods import get_method
-
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "announced_method.py").write_text(
         "from torchrl_koap.training import METHODS, Method, register_method\n"
