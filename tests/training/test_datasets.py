@@ -9,11 +9,8 @@ from offline_runs import save_arm, train_arm
 
 from torchrl_koap import PlannerConfig, RunConfig
 from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted
-from torchrl_koap.training.datasets import (
-    choose_held_out,
-    held_out_by,
-    split_held_out,
-)
+from torchrl_koap.data.ted import load_ted
+from torchrl_koap.training.datasets import choose_held_out, held_out_by, split_held_out
 
 
 def flat(count):
@@ -72,8 +69,6 @@ def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
 
 def test_the_planner_does_not_depend_on_what_is_held_out(tmp_path):
     """Nothing of these trajectories reaches it, not even through its statistics."""
-    from torchrl_koap.data.ted import load_ted
-
     arm = save_arm(tmp_path / "arm", labelled=8)
     run = train_arm(tmp_path / "run", arm, method="linear")
     data, task = load_ted(arm / "ted")
