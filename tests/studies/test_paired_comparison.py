@@ -28,19 +28,7 @@ def test_p_value_by_hand():
         sum(s * v for s, v in zip(signs, values[:4], strict=True)) for signs in itertools.product((-1, 1), repeat=4)
     ]
     assert sign_flip_p(values) == np.mean([abs(total) >= abs(sum(values)) - 1e-9 for total in sums])
-
-
-def test_exact_and_drawn_p_values_agree():
-    values = [1.0] * 12 + [-1.0] * 5  # 17: drawn
-    exact = (
-        sum(  # 17 coins, at least 12 alike
-            np.prod([(17 - i) / (i + 1) for i in range(k)]) for k in [*range(6), *range(12, 18)]
-        )
-        / 2.0**17
-    )
-    assert sign_flip_p(values) == pytest.approx(exact, abs=0.01)
-    assert sign_flip_p(values) == sign_flip_p(values)
-    assert sign_flip_p([1.0] * 40) == pytest.approx(2 / 10_001)
+    assert sign_flip_p([1.0] * 40) == pytest.approx(2 / 10_001)  # of so many, signs are drawn
 
 
 def test_identical_outcomes_differ_by_nothing():

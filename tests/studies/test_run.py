@@ -17,8 +17,6 @@ from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerC
 from torchrl_koap.files import one_at_a_time
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies import run as run_module
-from torchrl_koap.studies.cells import Cell
-from torchrl_koap.studies.run import _Table
 
 pytestmark = pytest.mark.usefixtures("job_server")
 DP, LINEAR = "cells/avoiding/dp-0.25-1-seed0", "cells/avoiding/linear-0.25-1-seed0"
@@ -106,13 +104,17 @@ def test_a_second_call_redoes_nothing(curve, demonstrations):
     assert (curve / "index.html").exists()
 
 
-def test_methods_labels_and_seeds_may_be_added(curve, demonstrations):
-    before = marks(curve)
+def test_methods_labels_and_seeds_may_be_added(curve, demonstrations, monkeypatch):
+    read, original, before = [], run_module.cell_row, marks(curve)
+    monkeypatch.setattr(
+        run_module, "cell_row", lambda root, cell, **more: read.append(cell.folder) or original(root, cell, **more)
+    )
     assert run(curve, demonstrations, methods=("dd",), labels=(0.5,), seeds=2)["done"] == 4
     after = marks(curve)
     assert {name: after[name] for name in before} == before
     added = {f"cells/avoiding/dd-0.5-1-seed{seed}" for seed in (0, 1)}
     assert set(rows_of(curve)) == {DP, LINEAR} | added
+    assert sorted(read) == sorted([DP, LINEAR, *added, *added])  # each once at first, and again when it has ended
     kept = json.loads((curve / "study.json").read_text())
     assert (kept["methods"], kept["labels"], kept["seeds"]) == (["linear", "dp", "dd"], [0.25, 0.5], 2)
 
@@ -286,38 +288,3 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
         assert episodes_of(out, cell) == episodes_of(whole_curve, cell)
         name = "controller.safetensors"
         assert (out / cell / name).read_bytes() == (whole_curve / cell / name).read_bytes()
-
-
-LABELS = {"labelled_units": 1, "labelled_transitions": 20, "trajectories_touched": 1}
-ROW = {"episodes": 60, "successes": 30, "success_rate": 0.5, "mode_entropy": 0.3, "train_seconds": 1.0} | LABELS
-
-
-def finish(root, cell):
-    """The file of a cell that was trained and evaluated."""
-    folder = root / cell.folder
-    folder.mkdir(parents=True)
-    content = {"row": ROW, "outcomes": [[seed, seed, True] for seed in range(60)]}
-    (folder / "result.json").write_text(json.dumps(content))
-
-
-def cells(number):
-    return [Cell("avoiding", "linear", 0.5, 1.0, seed) for seed in range(number)]
-
-
-def test_each_finished_cell_is_read_once(tmp_path, monkeypatch):
-    """What was finished before, and what another cell ended after, is not read again; the table holds all of it."""
-    for cell in cells(30)[:25]:
-        finish(tmp_path, cell)
-    read, original = [], run_module.cell_row
-    monkeypatch.setattr(
-        run_module, "cell_row", lambda root, cell, **more: read.append(cell.seed) or original(root, cell, **more)
-    )
-    table = _Table(Study(out=tmp_path, label_unit="trajectory"), cells(30))
-    todo = [cell for cell in cells(30) if table.rows[cell]["status"] != "done"]
-    for cell in todo[:-1]:
-        finish(tmp_path, cell)
-        table.ended(cell, None)
-    table.ended(todo[-1], "no memory")
-    table.write()
-    assert read == [*range(30), *range(25, 30)] and len(table.outcomes) == 29
-    assert [row["status"] for row in read_csv(tmp_path / "cells.csv")] == [*29 * ["done"], "failed"]

@@ -12,7 +12,7 @@ from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerC
 from torchrl_koap.runs.run_directory import RunDirectoryError, pretrained_folders
 from torchrl_koap.studies import Study, run_study
 from torchrl_koap.studies.study import PRESETS, check_study, complete
-from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.tasks import TASKS, Action, Task, get_task
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import METHODS
 
@@ -82,15 +82,11 @@ def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations
     assert named.planners == (f"avoiding={pretrained_folders()['avoiding'].absolute()}",)
 
 
-def test_data_are_needed_where_there_is_no_environment(tmp_path):
-    from torchrl_koap.tasks import Action, Task, register_task
-
-    register_task(Task(name="bare_arm", observation_parts={"q": 2}, actions={"dq": Action("rad")}, position="q"))
-    try:
-        with pytest.raises(ValueError, match="task 'bare_arm' has no environment to record demonstrations in"):
-            run_study(Study(out=tmp_path / "out", tasks=("bare_arm",)))
-    finally:
-        del TASKS["bare_arm"]
+def test_data_are_needed_where_there_is_no_environment(tmp_path, monkeypatch):
+    arm = Task(name="bare_arm", observation_parts={"q": 2}, actions={"dq": Action("rad")}, position="q")
+    monkeypatch.setitem(TASKS, "bare_arm", arm)
+    with pytest.raises(ValueError, match="task 'bare_arm' has no environment to record demonstrations in"):
+        run_study(Study(out=tmp_path / "out", tasks=("bare_arm",)))
     assert not list(tmp_path.iterdir())
 
 
