@@ -8,6 +8,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from torchrl_koap.data.d3il.conversion import CONVERTERS
+from torchrl_koap.envs.contexts import draw_contexts, yaw_quaternions
+from torchrl_koap.envs.registry import make_env
 from torchrl_koap.reports import scenes
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.tasks.avoiding import OBSTACLES
@@ -16,12 +18,7 @@ from torchrl_koap.tasks.avoiding import OBSTACLES
 @pytest.fixture(scope="module")
 def models():
     """Compiled scenes of the environments."""
-    registry = pytest.importorskip("torchrl_koap.envs.registry")
-    return {
-        name: registry.make_env(name).sims.model
-        for name in TASKS
-        if (TASKS[name].env or "").startswith("torchrl_koap.") and TASKS[name].source in CONVERTERS
-    }
+    return {name: make_env(name).sims.model for name in TASKS if TASKS[name].source in CONVERTERS}
 
 
 def shapes(task, role):
@@ -80,14 +77,12 @@ def test_bodies_have_the_sizes_and_colours_of_the_environment(task, models):
 def test_every_start_lies_inside_the_picture(task):
     axes = scenes.draw_scene(Figure().add_subplot(), TASKS[task])
     if TASKS[task].objects:
-        contexts = pytest.importorskip("torchrl_koap.envs.contexts").draw_contexts(task, 200, 0)
+        contexts = draw_contexts(task, 200, 0)
         low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
         assert ((contexts[..., :2] > low + 0.04) & (contexts[..., :2] < high - 0.04)).all()
 
 
 def test_outlines_turn_with_the_body():
-    from torchrl_koap.envs.contexts import yaw_quaternions
-
     poses, half = np.array([[0.4, -0.2, 0.7], [0.5, 0.1, -1.2]]), (0.03, 0.05)
     for pose, outline in zip(poses, scenes.outlines(poses, half), strict=True):
         np.testing.assert_allclose(outline[0], outline[4])
