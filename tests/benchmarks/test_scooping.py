@@ -1,10 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The study of Scooping: options, rows and cells, with planted answers."""
 
-import csv
 import re
 
 import pytest
+from tiny_runs import read_csv
 
 
 @pytest.mark.parametrize(
@@ -56,8 +56,7 @@ def study(benchmark_script, monkeypatch, tmp_path):
 
 def run(study, tmp_path, **options):
     study.main(**{"folder": tmp_path, "labels": (5,), "methods": ("koap",), "results": tmp_path} | options)
-    with (tmp_path / "scooping.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+    return read_csv(tmp_path / "scooping.csv")
 
 
 def test_a_cell_is_trained_rolled_out_and_written_once(study, tmp_path):

@@ -1,12 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Controllers that follow demonstrations in a regime: who reads the plan arrives, who stands still does not."""
 
-import csv
-
 import pytest
 import torch
 from tensordict import TensorDict
-from tiny_runs import koap
+from tiny_runs import koap, read_csv
 from torch import nn
 
 from torchrl_koap.tasks import get_task
@@ -73,8 +71,7 @@ def test_rows_are_not_run_again_and_of_two_tables_that_alone_which_lacks_some(
     errors = (tmp_path / "unlabelled_data.csv").read_text()
     assert len(errors.splitlines()) == 3 and not (tmp_path / "unlabelled_rollouts.csv").exists()
     script.main(**asked, rollouts=True)
-    with (tmp_path / "unlabelled_rollouts.csv").open(newline="") as file:
-        first, _ = csv.DictReader(file)
+    first, _ = read_csv(tmp_path / "unlabelled_rollouts.csv")
     assert (first["regime"], first["method"], first["labels"], first["n"]) == ("wide_64", "linear_steps", "1", "2")
     assert (tmp_path / "unlabelled_data.csv").read_text() == errors
     monkeypatch.setattr(script, "controllers", None)

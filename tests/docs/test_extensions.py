@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Pages that are made from the code: every tutorial, command, room and frame is on one."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

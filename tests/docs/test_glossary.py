@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One word per concept: the glossary is short, and words that it replaced do not come back."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a newcomer asks is answered on a page that a search for its words finds."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every page of results has one form, and every number of its text is one of the CSV files that it links."""
 
-from __future__ import annotations
-
 import csv
 import re
 from pathlib import Path

@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Pages are short and plain: a budget of words, short sentences, none of the words that hide what is meant."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
