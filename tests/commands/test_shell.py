@@ -53,6 +53,13 @@ def test_empty_words_are_refused(words, capsys):
     assert "is a variable of the shell not set?" in capsys.readouterr().err
 
 
+def test_a_narrow_terminal_gets_its_help(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "1")
+    with pytest.raises(SystemExit) as left:
+        cli.main(["doctor", "--help"])
+    assert left.value.code == 0 and "--quiet" in capsys.readouterr().out and os.environ["COLUMNS"] == "1"
+
+
 def test_out_of_memory_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(cli, "_run", Mock(side_effect=MemoryError))
     assert cli.main(["doctor"]) == 1
@@ -98,9 +105,13 @@ def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0)
 
 
 @pytest.mark.faults
-def test_a_setting_with_which_nothing_can_be_imported():
-    status, said = ended("doctor", settings={"MPLBACKEND": "bogus"})
-    assert status == 1 and "'bogus' is not a valid value for backend" in said and len(said.splitlines()) == 1
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is no backend"), ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO")],
+)
+def test_settings_with_which_nothing_can_be_imported(settings, says):
+    status, said = ended("doctor", settings=settings)
+    assert status == 1 and says in said and len(said.splitlines()) == 1
 
 
 @pytest.mark.faults
@@ -125,11 +136,30 @@ def test_a_full_device(words):
     assert len(said.splitlines()) == 1
 
 
+CLOSED = """
+import os, sys
+from torchrl_koap.commands.shell import open_closed_streams
+open_closed_streams()
+print("lost"), print("lost", file=sys.stderr), sys.stdin.read(), sys.stdout.flush(), sys.stderr.flush()
+os.write(1, b"lost"), os.write(2, b"lost")
+with open(sys.argv[1], "w") as file:
+    file.write(str(file.fileno()))
+"""
+
+
+def test_a_process_without_streams_prints_nowhere_and_into_no_file(tmp_path):
+    """A file that is opened with one of the three numbers would get what a library prints."""
+    closed = lambda: [os.close(number) for number in range(3)]  # noqa: E731
+    done = subprocess.run([sys.executable, "-c", CLOSED, tmp_path / "file"], preexec_fn=closed, close_fds=True)
+    assert done.returncode == 0 and int((tmp_path / "file").read_text()) > 2
+
+
 @pytest.mark.faults
-def test_a_training_goes_on_without_its_bar(tmp_path):
+@pytest.mark.parametrize("shell", ["2>/dev/full", "2>&-", ">&- 2>&- <&-"])
+def test_a_training_goes_on_without_its_bar(shell, tmp_path):
     data = write_demonstrations(tmp_path / "data")
     words = [*COMMAND, "train", "--out", tmp_path / "run", "--dataset", data, *TINY]
-    assert subprocess.run(["bash", "-c", '"$@" 2>/dev/full', "bash", *words]).returncode == 0
+    assert subprocess.run(["bash", "-c", f'"$@" {shell}', "bash", *words]).returncode == 0
     assert (tmp_path / "run" / "summary.json").exists()
 
 

@@ -24,6 +24,8 @@ from torchrl_koap.commands.shell import (
     ending_at_once,
     ending_like_ctrl_c,
     one_line_warnings,
+    open_closed_streams,
+    wide_enough,
     written_output,
 )
 
@@ -45,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments (sequence of str, optional): the words of the command line. Default: those of the process.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    open_closed_streams()
     try:
         with ending_like_ctrl_c(), one_line_warnings():
             return _run(arguments)
@@ -69,7 +72,7 @@ def _run(arguments: Sequence[str]) -> int:
         return 0
     _check_words(arguments)
     options, subcommands, without_progress_bars = _commands()
-    with written_output():
+    with written_output(), wide_enough():
         if not arguments or arguments[0] in ("-h", "--help"):
             print(subcommands.overview(), file=sys.stdout if arguments else sys.stderr)
             return 0 if arguments else 2
@@ -121,6 +124,11 @@ def _check_words(arguments: Sequence[str]) -> None:
 
 def _commands() -> tuple[Any, ...]:
     """What takes seconds to import."""
+    if sys.flags.optimize > 1:
+        raise RuntimeError(
+            "Python runs with -OO (or PYTHONOPTIMIZE=2), which removes docstrings that torch and the options of"
+            " `koap` are made of; use -O or nothing"
+        )
     loaded = "torchrl_koap.commands.subcommands" in sys.modules
     with nullcontext() if loaded else ending_at_once():
         try:
@@ -128,6 +136,11 @@ def _commands() -> tuple[Any, ...]:
             from torchrl_koap.runs.progress import without_progress_bars
         except (ImportError, AttributeError) as error:
             raise RuntimeError(f"a part of the installation cannot be imported: {error}") from error
+        except ValueError as error:
+            backend = os.environ.get("MPLBACKEND")
+            if backend and backend in str(error):
+                raise ValueError(f"MPLBACKEND={backend} is no backend of matplotlib; unset it") from error
+            raise
     return options, subcommands, without_progress_bars
 
 

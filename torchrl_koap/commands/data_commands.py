@@ -174,7 +174,8 @@ class Convert(Command):
     def _bring_in(self) -> dict[str, Any]:
         """Recordings become a data set of this library."""
         if stored_folder(self.source) is not None:
-            raise ValueError(f"{self.source} is a data set of this library already: name another format by --to")
+            again = " (and convert that with the roles of its columns)" if self.resample is not None else ""
+            raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
         recordings = self._read()

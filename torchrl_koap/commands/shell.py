@@ -1,10 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a shell does to a command: signals, all of which are taken like Ctrl-C, and output that cannot be written."""
+"""What a shell does to a command: signals (all are taken like Ctrl-C), closed streams, full devices, no columns."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -14,6 +15,7 @@ from types import FrameType
 
 # SIGHUP: the terminal was closed; other systems than Unix do not know it
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+_LEAST_COLUMNS = 40  # the help of a terminal with a single column never ends
 KEPT = "`koap train --resume` goes on from its last checkpoint, `koap demos` and `koap curve` when called again"
 
 
@@ -82,6 +84,22 @@ def written_output() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def wide_enough() -> Iterator[None]:
+    """Gives a terminal a few columns at least inside the block."""
+    earlier = os.environ.get("COLUMNS")
+    if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
+        yield
+        return
+    os.environ["COLUMNS"] = str(_LEAST_COLUMNS)
+    try:
+        yield
+    finally:
+        os.environ.pop("COLUMNS")
+        if earlier is not None:
+            os.environ["COLUMNS"] = earlier
+
+
+@contextlib.contextmanager
 def one_line_warnings() -> Iterator[None]:
     """Shows a warning inside the block as one line, without its place in the code."""
     earlier = warnings.formatwarning
@@ -90,6 +108,23 @@ def one_line_warnings() -> Iterator[None]:
         yield
     finally:
         warnings.formatwarning = earlier
+
+
+def open_closed_streams() -> None:
+    """Sends stdin, stdout and stderr nowhere if the process was started without them (``2>&-``).
+
+    The next file that is opened would otherwise get their number, and what a library prints would land in it.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))
 
 
 def discard_output() -> None:

@@ -1,13 +1,18 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Many independent jobs, in processes of this machine or on a Ray cluster. A failed job does not stop the others."""
+"""Many independent jobs, in processes of this machine or on a Ray cluster. A failed job does not stop the others.
+
+Imported first by the server that worker processes are copies of: :func:`end_with_parent` is its first act.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib.util
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -18,8 +23,25 @@ from typing import Any, TextIO
 
 from torchrl_koap.lookup import lookup
 
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _LONGEST = 500  # characters of a reason
 LAUNCHERS = ("local", "ray")
+
+
+def end_with_parent() -> None:
+    """Kills this process when its parent ends, at whatever moment; systems other than Linux cannot be asked to."""
+    if not sys.platform.startswith("linux"):
+        return
+    parent = os.getppid()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it has ended in the meantime
+        os._exit(1)
+
+
+if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # how such a server is started
+    # by itself it would notice the death of its parent only when it has imported everything else, seconds later
+    end_with_parent()
 
 
 @dataclass(frozen=True)
@@ -160,7 +182,7 @@ class LocalPool:
     def __init__(self, function: Callable[[str], None], workers: int):
         self.function, self.workers = function, workers
         self.context = multiprocessing.get_context("forkserver")
-        self.context.set_forkserver_preload([function.__module__])
+        self.context.set_forkserver_preload(["torchrl_koap.studies.launchers", function.__module__])
         with _without_ctrl_c():
             forkserver.ensure_running()
         self.running: dict[Any, tuple[Job, Any, Any]] = {}
