@@ -41,11 +41,28 @@ def test_chosen_observations(file):
     assert read_robomimic(file, observations=["width", "eef"]).state_names[0] == "width"
 
 
-def test_next_observations_are_listed_and_not_read(file):
+def test_the_frame_behind_the_last_action(file):
     with h5py.File(file, "a") as stream:
-        stream["data/demo_2/next_obs/width"] = np.arange(1.0, 5.0)
+        demo = stream["data/demo_2"]
+        demo["next_obs/eef"] = np.array([2.0, 2.0, 2.0, 7.0])[:, None].repeat(3, 1)
+        demo["next_obs/width"] = np.arange(1.0, 5.0)
     recordings = read_robomimic(file)
-    assert recordings.states[0][:, 3].tolist() == [0, 1, 2, 3] and recordings.skipped == ("next_obs",)
+    assert len(recordings.states[0]) == 5 and recordings.num_labels == 4
+    assert recordings.cameras["camera"][0].numbers == (0, 1, 2, 3, 3)
+    assert recordings.states[0][-1].tolist() == [7, 7, 7, 4]
+
+
+@pytest.mark.parametrize("width", [np.arange(4.0), np.arange(4.0)[::-1]], ids=["the same frame", "another order"])
+def test_next_observations_that_are_not_those_of_the_next_frame(width, file):
+    with h5py.File(file, "a") as stream:
+        demo = stream["data/demo_2"]
+        demo["next_obs/eef"], demo["next_obs/width"] = demo["obs/eef"][:], width
+    with pytest.raises(
+        DataError, match="row 0 of next_obs/width is not row 1 of obs/width: .*--drop-columns. next_obs"
+    ):
+        read_robomimic(file)
+    recordings = read_robomimic(file, drop_columns=["next_obs"])
+    assert len(recordings.states[0]) == 4 and recordings.skipped == ("next_obs",)
 
 
 def test_ends_of_episodes_beside_the_observations(file):
@@ -78,13 +95,16 @@ def test_faults(file, tmp_path):
     ("entry", "values", "message"),
     [
         ("obs/eef", np.zeros((4, 3)), "demo_10: its columns have different numbers of rows: 4 in .*; 5 in width"),
+        ("next_obs/eef", np.zeros((4, 2)), r"demo_10: next_obs/eef is \[4, 2\], obs/eef is \[5, 3\]"),
         ("actions", np.zeros((5, 6)), "demo_10: its action columns are not those of demo_2: it lacks action_6"),
     ],
 )
 def test_other_shapes_are_named(entry, values, message, file):
     with h5py.File(file, "a") as stream:
         demo = stream["data/demo_10"]
-        if entry in demo:
+        if entry.startswith("next_obs"):
+            demo["next_obs/width"] = demo["obs/width"][:]
+        elif entry in demo:
             del demo[entry]
         demo[entry] = values
     with pytest.raises(DataError, match=message):

@@ -23,7 +23,7 @@ def columns_of(rows=6, **more):
 
 def test_archives(tmp_path):
     np.savez(tmp_path / "a.npz", observation=FRAMES, action=np.ones((5, 3)), control_hz=25, state_names=["x", "y"])
-    np.savez(tmp_path / "b.npz", observation=FRAMES[:4], state_names=["x", "y"])
+    np.savez(tmp_path / "b.npz", observation=FRAMES[:4])
     recordings = read_tables(tmp_path)
     assert recordings.control_hz == 25 and recordings.state_names == ("x", "y")
     assert [len(frames) for frames in recordings.states] == [6, 4] and recordings.num_labels == 5

@@ -16,6 +16,7 @@ from torchrl_koap.data.formats.frames import stored_clips
 from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.data.formats.robomimic import is_hdf5, read_robomimic
 from torchrl_koap.data.formats.tables import is_table_folder, read_tables
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
@@ -38,7 +39,9 @@ class Format:
     write: Callable[[Recordings, Path], None] | None = None  # into a new folder; None where it is not written
 
 
-def _read_stored(source: str) -> Recordings:
+def _read_stored(
+    source: str, *, resample: float | None = None, action_kind: str | Sequence[str] = "delta"
+) -> Recordings:
     """All observation columns of a data set of this library, the command included, and the labels that there are."""
     data, task = load_ted(stored_folder(source) or source)
     lengths = trajectory_lengths(data).tolist()
@@ -46,7 +49,7 @@ def _read_stored(source: str) -> Recordings:
     observed, behind = (data[key].double() + origin for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION))
     actions = torch.where(data[keys.HAS_ACTION], data[keys.ACTION].double() + added, torch.nan)
     pairs = zip(observed.split(lengths), behind.split(lengths), strict=True)
-    return make_recordings(
+    recordings = make_recordings(
         [torch.cat([frames, following[-1:]]) for frames, following in pairs],
         actions.split(lengths),
         state_names=task.observation_names,
@@ -56,6 +59,12 @@ def _read_stored(source: str) -> Recordings:
         cameras=stored_clips(read_about(stored_folder(source) or source)["notes"]),
         source=source,
     )
+    if resample is None:
+        return recordings
+    given = [action_kind] * task.action_dim if isinstance(action_kind, str) else list(action_kind)
+    declared = [action.kind for action in task.actions.values()]
+    kinds = ["absolute" if is_one == "absolute" else kind for is_one, kind in zip(declared, given, strict=True)]
+    return resampled(recordings, resample, kinds)
 
 
 # what folders hold that are no recordings, and what to do
@@ -84,6 +93,7 @@ FORMATS = {
         "a data set of this library",
         lambda source: stored_folder(source) is not None,
         _read_stored,
+        ("resample", "action_kind"),
     ),
     "robomimic": Format(
         "an HDF5 file in robomimic's layout (*.hdf5)",

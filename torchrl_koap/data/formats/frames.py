@@ -145,8 +145,9 @@ def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
     import h5py
 
     with h5py.File(clip.file, "r") as stream:
-        frames = stream[clip.entry]
-        yield from (frames[number] for number in clip.numbers)
+        frames, behind = stream[clip.entry], clip.entry.replace("/obs/", "/next_obs/")
+        for number in clip.numbers:  # the one behind the last is that of the observation that followed
+            yield frames[number] if number < len(frames) else stream[behind][-1]
 
 
 def _parquet(clip: Clip) -> Iterator[np.ndarray]:

@@ -6,9 +6,8 @@
     data                     attribute env_args (JSON; env_kwargs/control_freq is the rate)
     data/demo_0/obs/<name>   [T, d] or [T] numbers, side by side the state; frames of a camera [T, H, W, 3]
     data/demo_0/actions      [T, a]; may be missing
+    data/demo_0/next_obs     optional; its last row is the frame behind the last action, the others repeat obs
     data/demo_0/dones        optional, as time stamps, counters and numbers of episodes: [T] beside obs
-
-``next_obs`` repeats ``obs``, all but its last row, and is not read.
 """
 
 from __future__ import annotations
@@ -26,9 +25,11 @@ from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, gathered
+from torchrl_koap.files import DataError, gathered, option
 
+NEXT = "next_obs"
 BESIDE = ("episode", "frame", "start", "end")  # what entries beside the observations may be
+_SAME, _ROUNDED = 1e-3, 1e-6  # share of a column's range, and of its numbers, that is rounding
 
 
 def is_hdf5(path: str | Path) -> bool:
@@ -36,11 +37,14 @@ def is_hdf5(path: str | Path) -> bool:
     return Path(path).suffix.lower() in (".hdf5", ".h5") and Path(path).is_file()
 
 
-def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = None, **options: Any) -> Recordings:
+def read_robomimic(
+    file: str | Path, *, observations: Sequence[str] | None = None, drop_columns: Sequence[str] = (), **options: Any
+) -> Recordings:
     """Reads trajectories from an HDF5 file, which declares its rate by ``control_freq`` of ``env_args``.
 
     ``observations`` are the entries of ``obs`` that make up the state, in that order. Default: all that are no images,
-    by name. The options are those of :func:`~torchrl_koap.data.formats.columns.assemble`.
+    by name. ``next_obs`` is one of the ``drop_columns``, too. The options are those of
+    :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     if importlib.util.find_spec("h5py") is None:
         raise RuntimeError("HDF5 files are read with an extra: pip install 'torchrl_koap[hdf5]'")
@@ -51,7 +55,7 @@ def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = Non
         raise FileNotFoundError(f"{file} is no file")
     try:
         with h5py.File(file, "r") as stream:
-            pieces, declared, skipped = _read(stream, file, observations)
+            pieces, declared, skipped = _read(stream, file, observations, use_next=NEXT not in drop_columns)
     except OSError as error:
         raise DataError(file, "it is no HDF5 file, or damaged") from error
     return assemble(
@@ -59,12 +63,15 @@ def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = Non
         str(file),
         declared_hz=declared,
         skipped=skipped,
+        drop_columns=[name for name in drop_columns if name != NEXT],
         no_rate="env_args holds no control_freq",
         **options,
     )
 
 
-def _read(stream: Any, file: Path, observations: Sequence[str] | None) -> tuple[list[Piece], float | None, list[str]]:
+def _read(
+    stream: Any, file: Path, observations: Sequence[str] | None, *, use_next: bool
+) -> tuple[list[Piece], float | None, list[str]]:
     """Demonstrations, the rate that is declared, and what is not read."""
     if not _is_group(stream.get("data")):
         wanted = "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions)"
@@ -80,46 +87,66 @@ def _read(stream: Any, file: Path, observations: Sequence[str] | None) -> tuple[
     chosen = usable if observations is None else list(observations)
     if not chosen:
         faults.append(("data/*/obs", f"no entry is a table of numbers; there are {', '.join(first['obs'])}"))
-    pieces = [_piece(data[name], name, chosen, faults) for name in demos]
+    followed = {name for name in demos if use_next and all(entry in data[name].get(NEXT, {}) for entry in chosen)}
+    pieces = [_piece(data[name], name, chosen, faults, behind=name in followed) for name in demos]
     if faults:
         raise DataError(file, gathered(faults))
     seen = {name for piece in pieces for name in (*piece.states, *piece.cameras)}
     skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
-    skipped += [name for name in sorted(first) if name not in ("obs", "actions", *seen)]
+    skipped += [name for name in sorted(first) if name not in ("obs", NEXT, "actions", *seen)]
+    skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - followed) else []
     skipped += [f"data/{name} (no group)" for name in data if name not in demos]
     skipped += [name for name in stream if name != "data"]
     return pieces, _control_frequency(data.attrs.get("env_args")), skipped
 
 
-def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]]) -> Piece:
+def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]], *, behind: bool) -> Piece:
     states: dict[str, np.ndarray] = {}
+    following = group[NEXT] if behind else {}
     for entry in chosen:
-        part = group["obs"].get(entry)
+        part, called = group["obs"].get(entry), (f"data/{name}", f"obs/{entry}")
+        last = following[entry] if behind else part
         if part is None:
-            faults.append((f"data/{name}", f"obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}"))
+            faults.append((called[0], f"obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}"))
         elif not _is_table(part):
-            said = f"obs/{entry} is {_shape(part)}, no table of numbers: it cannot be part of the state"
-            faults.append((f"data/{name}", said))
+            faults.append(
+                (called[0], f"{called[1]} is {_shape(part)}, no table of numbers: it cannot be part of the state")
+            )
+        elif _shape(last) != _shape(part):
+            faults.append((called[0], f"next_obs/{entry} is {_shape(last)}, {called[1]} is {_shape(part)}"))
+        elif behind and (odd := _other_frame(part[()], last[()])) is not None:
+            said = f"row {odd} of next_obs/{entry} is not row {odd + 1} of {called[1]}: are frames missing, or out of"
+            cure = f"order? if next_obs means nothing, leave it out by {option('drop_columns')} next_obs"
+            faults.append((called[0], f"{said} {cure}"))
         else:
-            states |= spread(entry, part)
-    frames = len(next(iter(states.values()), ()))
-    for entry, part in group.items():  # time stamps, counters and ends of episodes may lie beside obs
-        kind, single = kind_of(entry)[0], len(_shape(part)) > 0 and part.size == len(part)
-        if single and (kind == "clock" or kind in BESIDE and len(part) == frames):
-            beside = as_numbers(entry, part[()].ravel())
-            states = states if beside is None else {entry: beside} | states
-    file = str(Path(group.file.filename).resolve())
-    cameras = {
-        film: Clip(file, tuple(range(len(part))), f"data/{name}/obs/{film}")
-        for film, part in group["obs"].items()
-        if len(_shape(part)) == 4
-    }
+            states |= spread(entry, np.concatenate([part, last[-1:]] if behind else [part]))
+    if not behind:  # time stamps, counters and ends of episodes may lie beside obs
+        frames = len(next(iter(states.values()), ()))
+        for entry, part in group.items():
+            kind, single = kind_of(entry)[0], len(_shape(part)) > 0 and part.size == len(part)
+            if single and (kind == "clock" or kind in BESIDE and len(part) == frames):
+                beside = as_numbers(entry, part[()].ravel())
+                states = states if beside is None else {entry: beside} | states
+    file, cameras = str(Path(group.file.filename).resolve()), {}
+    for film, part in group["obs"].items():
+        if len(_shape(part)) == 4:  # where nobody kept the frame behind the last one, that one is taken again
+            last = (len(part) - (film not in following),) if behind else ()
+            cameras[film] = Clip(file, (*range(len(part)), *last), f"data/{name}/obs/{film}")
     actions = group.get("actions")
     if actions is not None and not _is_table(actions):
         faults.append((f"data/{name}", f"actions must be numbers [T, a], got {_shape(actions)}"))
     columns = spread("action", actions).values() if _is_table(actions) else ()
     steps = {f"action_{index}": values for index, values in enumerate(columns)}
     return Piece(name, states, steps or None, cameras=cameras)
+
+
+def _other_frame(frames: np.ndarray, following: np.ndarray) -> int | None:
+    """The first row ``[T, d]`` that is not the one that followed it by the next observations; None if all are."""
+    frames, following = (part.reshape(len(part), -1).astype(np.float64) for part in (frames, following))
+    if len(frames) < 2:
+        return None
+    off = np.abs(following[:-1] - frames[1:]) > _SAME * np.ptp(frames, axis=0) + _ROUNDED * np.abs(frames).max()
+    return int(off.any(-1).argmax()) if off.any() else None
 
 
 def _shape(entry: Any) -> list[int]:

@@ -78,13 +78,16 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
         raise DataError(folder, gathered(faults))
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
-        said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
-        raise DataError(folder, f"{said}: bring them to one rate, or pass {option('control_hz')}")
+        if "resample" not in options or len(rates) < len(tables):
+            said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
+            cure = f"pass {option('resample')} to bring them to one rate, or {option('control_hz')}"
+            raise DataError(folder, f"{said}: {cure}")
+        tables = [(_stamped(piece, rate), None, names) for (piece, _, names), rate in zip(tables, rates, strict=True)]
     beside = {file.with_suffix("") for file in files}
     others = [path for path in sorted(files[0].parent.iterdir()) if path not in files and path not in beside]
     unread = [f"{path.name} (no table)" for path in others if folder.is_dir()]
     return assemble(
-        [piece for piece, _, _ in tables],
+        _named_alike([piece for piece, _, _ in tables]),
         str(folder),
         declared_hz=float(np.median(rates)) if rates else None,
         skipped=[*(name for _, _, names in tables for name in names), *unread],
@@ -102,6 +105,12 @@ def _with_cameras(piece: Piece, file: Path) -> Piece:
 def _files(folder: Path) -> list[Path]:
     found = [folder] if folder.is_file() else sorted(folder.glob("[!.]*"))
     return [path for path in found if path.suffix.lower() in _READERS and path.is_file()]
+
+
+def _stamped(piece: Piece, rate: float) -> Piece:
+    """A piece with time stamps by its rate, unless it has some."""
+    frames = len(next(iter(piece.states.values())))
+    return replace(piece, states={"timestamp": np.arange(frames) / rate} | piece.states)
 
 
 def _entries(file: Path) -> dict[str, np.ndarray]:
@@ -158,6 +167,22 @@ def _declared(entry: np.ndarray | None) -> float | None:
     if found is None or len(found) != 1 or wrong_rate(found[0], "control_hz"):
         raise ValueError(f"entry 'control_hz' must be one positive number of frames per second, got {entry}")
     return float(found[0])
+
+
+def _named_alike(pieces: list[Piece]) -> list[Piece]:
+    """Archives without names take those of the first archive of their width that has some."""
+
+    def named(columns: Any, made_up: str, others: list[Any]) -> Any:
+        if not columns or made_up not in columns:
+            return columns
+        fits = (other for other in others if other and len(other) == len(columns) and made_up not in other)
+        return dict(zip(next(fits, columns), columns.values(), strict=True))
+
+    states, actions = [piece.states for piece in pieces], [piece.actions for piece in pieces]
+    return [
+        replace(piece, states=named(piece.states, "state_0", states), actions=named(piece.actions, "action_0", actions))
+        for piece in pieces
+    ]
 
 
 def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, np.ndarray]:
