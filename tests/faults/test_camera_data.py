@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fault_ledger import DAMAGE, Fault, Place, check, edit_json, meet, table
+from fault_damage import DAMAGE
 from fault_ledger import EMBED as WORDS
+from fault_ledger import Fault, Place, check, edit_json, meet, table
 
 pytest.importorskip("pyarrow")
 
@@ -76,17 +77,106 @@ def _png(size: int, channels: int = 3) -> bytes:
     return encode_png(np.zeros((size, size, channels), dtype=np.uint8))
 
 
+def first(rows: int) -> Callable[[dict[str, Any]], Any]:
+    return lambda content: [content.update({name: content[name][:rows]}) for name in content]
+
+
 CAMERA, STATE = "observation.images.third_person", "observation.state"
 # of the first episode: what is wrong, what is said, and the change
 EPISODE = {
     "frames of no picture": ("picture|image", cell(CAMERA, {"bytes": b"PNG", "path": None})),
     "frames of no bytes": ("picture|image", cell(CAMERA, {"bytes": None, "path": "x.png"})),
-    "a frame that is null": (CAMERA, cell(CAMERA, None)),
-    "no frames": (CAMERA, without(CAMERA)),
     "frames of another size": ("size|shape", cell(CAMERA, {"bytes": _png(16), "path": ""})),
-    "frames with alpha": ("shape|colours", cell(CAMERA, {"bytes": _png(8, 4), "path": ""})),
+    "frames with alpha": ("shape|colours", cell(CAMERA, {"bytes": _png(32, 4), "path": ""})),
     "state of another width": (STATE, cell(STATE, [1.0])),
+    "state is NaN": ("not finite", cell(STATE, [float("nan")] * 3)),
+    "state is text": (STATE, put(STATE, ["x"] * 5)),
+    "action of another width": ("action", cell("action", [1.0])),
+    "action is infinite": ("infinite|NaN", cell("action", [float("inf")] * 7)),
+    "one row": ("row|frame", first(1)),
+    "no rows": ("row|frame", first(0)),
 }
+for _name in (CAMERA, STATE):
+    EPISODE |= {
+        f"episode without {_name}": (_name, without(_name)),
+        f"{_name} is null": (f"{_name}|not finite", cell(_name, None)),
+    }
+
+
+CONVERT = ("convert", "{filmed}", "--out", "{out}")
+SEEN = ("embed", "{seen}", "--out", "{out}", "--network", "tiny_network:random_layer", "--components", "3")
+TOP, WRIST = "1/top/000007.png", "1/wrist.npy"
+
+
+def of_array(change: Callable[[Any], Any]) -> Callable[[Path], None]:
+    """A change of the frames that the camera wrist saw."""
+
+    def do(folder: Path) -> None:
+        import numpy as np
+
+        np.save(folder / WRIST, change(np.load(folder / WRIST)))
+
+    return do
+
+
+def of_picture(size: int, channels: int) -> Callable[[Path], None]:
+    return lambda folder: (folder / TOP).write_bytes(_png(size, channels)) and None
+
+
+# frames beside own arrays: what is said where they are converted, and where they are embedded after it; the damage
+FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
+    "a frame missing": (
+        "1.npz.*'top': frame 7 is missing",
+        "'top' of 1.*frame 7 is missing",
+        lambda folder: (folder / TOP).unlink(),
+    ),
+    "frames without end": (
+        r"'wrist' has 18 frames for 20 rows.*drop_columns .* wrist",
+        "'wrist' of 1.*frame 18 is missing",
+        of_array(lambda frames: frames[:18]),
+    ),
+    "a camera absent": (
+        "'wrist' has no frames in 1.npz",
+        r"wrist.npy is not there \(any more\)",
+        lambda folder: (folder / WRIST).unlink(),
+    ),
+    "names without numbers": (
+        "must end in a number",
+        "must end in a number",
+        lambda folder: (folder / TOP).rename(folder / "1/top/last.png"),
+    ),
+    "no array": (*("wrist.npy holds no array of numbers",) * 2, lambda folder: (folder / WRIST).write_bytes(b"array")),
+    "a damaged picture": (
+        None,
+        "'top' of 1.*frame 7 .000007.png. is no picture",
+        lambda folder: (folder / TOP).write_bytes(b"PNG"),
+    ),
+    "another size": (None, "'top' of 1.*frame 7 is 16 x 16, the camera's others are 32 x 32", of_picture(16, 3)),
+    "alpha": (None, "'top' of 1.*frame 7 is RGBA", of_picture(32, 4)),
+    "greyscale": (None, "'wrist' of 1.*frame 0 is greyscale.*save it as RGB", of_array(lambda frames: frames[..., 0])),
+    "floats": (None, "'wrist' of 1.*frame 0 is float64, wanted uint8", of_array(lambda frames: frames / 255.0)),
+    "colours first": (
+        None,
+        "'wrist' of 1.*put the colours last",
+        of_array(lambda frames: frames.transpose(0, 3, 1, 2)),
+    ),
+}
+
+
+def filmed(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
+    return lambda place: damage(place.get("filmed")) and None
+
+
+def seen(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
+    """Damage after the frames were converted."""
+
+    def do(place: Place) -> None:
+        from torchrl_koap.data import read_recordings, save_demonstrations
+
+        save_demonstrations(place.get("seen"), read_recordings(place.get("filmed")))
+        damage(place.get("filmed"))
+
+    return do
 
 
 def in_projection() -> Iterator[tuple[str, str, Callable[[dict[str, Any], dict[str, str]], Any]]]:
@@ -115,6 +205,14 @@ def faults() -> Iterator[Fault]:
         yield Fault(f"features {name}", EMBED, "camera|feature", info(put("features", value)))
     for name, (says, change) in EPISODE.items():
         yield Fault(name, EMBED, says, columns(change))
+    for name, (early, late, damage) in FILMED.items():
+        says = {} if early is None else {"says": early}
+        yield Fault(f"filmed {name}", CONVERT, damage=filmed(damage), accepted=early is None, **says)
+        yield Fault(f"seen {name}", SEEN, late, seen(damage))
+    yield Fault("seen nothing wrong", SEEN, damage=seen(lambda folder: None), accepted=True)
+    unharmed = seen(lambda folder: None)
+    yield Fault("another camera", (*SEEN, "--camera", "tip"), "unknown camera 'tip'; did you mean 'top'", unharmed)
+    yield Fault("too many components", (*SEEN[:-1], "99"), "99 components need more", unharmed)
     for name, says, change in in_projection():
         yield Fault(f"projection {name}", EMBED, says, projection(change))
 

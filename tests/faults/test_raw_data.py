@@ -1,8 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Raw demonstrations and data sets on disk: every file, damaged in every way; and hostile ones.
-
-Entries that are wrong are named by the readers themselves: tests/data/d3il and tests/data/test_ted.py.
-"""
+"""Raw demonstrations and data sets on disk: every entry, every file, damaged in every way; and hostile ones."""
 
 import json
 import os
@@ -13,15 +10,76 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fault_ledger import DAMAGE, Fault, Place, check, edit_json, flip, meet, table
+from fault_damage import DAMAGE, flip
+from fault_ledger import Fault, Place, check, edit_json, meet, table
 
+from torchrl_koap.data.d3il.conversion import ROBOT_COLUMNS
 from torchrl_koap.files import sha256_of
 
 FILE = "env_003_00.pkl"
-CALLS = {
-    "data": (("validate", "{data}"), ("train", "--out", "{out}", "--dataset", "{data}", "--steps", "2")),
-    "ted": (("validate", "{ted}"), ("train", "--out", "{out}", "--dataset", "{ted}", "--steps", "2")),
+VALIDATE = ("validate", "{data}")
+
+
+def episode(rows: int = 30) -> dict[str, Any]:
+    """One demonstration with every entry that D3IL logs."""
+    generator = np.random.default_rng(0)
+    robot = {name: generator.normal(size=(rows, *shape)) for name, shape in ROBOT_COLUMNS.items()}
+    return {"context": None, "robot": robot}
+
+
+def written(change: Callable[[dict[str, Any]], Any]) -> Callable[[Place], None]:
+    """Writes a demonstration after a change."""
+
+    def do(place: Place) -> None:
+        content = episode()
+        other = change(content)
+        (place.get("data") / FILE).write_bytes(pickle.dumps(content if other is None else other, protocol=4))
+
+    return do
+
+
+def raw_bytes(content: bytes) -> Callable[[Place], None]:
+    return lambda place: (place.get("data") / FILE).write_bytes(content)
+
+
+def put(name: str, make: Callable[[np.ndarray], Any]) -> Callable[[dict[str, Any]], None]:
+    return lambda content: content["robot"].update({name: make(content["robot"][name])})
+
+
+def without(name: str) -> Callable[[dict[str, Any]], None]:
+    def change(content):
+        del content["robot"][name]
+
+    return change
+
+
+def with_value(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(array):
+        array = array.copy()
+        array.reshape(-1)[-1] = value
+        return array
+
+    return change
+
+
+ARRAYS: dict[str, Callable[[np.ndarray], Any]] = {
+    "None": lambda array: None,
+    "text": lambda array: "n0nsense",
+    "a list": lambda array: array.tolist(),
+    "a number": lambda array: 3.5,
+    "of text": lambda array: array.astype("U8"),
+    "complex": lambda array: array.astype(complex),
+    "of truths": lambda array: array > 0,
+    "NaN": with_value(np.nan),
+    "infinite": with_value(-np.inf),
+    "shorter": lambda array: array[:-1],
+    "longer": lambda array: np.concatenate([array, array[:1]]),
+    "empty": lambda array: array[:0],
+    "wider": lambda array: np.stack([array, array, array, array, array], -1),
+    "flat": lambda array: array.reshape(-1)[: 30 * 3].reshape(-1, 1, 1),
+    "a scalar array": lambda array: np.float64(1.0),
 }
+NEEDED = ("des_c_pos", "c_pos")
 
 
 class Hostile:
@@ -41,29 +99,100 @@ def deep(depth: int) -> bytes:
 HOSTILE = {  # all others are refused by tests/data/d3il/test_unpickling.py
     "system": pickle.dumps(Hostile(os.system, "touch owned")),
     "nested lists": deep(100_000),
-    "two pickles": pickle.dumps({"robot": {"c_pos": np.zeros((30, 3))}}) * 2,
+    "two pickles": pickle.dumps(episode()) * 2,
     "an archive": b"PK\x03\x04" + bytes(500),
     "a script": b"import os\nos.system('touch owned')\n",
 }
-STEPS = "steps.safetensors"
-FORGERIES: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "a longer shape": lambda header: header["action"].update(shape=[10**9, 2]),
-    "no element type": lambda header: header["action"].update(dtype="nothing"),
-    "bytes beyond": lambda header: header["action"].update(data_offsets=[0, 10**12]),
-    "shared bytes": lambda header: header["action"].update(data_offsets=header["observation"]["data_offsets"]),
-    "an entry of another length": lambda header: header.update(other={**header["action"], "shape": [2, 268]}),
-    "no action": lambda header: header.pop("action"),
+CONTENT: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "a list": lambda content: [content],
+    "a number": lambda content: 3,
+    "nothing": lambda content: {},
+    "no robot": lambda content: {"context": None},
+    "robot a list": lambda content: {"robot": [1]},
+    "robot None": lambda content: {"robot": None},
+    "robot empty": lambda content: {"robot": {}},
+    "robot of other names": lambda content: {"robot": {"xyz": np.zeros((30, 3))}},
+    "robot of numbers": lambda content: {"robot": {1: np.zeros((30, 3))}},
+    "one row": lambda content: {"robot": {name: array[:1] for name, array in content["robot"].items()}},
+    "no rows": lambda content: {"robot": {name: array[:0] for name, array in content["robot"].items()}},
+    "an object of another task": lambda content: content.update(
+        {"push-box": {"pos": np.zeros((30, 3)), "quat": np.zeros((30, 4))}}
+    ),
+    "an object that is none": lambda content: content.update({"push-box": 3}),
 }
 
 
-def at(part: str, name: str, damage: Callable[[Path], object]) -> Callable[[Place], object]:
-    return lambda place: damage(place.get(part) / name)
+def raw() -> Iterator[Fault]:
+    for name in ROBOT_COLUMNS:
+        for kind, make in ARRAYS.items():
+            yield Fault(f"{name} {kind}", VALIDATE, FILE, written(put(name, make)))
+    for name in NEEDED:
+        yield Fault(f"{name} missing", VALIDATE, f"{FILE}.*{name}", written(without(name)))
+    for kind, content in HOSTILE.items():
+        yield Fault(f"hostile {kind}", VALIDATE, FILE, raw_bytes(content))
+    for kind, change in CONTENT.items():
+        yield Fault(f"content {kind}", VALIDATE, FILE, written(change))
+    for kind, damage in DAMAGE.items():
+        if kind != "missing":
+            yield Fault(f"{FILE} {kind}", VALIDATE, FILE, lambda place, d=damage: d(place.get("data") / FILE))
+            yield Fault(
+                f"{FILE} {kind}",
+                ("train", "--out", "{out}", "--dataset", "{data}", "--steps", "2"),
+                FILE,
+                lambda place, d=damage: d(place.get("data") / FILE),
+            )
 
 
-def forged(damage: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+STEPS = "steps.safetensors"
+ABOUT = {
+    "format": (1, None, "2", [2]),
+    "task": (3, [1], "sorting", {"a": 1}),
+    "sha256": (None, 3, {}, "0"),
+    "definition": (3, "x", [1], {"name": 3}),
+    "steps": ("many", 3),
+    "lengths": (3, None),
+}
+
+
+def ted() -> Iterator[Fault]:
+    call = ("validate", "{ted}")
+    train = ("train", "--out", "{out}", "--dataset", "{ted}", "--steps", "2", "--threads", "1")
+    for name in ("about.json", STEPS):
+        for kind, damage in DAMAGE.items():
+            yield Fault(f"ted {name} {kind}", call, name, at(name, damage))
+    yield Fault(f"ted {STEPS} with a flipped bit", call, f"{STEPS} .*changed", at(STEPS, flip))
+    for name, values in ABOUT.items():
+        for number, value in enumerate(values):
+            damage = lambda path, n=name, v=value: edit_json(path, lambda about: about.update({n: v}))  # noqa: E731
+            yield Fault(
+                f"ted about.json {name} {number}",
+                train if name == "definition" else call,
+                "about.json|steps|task|ted",
+                at("about.json", damage),
+            )
+    forgeries: dict[str, Callable[[dict[str, Any]], Any]] = {
+        "a longer shape": lambda header: header["action"].update(shape=[10**9, 2]),
+        "a negative shape": lambda header: header["action"].update(shape=[-1, 2]),
+        "no element type": lambda header: header["action"].update(dtype="nothing"),
+        "a wider element type": lambda header: header["action"].update(dtype="F64"),
+        "bytes beyond": lambda header: header["action"].update(data_offsets=[0, 10**12]),
+        "shared bytes": lambda header: header["action"].update(data_offsets=header["observation"]["data_offsets"]),
+        "an entry of another length": lambda header: header.update(other={**header["action"], "shape": [2, 268]}),
+        "no action": lambda header: header.pop("action"),
+    }
+    for kind, damage in forgeries.items():
+        yield Fault(f"ted {kind}", call, f"{STEPS}|missing key", forged(damage))
+
+
+def at(name: str, damage: Callable[[Path], object]) -> Callable[[Place], object]:
+    return lambda place: damage(place.get("ted") / "ted" / name)
+
+
+def forged(damage: Callable[[dict[str, Any]], object]) -> Callable[[Place], None]:
     """Damage of the header by somebody who has made the checksum fit."""
 
-    def do(path: Path) -> None:
+    def do(place: Place) -> None:
+        path = place.get("ted") / "ted" / STEPS
         content = path.read_bytes()
         size = int.from_bytes(content[:8], "little")
         header = json.loads(content[8 : 8 + size])
@@ -77,19 +206,8 @@ def forged(damage: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]
 
 
 def faults() -> Iterator[Fault]:
-    for kind, content in HOSTILE.items():
-        hostile = at("data", FILE, lambda path, content=content: path.write_bytes(content))
-        yield Fault(f"hostile {kind}", CALLS["data"][0], FILE, hostile)
-    for part, name in (("data", FILE), ("ted", "ted/about.json"), ("ted", f"ted/{STEPS}")):
-        for kind, damage in DAMAGE.items():
-            if (name, kind) != (FILE, "missing"):  # then it is not there, which is right
-                for words in CALLS[part]:
-                    yield Fault(f"{name} {kind}", words, Path(name).name, at(part, name, damage))
-    yield Fault(
-        f"ted {STEPS} with a flipped bit", CALLS["ted"][0], f"{STEPS} .*changed", at("ted", f"ted/{STEPS}", flip)
-    )
-    for kind, damage in FORGERIES.items():
-        yield Fault(f"ted {kind}", CALLS["ted"][0], f"{STEPS}|missing key", at("ted", f"ted/{STEPS}", forged(damage)))
+    yield from raw()
+    yield from ted()
 
 
 @pytest.mark.parametrize("fault", table(faults()))

@@ -1,15 +1,19 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every file of a run, damaged in every way, and every entry of its options with a value of another type."""
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
-from fault_ledger import DAMAGE, Fault, Place, check, edit_json, flip, meet, table
+from fault_damage import DAMAGE, flip
+from fault_ledger import Fault, Place, check, edit_json, meet, table
+from safetensors.torch import save_file
 
 from torchrl_koap.runs.weights import load_tensors, save_tensors
 
+JSON = ("config.json",)
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
 STATES = ("checkpoints/planner.safetensors", "checkpoints/controller.safetensors")
 EVAL = ("eval", "{run}", "--episodes", "1", "--threads", "1", "--no-report")
@@ -51,14 +55,17 @@ def entry(path: str, value: object) -> Callable[[Place], None]:
     return do
 
 
-def tensors(name: str, change: Callable, *, finished: bool = True) -> Callable[[Place], None]:
-    """Changes tensors and facts of a file, and its checksum with them."""
+def tensors(name: str, change: Callable, *, finished: bool = True, digest: bool = True) -> Callable[[Place], None]:
+    """Changes tensors and facts of a file, and its checksum with them or not."""
 
     def do(place: Place) -> None:
         def rewrite(path):
             held, about = load_tensors(path)
             change(held, about)
-            save_tensors(path, held, about)
+            if digest:
+                save_tensors(path, held, about)
+            else:
+                save_file(held, path, metadata={"about": json.dumps(about)})
 
         damaged(name, rewrite, finished=finished)(place)
 
@@ -89,7 +96,7 @@ def apply(part: str, function: Callable) -> Callable:
 
 def files() -> Iterator[Fault]:
     for kind, damage in DAMAGE.items():
-        for name in ("config.json", *WEIGHTS):
+        for name in (*JSON, *WEIGHTS):
             for words in READERS.values():
                 yield Fault(f"{name} {kind}", words, name, damaged(name, damage))
         if kind != "missing":  # then they are not there, which is right
@@ -116,13 +123,21 @@ ENTRIES = {
     "task": (),
     "method": (),
     "planner": (),
+    "controller": (),
+    "labels": (),
+    "run": (),
+    "execution": (),
     "planner.network": (),
+    "planner.width": (),
     "planner.frames": (),
-    "planner.learning_rate": ("null", "a fraction"),
     "controller.preset": (),
     "controller.columns": (),
     "labels.unit": (),
     "labels.fraction": ("null",),
+    "labels.episodes": (),
+    "planner.steps": ("null",),
+    "planner.learning_rate": ("null", "a fraction"),
+    "run.seed": (),
     "run.plugins": (),
     "execution.strategy": ("null",),
 }
@@ -149,30 +164,41 @@ def contents() -> Iterator[Fault]:
         normaliser = "plan_normalizer" if "planner" in name else "action_normalizer"
         wrong = {
             "another task": put("task", "sorting"),
+            "no task": put("task", None),
             "no normaliser": drop(normaliser),
             "negative scale": apply(f"{normaliser}.scale", lambda value: -value),
             "scale zero": apply(f"{normaliser}.scale", lambda value: 0 * value),
             "offset NaN": apply(f"{normaliser}.offset", nan),
             "weights NaN": apply("weight", nan),
             "other shapes": apply("weight", lambda value: value[:1].clone()),
+            "nothing": drop(""),
         }
         for kind, change in wrong.items():
             yield Fault(f"{name} {kind}", EVAL, name, tensors(name, change))
             yield Fault(f"{name} {kind}", READERS["doctor"], name, tensors(name, change))
+            yield Fault(f"{name} {kind} of before", EVAL, name, tensors(name, change, digest=False))
     for name in STATES:
         wrong = {
             "step text": put("step", "many"),
+            "step null": put("step", None),
+            "step a fraction": put("step", 10.5),
+            "step true": put("step", True),
             "step negative": put("step", -5),
             "step huge": put("step", 10**9),
             "no optimiser": drop("optimizer."),
+            "no first moments": drop(".exp_avg"),
             "moments NaN": apply(".exp_avg_sq", nan),
+            "moments of other shapes": apply(".exp_avg_sq", lambda value: value.reshape(-1)[:1].clone()),
             "no random state": drop("rng.cpu"),
+            "random state cut": apply("rng.cpu", lambda value: value[:7].clone()),
             "random state of floats": apply("rng.cpu", lambda value: value.float()),
+            "no network": drop("loss."),
             "network of doubles": apply("loss.", lambda value: value.double()),
             "network cut": apply("loss.", lambda value: value.reshape(-1)[:1].clone()),
         }
         for kind, change in wrong.items():
             yield Fault(f"{name} {kind}", RESUME, name, tensors(name, change, finished=False))
+            yield Fault(f"{name} {kind} of before", RESUME, name, tensors(name, change, finished=False, digest=False))
 
 
 def faults() -> Iterator[Fault]:

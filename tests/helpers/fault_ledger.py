@@ -9,7 +9,6 @@ there, so that hundreds of faults take seconds.
 import contextlib
 import io
 import json
-import os
 import re
 import shutil
 import signal
@@ -19,10 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from camera_sets import write_camera_set
 from tiny_runs import TINY, koap, write_demonstrations
-
-from torchrl_koap.tasks import get_task
 
 LONGEST = 60  # s; a fault that takes longer counts as a hang
 EVERY = 25  # of so many faults one is met in `make test`, all of them in `make faults`
@@ -56,8 +52,8 @@ class Place:
 
     Args:
         root (Path): an empty folder.
-        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, camera
-            ``frames`` and the projection of a ``network`` for them; not written to.
+        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, ``filmed`` arrays,
+            camera ``frames`` and a ``network`` for them; not written to.
     """
 
     root: Path
@@ -158,10 +154,9 @@ def table(faults: Iterable[Fault], every: int = EVERY) -> list[Any]:
 def make_template(root: Path) -> Path:
     """A trained run with checkpoints, an evaluation and a log, and data of every kind."""
     import numpy as np
-    import torch
 
     from torchrl_koap.data import open_dataset, save_ted
-    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
+    from torchrl_koap.tasks import get_task
 
     data = write_demonstrations(root / "data")
     run = ("--out", root / "run", "--dataset", data, *TINY, "--quiet")
@@ -175,13 +170,42 @@ def make_template(root: Path) -> Path:
         generator = np.random.default_rng(index)
         states = generator.normal(size=(40, 3)).cumsum(0)
         np.savez(root / "arrays" / f"{index}.npz", states=states, actions=np.diff(states[:, :2], axis=0))
-    write_camera_set(root / "frames", "robot")
-    (root / "network").mkdir()
-    torch.manual_seed(0)
-    fitted = Projection.fit(torch.randn(200, 4 * 36), get_task("scooping").observation_dim - 3)
-    fitted.about = FrozenImageEncoder(load_backbone("tiny_network:random_layer"), size=8).identity
-    fitted.save(root / "network" / "projection.safetensors")
+    make_camera_template(root)
     return root
+
+
+def make_camera_template(root: Path) -> None:
+    """Demonstrations that a camera saw, and a projection fitted behind a network of one's own."""
+    import numpy as np
+    import torch
+
+    from torchrl_koap.data.formats.writers import LeRobotWriter, encode_png
+    from torchrl_koap.tasks import get_task
+    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
+
+    task, (network, width) = get_task("scooping"), (root / "network", 32)
+    network.mkdir()
+    torch.manual_seed(0)
+    backbone = load_backbone("tiny_network:random_layer")
+    about = {"state_names": "xyz", "action_names": task.action_names, "embodiment": "robot", "task": "scoop"}
+    writer = LeRobotWriter(root / "frames", fps=10, camera="observation.images.third_person", **about)
+    generator = np.random.default_rng(0)
+    for length in (4, 6):
+        frames = generator.integers(0, 256, (length + 1, width, width, 3), dtype=np.uint8)
+        action = generator.normal(size=(length, task.action_dim))
+        writer.add(generator.normal(size=(length + 1, 3)), action, frames=frames)
+    writer.close()
+    for number in range(2):  # recordings with two cameras beside them
+        states = generator.normal(size=(20, 2)).cumsum(0)
+        (root / "filmed" / str(number) / "top").mkdir(parents=True)
+        np.savez(root / "filmed" / f"{number}.npz", states=states, actions=np.diff(states, axis=0), control_hz=10.0)
+        frames = generator.integers(0, 256, (20, width, width, 3), dtype=np.uint8)
+        np.save(root / "filmed" / str(number) / "wrist.npy", frames)
+        for index, frame in enumerate(frames):
+            (root / "filmed" / str(number) / "top" / f"{index:06d}.png").write_bytes(encode_png(frame))
+    fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
+    fitted.about = FrozenImageEncoder(backbone, size=width).identity
+    fitted.save(network / "projection.safetensors")
 
 
 @contextlib.contextmanager
@@ -212,7 +236,7 @@ def _in_time() -> Iterator[None]:
 
 
 def _filled(word: str, place: Place) -> str:
-    for name in ("run", "data", "ted", "arrays", "frames", "network", "out"):
+    for name in ("run", "data", "ted", "arrays", "filmed", "seen", "frames", "network", "out"):
         if f"{{{name}}}" in word:
             word = word.replace(f"{{{name}}}", str(place.get(name)))
     return word
@@ -223,46 +247,3 @@ def edit_json(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
-
-
-def flip(path: Path) -> None:
-    """One bit near the end, where the numbers are."""
-    content = bytearray(path.read_bytes())
-    content[-9] ^= 4
-    path.write_bytes(content)
-
-
-def grow(path: Path) -> None:
-    """More than any memory holds; the disk is not asked for it."""
-    with path.open("r+b") as file:
-        file.truncate(40 << 30)
-
-
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-def zeros(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
-
-
-def folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-# damage to any file
-DAMAGE: dict[str, Callable[[Path], object]] = {
-    "missing": Path.unlink,
-    "empty": lambda path: path.write_bytes(b""),
-    "cut off": lambda path: os.truncate(path, path.stat().st_size // 2),
-    "cut by a byte": lambda path: os.truncate(path, path.stat().st_size - 3),
-    "of noise": lambda path: path.write_bytes(bytes(range(256)) * 8),
-    "of another kind": lambda path: path.write_text("just words\n" * 30),
-    "a folder": folder,
-    "a pipe": pipe,
-    "without end": zeros,
-    "of 40 GB": grow,
-}
