@@ -45,7 +45,8 @@ def test_order_headline_labels_pictures_commands(run):
     places = [text.index(word) for word in ("Result", "Training", "Executed rollouts", "All numbers", "Do it again")]
     assert places == sorted(places)
     assert "koap train --out 'a folder'" in text
-    assert "koap eval 'a folder' --episodes 4" in text
+    solver = "--episodes 4 --seed 100 --strategy feedback --replan-interval 4"
+    assert f"koap eval {run} {solver}" in text
 
 
 def test_pictures_are_there_with_captions_and_no_outside_resource(run):

@@ -82,7 +82,7 @@ class Eval(Command):
     def __call__(self) -> dict[str, str]:
         """Evaluates and reports."""
         check_logger(self.logger)
-        result = evaluate(self.run, self.config, command=as_typed())
+        result = evaluate(self.run, self.config)
         folder = Path(self.run) if self.config.out is None else self.config.out
         report = {"report": str(write_report(folder, animation=self.animate))} if self.report else {}
         with open_logger(self.logger, folder) as logger:

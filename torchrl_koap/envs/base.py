@@ -315,8 +315,8 @@ class ManipulationEnv(EnvBase):
         """Which episodes are decided or have used up their steps, bool [n]."""
         return self._success | self._collision | (self._steps >= self.max_steps)
 
-    def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str | None = None) -> np.ndarray:
-        """Draws one environment, uint8 [height, width, 3], by a camera of the model: by default that of the scene.
+    def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = "cage") -> np.ndarray:
+        """Draws one environment, uint8 [height, width, 3]; cameras: ``"front"``, ``"cage"`` (D3IL's) and ``"wrist"``.
 
         Raises:
             RuntimeError: if no OpenGL library can be used.
@@ -328,7 +328,7 @@ class ManipulationEnv(EnvBase):
             if self._renderer is not None:
                 self._renderer.close()
             self._renderer = Renderer(self.sims.model, width, height)
-        return self._renderer.render(self.sims.data[index], camera or self.task.scene.camera)
+        return self._renderer.render(self.sims.data[index], camera)
 
     def close(self, **kwargs) -> None:
         """Frees graphics memory, if any was used, and the threads."""

@@ -179,7 +179,7 @@ class ManipulationGymEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Draws the scene, uint8 [height, width, 3]; None without ``render_mode``."""
-        return self.batched.render(**self._size) if self.render_mode == "rgb_array" else None
+        return self.batched.render(**self._size, camera="front") if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Frees graphics memory."""

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _SHOWN = 6  # columns of plans that are drawn where nobody knows what lies in a plane
 
 
-def evaluate(run: str | Path, config: EvalConfig | None = None, *, command: str | None = None) -> dict[str, Any]:
+def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
     A task without an environment is judged on recorded data instead
@@ -46,9 +46,6 @@ def evaluate(run: str | Path, config: EvalConfig | None = None, *, command: str 
     Args:
         run (str or Path): a run directory, or ``pretrained:NAME``, a trained policy of the repository.
         config (EvalConfig, optional): how many rollouts, and how. Default: 60 as in training.
-
-    Keyword Args:
-        command (str, optional): how it was called, if from a shell; kept in ``eval.json``.
 
     Returns:
         dict: what ``eval.json`` holds: success and entropy with intervals, speed, a row per episode; or, with
@@ -74,7 +71,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None, *, command: str 
     trained = Trained.load(writable_folder(run, config.out), plugins=config.plugins)
     directory, task = RunDirectory(trained.folder), trained.task
     if task.env is None and config.env is None:
-        return _judge_offline(trained, config, command)
+        return _judge_offline(trained, config)
     if config.execution.strategy == "oracle" and config.env is not None:
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
@@ -108,7 +105,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None, *, command: str 
     timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
     result |= measure_latency(timed, task.observation_dim)
     result |= errors | limited_commands(policy) | {"execution": to_json(policy.execution), "episode": rows}
-    result |= {**where.facts, "command": command}
+    result |= where.facts
     if where.record is not None:
         result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
@@ -131,13 +128,13 @@ def evaluate(run: str | Path, config: EvalConfig | None = None, *, command: str 
     return result
 
 
-def _judge_offline(trained: Trained, config: EvalConfig, command: str | None) -> dict[str, Any]:
+def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
     policy = trained_policy(trained, config.execution)
     result, actions = evaluate_offline(trained, config)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
-    result |= {"seed": config.seed, "execution": to_json(policy.execution), "command": command}
+    result |= {"seed": config.seed, "execution": to_json(policy.execution)}
     if actions:
         save_tensors(trained.folder / "actions.safetensors", actions)
     RunDirectory(trained.folder).write_json("eval.json", result)

@@ -17,7 +17,8 @@ from torchrl_koap.reports.run_facts import RunFacts, mapping
 
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
-_EVAL_ELSEWHERE = ("episode", "trajectory", "faults", "rates", "action_errors", "command")
+_EVAL_ELSEWHERE = ("episode", "trajectory", "faults", "rates", "action_errors")
+_ABOUT_ENV = ("env", "env_kwargs", "success_key", "num_envs")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
 
@@ -60,7 +61,7 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
             if (shown := {key: value for key, value in source.items() if key not in elsewhere})
         ],
         episodes=evaluation.get("episode") or evaluation.get("trajectory"),
-        again=[str(source["command"]) for source in (config, evaluation) if source.get("command")],
+        again=_again(run),
         configured=bool(config),
         has_command=_given(config, "command"),
         versions=config.get("versions"),
@@ -95,6 +96,27 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
         elif item.empty:
             figures.append(figure | {"empty": item.empty})
     return figures, missing
+
+
+def _again(run: RunFacts) -> list[str]:
+    """Command lines that train and evaluate the run again."""
+    trained = [str(run.config["command"])] if _given(run.config, "command") else []
+    return trained + ([_eval_command(run)] if run.evaluation else [])
+
+
+def _eval_command(run: RunFacts) -> str:
+    evaluation = run.evaluation
+    words = ["koap", "eval", str(run.folder)]
+    if evaluation.get("kind") == "offline":
+        evaluation = {"seed": evaluation.get("seed")}
+    episode = evaluation.get("episode")
+    first = mapping(episode[0]) if isinstance(episode, list) and episode else {}
+    options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
+    options |= dict(mapping(run.evaluation.get("execution"))) | {key: evaluation.get(key) for key in _ABOUT_ENV}
+    for key, value in options.items():
+        if value not in (None, []):
+            words += [f"--{key.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
+    return shlex.join(words)
 
 
 def _filled(command: str, run: RunFacts) -> str:
