@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 from tables import fact, percent, read_rows, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, tidy
+from torchrl_koap.reports.style import BLUE, GREEN, INK, MUTED, ORANGE, PALE_BLUE, tidy
 
 TITLES = {
     "pusht": "Push-T",
+    "pusht_pixels": "Push-T from pixels",
     "adroit_door": "Adroit door",
     "meta_world_assembly": "Meta-World assembly",
     "meta_world_bin-picking": "Meta-World bin-picking",
@@ -27,8 +28,12 @@ COMPARED = {
     "koap": ("KOAP", BLUE),
     "koap_untrained": ("random features", PALE_BLUE),
     "linear_steps": ("ridge regression", ORANGE),
+    "dd_lookahead": ("supervised, look-ahead", GREEN),
+    "dd": ("Decision Diffuser", "#9fd3ad"),
     "dp": ("Diffusion Policy", MUTED),
 }
+ALL_LABELS = {"pusht": 206} | {name: 100 for name in TITLES if name.startswith("meta_world")}  # demonstrations
+STEP = 0.9 / len(COMPARED)  # between two bars
 
 
 @dataclass(frozen=True)
@@ -99,8 +104,8 @@ def ground_score(ground: str, method: str, labels: int | None = None, execution:
 
 
 def label_counts(ground: str) -> list[int]:
-    """Lists the numbers of labelled demonstrations that a ground was run with."""
-    return sorted({int(row["labels"]) for row in read_rows("proving_grounds", ground=ground)})
+    """Lists the numbers of labelled demonstrations that KOAP was run with."""
+    return sorted({int(row["labels"]) for row in read_rows("proving_grounds", ground=ground, method="koap")})
 
 
 def ground_text(ground: str, method: str, labels: int | None = None, execution: str = "default") -> str:
@@ -125,9 +130,13 @@ def grounds_table() -> str:
         key = f"{ground}_published_mean"
         row = [TITLES[ground], str(labels), f"{first.seeds} x {first.n // first.seeds}"]
         row += ["not run" if score is None else score.text for score in scores]
+        row.append(ground_text(ground, "dp", ALL_LABELS[ground]) if ground in ALL_LABELS else "not run")
         body.append([*row, fact(key) if key in published else "none"])
     heads = [name for name, _ in COMPARED.values()]
-    return table(["ground", "labelled", "training seeds x n", *heads, "published, all labels"], body)
+    return table(
+        ["ground", "labelled", "training seeds x n", *heads, "Diffusion Policy, all labels", "published, all labels"],
+        body,
+    )
 
 
 def draw_grounds(path: Path) -> Path:
@@ -139,28 +148,30 @@ def draw_grounds(path: Path) -> Path:
     cells = list(_cells())
     rolled = [cell for cell in cells if (score := ground_score(cell[0], "koap", cell[1])) and score.plan is None]
     judged = [cell for cell in cells if cell not in rolled]
-    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    figure = Figure(figsize=(13, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[max(2, len(rolled)), 2 * max(1, len(judged))])
     for number, (method, (name, color)) in enumerate(COMPARED.items()):
         for place, (ground, labels) in enumerate(rolled):
             score = ground_score(ground, method, labels)
             if score is not None:
-                _bar(left, place + 0.2 * number, *score.interval, color, name)
+                _bar(left, place + STEP * number, *score.interval, color, name)
         for place, (ground, labels) in enumerate(judged):
             score = ground_score(ground, method, labels)
             for step, share in enumerate(() if score is None else (score.action, score.plan)):
                 if share is not None:
-                    _bar(right, 2 * place + step + 0.2 * number, share, share, share, color, name)
+                    _bar(right, 2 * place + step + STEP * number, share, share, share, color, name)
     texts = [f"{TITLES[ground].replace(' ', chr(10), 1)}\n{labels} labelled" for ground, labels in rolled]
-    left.set_xticks([place + 0.3 for place in range(len(rolled))], texts, fontsize=8)
-    left.set(ylim=(0, 1.05), ylabel="largest reward, or success")
+    left.set_xticks([place + 0.4 for place in range(len(rolled))], texts, fontsize=8)
+    left.set(ylim=(0, 1.12), ylabel="largest reward, or success")
     kinds = ("actions,\nridge = 1", "plans,\nstanding still = 1")
     texts = [f"{TITLES[ground]}\n{kind}" for ground, _ in judged for kind in kinds]
-    right.set_xticks([place + 0.3 for place in range(len(texts))], texts, fontsize=8)
+    right.set_xticks([place + 0.4 for place in range(len(texts))], texts, fontsize=8)
     right.axhline(1, color=MUTED, linewidth=0.7, linestyle=":")
     right.set_ylabel("error on recordings")
     handles = {text: handle for handle, text in zip(*left.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=len(COMPARED), frameon=False, fontsize=9
+    )
     for axes in (left, right):
         tidy(axes)
     figure.savefig(path, dpi=130, facecolor="white", metadata={"Software": None})
@@ -168,6 +179,6 @@ def draw_grounds(path: Path) -> Path:
 
 
 def _bar(axes, place: float, mean: float, low: float, high: float, color: str, name: str) -> None:
-    axes.bar(place, mean, width=0.18, color=color, label=name)
+    axes.bar(place, mean, width=0.9 * STEP, color=color, label=name)
     axes.plot([place, place], [low, high], color=INK, linewidth=1)
-    axes.annotate(f"{mean:.2f}", (place, high), ha="center", va="bottom", fontsize=7, color=INK)
+    axes.annotate(f"{mean:.2f}", (place, high), ha="center", va="bottom", fontsize=6, color=INK, rotation=90)

@@ -22,7 +22,7 @@ from unlabelled_rows import REGIMES, followed
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, set_title, tidy
-from torchrl_koap.studies.paper import default_entries
+from torchrl_koap.studies.paper import Entry, default_entries
 from torchrl_koap.tasks.scooping import CAMERA, FRAME_HZ
 
 STARTS = ("left", "near", "right")
@@ -62,17 +62,28 @@ def minutes(name: str, column: str) -> str:
 
 
 def paper_success_table(name: str) -> str:
-    """Formats a row per task and method: success of ours and of the paper's KOAP, a column per label level."""
+    """Formats a row per task and method: success of ours and of the paper's KOAP, a column per label level.
+
+    Between them an arrow says that ours is above or below what the paper prints around its mean, "=" that it is within.
+    """
     entries = paper_cells_beside(name)
     rows: dict[tuple[str, str], dict[int, str]] = {}
     for entry in [*(each for each in entries if each.method == "koap"), *default_entries(entries)]:
         if entry.method != "koap" and entry.task != "stacking_unobserved_joints":
             continue
         called = "`koap`" if entry.method == "koap" else "`command_regression`"
-        cell = f"{100 * entry.success:.0f} / {100 * entry.paper.success:.0f}"
-        rows.setdefault((f"`{entry.task}`", called), {})[entry.level] = cell
-    body = [[*names, *(cells[level] for level in sorted(cells))] for names, cells in rows.items()]
+        rows.setdefault((f"`{entry.task}`", called), {})[entry.level] = _beside_the_paper(entry)
+    body = [[*names, *(cells.get(level, "not run") for level in range(1, 6))] for names, cells in rows.items()]
     return table(["task", "method", *(f"level {level}" for level in range(1, 6))], body)
+
+
+def _beside_the_paper(entry: Entry) -> str:
+    paper = f"{100 * entry.paper.success:.0f}"
+    if entry.success is None:
+        return f"not run / {paper}"
+    away = entry.success - entry.paper.success
+    mark = "=" if abs(away) <= entry.paper.spread else "↑" if away > 0 else "↓"
+    return f"{100 * entry.success:.0f} {mark} {paper}"
 
 
 def controllers_table() -> str:
@@ -86,8 +97,7 @@ def controllers_table() -> str:
         body.append([f"`{task}`", text, *(f"{rate(rows)} of {sum(int(row['n']) for row in rows)}" for rows in found)])
         body[-1].insert(3, f"`{other}`")
     cells = [
-        count_successes("retrained", "stacking_unobserved_joints", name, 0.01)
-        for name in ("koap", "command_regression")
+        count_successes("table_1", "stacking_unobserved_joints", name, 0.01) for name in ("koap", "command_regression")
     ]
     told = [f"{percent(counts, 0)} of {counts['n']}" for counts in cells]
     body.append(["`stacking_unobserved_joints`", "1 % of windows", told[0], "`command_regression`", told[1]])

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tables import percent, read_rows, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.modules import Execution
 from torchrl_koap.studies.paper import (
     Entry,
     above_the_paper,
@@ -24,6 +25,8 @@ from torchrl_koap.studies.paper import (
 from torchrl_koap.studies.study import PAPER_TASKS
 from torchrl_koap.studies.table import as_markdown
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.defaults import CONTROLLER_UPDATES
+from torchrl_koap.training.methods import get_method
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}
 
@@ -129,23 +132,22 @@ def draw_bench_average(name: str, path: Path) -> Path:
     return draw_average(paper_cells_beside(name), path)
 
 
-def few_labels_table(name: str, retrained: str) -> str:
+def few_labels_table(name: str, all_labels: str) -> str:
     """A row per task: success with the fewest labels of KOAP and what it is compared with, all seeds together.
 
     The last column is Diffusion Policy with all labels.
 
     Args:
         name (str): file of cells without its ending.
-        retrained (str): another one, whose cells with the fewest or all labels go before those.
+        all_labels (str): that of Diffusion Policy with all labels.
     """
     body = []
     for task in PAPER_TASKS:
-        fewest, text = label_shares(name, task)[0], []
-        for method in ("koap", "koap_untrained", "linear_steps", "dp"):
-            text.append(_pooled(retrained if count_successes(retrained, task, method, fewest) else name, task, method))
+        fewest = label_shares(name, task)[0]
+        text = [_pooled(name, task, method) for method in ("koap", "koap_untrained", "linear_steps", "dd", "dp")]
         called = task.replace("po_", "partially observed ").replace("_unobserved_joints", ", joints hidden")
-        body.append([called.capitalize(), share(fewest), *text, _pooled(retrained, task, "dp", 1.0)])
-    head = ["task", "labelled", "KOAP", "random features", "ridge regression", "Diffusion Policy"]
+        body.append([called.capitalize(), share(fewest), *text, _pooled(all_labels, task, "dp", 1.0)])
+    head = ["task", "labelled", "KOAP", "random features", "ridge regression", "Decision Diffuser", "Diffusion Policy"]
     return table([*head, "Diffusion Policy, all labels"], body)
 
 
@@ -192,36 +194,87 @@ def bench_size(name: str) -> str:
     )
 
 
-def bench_means(name: str) -> str:
-    """A row per task and a column per method with all levels of the task: success averaged over the levels.
+@dataclass(frozen=True)
+class Setting:
+    """A way to train and execute a method, and its mean score over the tuning tasks; 0 updates: in closed form."""
 
-    All cells of a task meet the same contexts and noise, so the interval is that of one cell with the average success.
+    execution: str
+    updates: int
+    score: float
 
-    Args:
-        name (str): file of cells without its ending.
+    @property
+    def text(self) -> str:
+        """The setting in words."""
+        updates = f", {self.updates}" if self.updates else ""
+        return f"{self.execution.replace('_', ' ')}{updates}: {self.score:.2f}"
+
+
+def tuned_settings(method: str) -> list[Setting]:
+    """Settings of a method that were scored on every tuning task and number of labels, the best one first."""
+    found: dict[tuple[str, int], list[float]] = {}
+    for row in read_rows("method_tuning", method=method):
+        updates = int(row["updates"]) if get_method(method).phases else 0
+        found.setdefault((row["execution"], updates), []).append(float(row["score"]))
+    most = max(map(len, found.values()))
+    whole = [Setting(*setting, sum(scores) / most) for setting, scores in found.items() if len(scores) == most]
+    return sorted(whole, key=lambda setting: -setting.score)
+
+
+def declared_setting(method: str) -> Setting:
+    """The setting that a method declares, or the library's.
+
+    Raises:
+        LookupError: if the tuning did not try it.
     """
-    found: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
-    for row in finished_cells(name):
-        found.setdefault(row["task"], {}).setdefault(row["method"], []).append(row)
-    whole = {
-        task: {method: rows for method, rows in own.items() if len({row["labels"] for row in rows}) == 5}
-        for task, own in found.items()
-    }
-    methods = list(dict.fromkeys(method for own in whole.values() for method in own))
+    known = get_method(method)
+    execution = Execution().replaced(**known.execution)
+    as_planned = "_as_planned" if execution.strategy == "open_loop" and execution.blend == 0 else ""
+    wanted = execution.strategy + as_planned, (known.updates or CONTROLLER_UPDATES) if known.phases else 0
+    for setting in tuned_settings(method):
+        if (setting.execution, setting.updates) == wanted:
+            return setting
+    raise LookupError(f"{method}: {wanted} was not tried")
+
+
+def tuning_table() -> str:
+    """A row per method: the setting that it declares, and the best one with another execution."""
     body = []
-    for task, own in whole.items():
-        paper = [cell.success for cell in paper_cells(1) if (cell.task, cell.method) == (task, "koap")]
-        cells = [_together(own[method]) if method in own else "not all run" for method in methods]
-        body.append([f"`{task}`", *cells, f"{100 * sum(paper) / len(paper):.1f} %"])
-    return table(["task", *(f"`{method}`" for method in methods), "the paper's KOAP"], body)
+    for method in dict.fromkeys(row["method"] for row in read_rows("method_tuning")):
+        own = declared_setting(method)
+        other = next(each for each in tuned_settings(method) if each.execution != own.execution)
+        body.append([f"`{method}`", own.text, other.text])
+    return table(["method", "used", "best other execution"], body)
 
 
-def _together(rows: list[Mapping[str, Any]]) -> str:
-    """Mean success of cells that met the same contexts and noise, with the interval of one of them."""
-    trials = rows[0]["episodes"]
-    levels: dict[float, list[float]] = {}  # some have more seeds than others
-    for row in rows:
-        levels.setdefault(row["labels"], []).append(row["successes"] / row["episodes"])
-    mean = sum(sum(level) / len(level) for level in levels.values()) / len(levels)
-    low, high = wilson_interval(round(mean * trials), trials)
-    return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"
+RIVALS = {
+    "koap_untrained": "random features",
+    "linear_steps": "ridge regression",
+    "nonlinear": "nonlinear maps",
+    "dd_lookahead": "supervised, look-ahead",
+    "dd": "Decision Diffuser",
+    "lapo": "LAPO",
+}
+
+
+def comparison_table() -> str:
+    """A row per task: KOAP's success with the fewest labels minus that of others, in points, paired by context."""
+    body = []
+    for task in PAPER_TASKS:
+        rows = read_rows("cells/comparisons", task=task)
+        fewest = min((float(row["labels"]) for row in rows), default=0.0)
+        found = {row["method"]: row for row in rows if float(row["labels"]) == fewest and row["difference"]}
+        if found:
+            body.append([f"`{task}`", *(_points(found[name]) if name in found else "not run" for name in RIVALS)])
+    return table(["KOAP minus", *RIVALS.values()], body)
+
+
+def _points(row: Mapping[str, str]) -> str:
+    mean, low, high = (100 * float(row[name]) for name in ("difference", "low", "high"))
+    return f"{mean:+.0f} ({low:+.0f} to {high:+.0f})"
+
+
+def compared(method: str) -> str:
+    """In how many cells KOAP is above, equal to and below a method, by paired 95 % intervals: "3/4/0"."""
+    rows = [row for row in read_rows("cells/comparisons", method=method) if row["difference"]]
+    above, below = sum(float(row["low"]) > 0 for row in rows), sum(float(row["high"]) < 0 for row in rows)
+    return f"{above}/{len(rows) - above - below}/{below}"

@@ -192,7 +192,7 @@ def _controllers() -> list[Bar]:
             counts = (sum(int(row[key]) for row in rows) for key in ("successes", "n"))
             bars.append((f"{task}: {method}", *_interval(*counts)))
     for method in ("koap", "command_regression"):
-        counts = count_successes("retrained", "stacking_unobserved_joints", method, 0.01)
+        counts = count_successes("table_1", "stacking_unobserved_joints", method, 0.01)
         bars.append((f"joints hidden: {method}", *_interval(counts["successes"], counts["n"])))
     return bars
 
@@ -233,7 +233,8 @@ def draw_few_labels(path: Path) -> Path:
             counts = [
                 (100 * part, count_successes("table_1", task, method, part)) for part in label_shares("table_1", task)
             ]
-            _line(axes, [(part, *_interval(own["successes"], own["n"])) for part, own in counts], SHOWN[method], number)
+            points = [(part, *_interval(own["successes"], own["n"])) for part, own in counts if own]
+            _line(axes, points, SHOWN[method], number)
         axes.set_title(task.replace("_unobserved_joints", ", joints hidden").replace("_", " "), fontsize=9)
         axes.set(xscale="log", ylim=(-3, 103))
         axes.set_xticks(

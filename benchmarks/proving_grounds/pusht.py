@@ -39,9 +39,9 @@ def read_episodes() -> tuple[list[np.ndarray], list[np.ndarray]]:
     return np.split(raw["state"], ends), np.split(raw["action"].astype(np.float32), ends)
 
 
-def write_data_set(folder: Path) -> None:
-    """Writes the demonstrations, all of them with their actions, as a data set of ``koap train``."""
-    save(folder, six_columns, STATE)
+def write_data_set(folder: Path, *, demonstrations: int | None = None) -> None:
+    """Writes all or the first demonstrations, with their actions, as a data set of ``koap train``."""
+    save(folder, six_columns, STATE, demonstrations)
 
 
 def write_corners(folder: Path) -> None:
@@ -60,9 +60,11 @@ def write_corners(folder: Path) -> None:
     save(folder, corners, dict.fromkeys(names, "px"))
 
 
-def save(folder: Path, columns: Callable[[np.ndarray], np.ndarray], units: dict[str, str]) -> None:
+def save(
+    folder: Path, columns: Callable[[np.ndarray], np.ndarray], units: dict[str, str], most: int | None = None
+) -> None:
     """Writes the demonstrations with what is made of their states ``[T, 5]``."""
-    states, actions = read_episodes()
+    states, actions = (each[:most] for each in read_episodes())
     options = {"state_names": list(units), "state_units": list(units.values()), "action_names": TARGET}
     save_demonstrations(
         folder, list(map(columns, states)), actions, control_hz=10, robot=list(AGENT), **options, **ABSOLUTE

@@ -43,7 +43,7 @@ from torchrl_koap.evaluation.rollouts import roll_out  # noqa: E402
 from torchrl_koap.keys import SUCCESS  # noqa: E402
 from torchrl_koap.lookup import lookup  # noqa: E402
 from torchrl_koap.modules import ExecutionConfig  # noqa: E402
-from torchrl_koap.training.methods import METHODS, get_method  # noqa: E402
+from torchrl_koap.training.methods import get_method  # noqa: E402
 from torchrl_koap.vision.observer import Observer  # noqa: E402
 
 RESULTS = HERE.parent / "results" / "proving_grounds.csv"
@@ -67,13 +67,15 @@ def grounds() -> dict[str, Ground]:
     return found
 
 
-def roll(ground: Ground, trained: Trained, execution: ExecutionConfig, n: int) -> dict[str, Any]:
+def roll(
+    ground: Ground, trained: Trained, execution: ExecutionConfig, n: int, *, first_seed: int = FIRST_SEED
+) -> dict[str, Any]:
     """Scores a policy in the simulator of a ground."""
     observe = Observer.of(trained.task, trained.cameras)
     episodes = roll_out(
         load_policy(trained, **{key: value for key, value in vars(execution).items() if value is not None}),
         lambda count: GymnasiumBatch(ground.env, trained.task, count, observe=observe, max_steps=ground.max_steps),
-        list(range(FIRST_SEED, FIRST_SEED + n)),
+        list(range(first_seed, first_seed + n)),
         max_steps=ground.max_steps,
         batch_size=25,
     )
@@ -122,7 +124,7 @@ def main(
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     /,
     *,
-    methods: tuple[str, ...] = ("koap", "koap_untrained", "linear_steps", "dp"),
+    methods: tuple[str, ...] = ("koap", "koap_untrained", "linear_steps", "dd_lookahead", "dd", "dp"),
     labels: tuple[int, ...] | None = None,
     seeds: int = 3,
     executions: tuple[str, ...] = ("default",),
@@ -134,7 +136,7 @@ def main(
 
     Args:
         names: grounds; all of them if none is named.
-        methods: what is compared; the first one plans, and the others share its planner.
+        methods: what is compared; those that plan share the planner of the first of them.
         labels: numbers of demonstrations whose actions may be seen, one after the other. Default: the ground's own.
         seeds: number of training seeds, from 0.
         executions: ways to execute plans: default, open_loop_8, temperature_1.
@@ -147,13 +149,13 @@ def main(
         asked = {name: lookup(known, name, "proving ground") for name in names or known}
         for method in methods:
             get_method(method)
-        lookup([name for name in METHODS if get_method(name).plans], methods[0], "first method, which plans")
         ways = {name: lookup(EXECUTIONS, name, "execution") for name in executions}
     except ValueError as error:
         sys.exit(str(error))
     torch.set_num_threads(1)
     folder = folder.resolve()  # runs remember where their data set is
     done, write = open_table(results, COLUMNS, KEYS)
+    planning = [method for method in methods if get_method(method).plans]
     for name, ground in asked.items():
         if lacks := ground.missing():
             print(f"{name} is skipped: {lacks}")
@@ -169,13 +171,15 @@ def main(
                         continue
                     if not (folder / name / "ted").is_dir():
                         ground.write(folder / name)
-                    first = None if method == methods[0] else folder / f"{name}-{methods[0]}-{count}-{seed}"
+                    takes = method in planning[1:]
                     config = TrainConfig(
                         dataset=str(folder / name),
                         out=folder / "-".join(map(str, cell)),
                         method=method,
                         labels=LabelConfig(count=count),
-                        planner=PlannerConfig(source=first if get_method(method).plans else None),
+                        planner=PlannerConfig(
+                            source=folder / f"{name}-{planning[0]}-{count}-{seed}" if takes else None
+                        ),
                         run=RunConfig(seed=seed, resume=True),
                     )
                     for row in run_cell(name, ground, config, own, trials):

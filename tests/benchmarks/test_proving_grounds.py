@@ -101,9 +101,7 @@ def test_what_is_missing_is_skipped_by_name(monkeypatch, capsys, tmp_path):
     assert other == "bare is skipped: no module no_such_simulator: pip install it"
 
 
-@pytest.mark.parametrize(
-    "asked", [{"methods": ("koap", "kaop")}, {"methods": ("dp",)}, {"executions": ("slow",)}], ids=str
-)
+@pytest.mark.parametrize("asked", [{"methods": ("koap", "kaop")}, {"executions": ("slow",)}], ids=str)
 def test_unknown_names_end_with_a_sentence(asked, tmp_path):
     with pytest.raises(SystemExit, match="unknown"):
         run.main(results=tmp_path / "table.csv", **asked)

@@ -43,7 +43,6 @@ EVALUATION = {
     "labels_read_outside_budget": 20,
     "action_errors": {"outside_budget": ERRORS},
     "execution": {"strategy": "feedback", "replan_interval": 4},
-    "command": "koap eval 'a folder' --episodes 4",
     "episode": [{"seed": 100 + e, "outcome": "success", "mode": e, "steps": 20} for e in range(4)],
 }
 

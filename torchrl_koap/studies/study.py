@@ -48,7 +48,6 @@ _TABLE_1: dict[str, Any] = {
     "first_seed_only": (3, 4),
     "label_unit": "window",
     "planner": {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3},
-    "controller": {"steps": 1000},
 }
 PRESETS: dict[str, dict[str, Any]] = {
     "table1": _TABLE_1,
@@ -65,7 +64,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "methods": ("koap", "koap_paper", "koap_untrained", "pca", "linear_steps", "dd"),
         "labels": (0.01,),
         "demonstrations": (0.1, 0.25, 0.5, 1.0),
-        "controller": {"steps": 1000},
     },
     # a table that can be read, not one to be cited
     "quick": _TABLE_1

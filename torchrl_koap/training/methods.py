@@ -4,9 +4,10 @@
 A method from outside the package is registered the same way (:func:`register_method`) by a module that ``--plugin`` or
 an entry point of the group ``torchrl_koap.methods`` names.
 
-Fair by construction: all controllers get the same labelled windows, the same planner and the same number of updates
-(two-stage methods share theirs between the stages). Networks that may look ahead read the same frames, 4 before and up
-to 5 after the present one, but for two that are defined otherwise: Decision Diffuser's controller (``dd``, and
+Fair by construction: all controllers get the same labelled windows and the same planner. Each has the execution and
+the number of updates that suited it best on demonstrations that no table uses (``benchmarks/tune_methods.py``).
+Two-stage methods share their updates between the stages. Networks that may look ahead read the same frames, 4 before
+and up to 5 after the present one, but for two that are defined otherwise: Decision Diffuser's controller (``dd``, and
 ``relabel``, which is one trained on a teacher's actions) is told the next state, ``vae`` encodes the whole window.
 ``dp`` and ``vpt`` have no planner and make its number of updates instead; relabelling costs the updates of the
 teacher besides.
@@ -96,6 +97,8 @@ _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
 
 _ANY_PRESET = tuple(PRESETS)
 _EVERY_STEP = {"strategy": "feedback", "gain": 1.0}  # they know the command that they gave, and how it is answered
+_OPEN_LOOP = {"strategy": "open_loop"}
+_AS_PLANNED = _OPEN_LOOP | {"blend": 0.0}
 
 METHODS: dict[str, Method] = {}
 
@@ -140,7 +143,15 @@ for _method in (
         knows_commands=True,
         execution=_EVERY_STEP,
     ),
-    Method("koap_sgd", "KOAP, decoder trained by gradients", _koap, _JOINT, presets=_ANY_PRESET),
+    Method(
+        "koap_sgd",
+        "KOAP, decoder trained by gradients",
+        _koap,
+        _JOINT,
+        presets=_ANY_PRESET,
+        updates=1000,
+        execution=_AS_PLANNED,
+    ),
     Method(
         "koap_paper",
         "KOAP as in the paper",
@@ -148,7 +159,8 @@ for _method in (
         _JOINT,
         presets=("paper",),
         columns="all",
-        execution={"strategy": "open_loop", "blend": 0.0, "temperature": 1.0},
+        updates=1000,
+        execution=_AS_PLANNED | {"temperature": 1.0},
     ),
     Method(
         "koap_labelled_only",
@@ -166,6 +178,8 @@ for _method in (
         _koap,
         (replace(_UNLABELLED, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
         presets=_ANY_PRESET,
+        updates=1000,
+        execution=_AS_PLANNED,
     ),
     Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
     Method(
@@ -174,9 +188,18 @@ for _method in (
         partial(_network, kind=PrincipalInverseDynamics),
         closed_form=True,
     ),
-    Method("linear", "ridge on raw frames", _linear, closed_form=True),
-    Method("dd", "supervised, next state (Decision Diffuser)", partial(_supervised, look_ahead=1), _LABELS),
-    Method("dd_lookahead", "supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS),
+    Method("linear", "ridge on raw frames", _linear, closed_form=True, execution=_OPEN_LOOP),
+    Method(
+        "dd",
+        "supervised, next state (Decision Diffuser)",
+        partial(_supervised, look_ahead=1),
+        _LABELS,
+        updates=1000,
+        execution=_OPEN_LOOP,
+    ),
+    Method(
+        "dd_lookahead", "supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS, updates=1000
+    ),
     Method(
         "vae",
         "variational autoencoder of whole windows",
@@ -185,14 +208,19 @@ for _method in (
             Phase("controller", VariationalLoss, share=0.5),
             replace(_DECODER, loss=partial(ActionLoss, freeze_latents=True, sample=True)),
         ),
+        updates=1000,
+        execution=_OPEN_LOOP,
     ),
     Method(
         "lapo",
         "LAPO, quantised latent actions",
         partial(_network, kind=QuantizedInverseDynamics),
         (Phase("controller", QuantizedDynamicsLoss, share=0.5), _DECODER),
+        updates=1000,
     ),
-    Method("nonlinear", "KOAP with nonlinear maps", partial(_network, kind=NonlinearInverseDynamics), _JOINT),
+    Method(
+        "nonlinear", "KOAP with nonlinear maps", partial(_network, kind=NonlinearInverseDynamics), _JOINT, updates=1000
+    ),
     Method("dp", "Diffusion Policy", build_sampler, _POLICY, plans=False),
     Method(
         "relabel",
@@ -200,8 +228,18 @@ for _method in (
         partial(_supervised, look_ahead=1),
         _LABELS,
         teacher="dd_lookahead",
+        updates=1000,
+        execution=_OPEN_LOOP,
     ),
-    Method("vpt", "Diffusion Policy on relabelled data", build_sampler, _POLICY, plans=False, teacher="dd_lookahead"),
+    Method(
+        "vpt",
+        "Diffusion Policy on relabelled data",
+        build_sampler,
+        _POLICY,
+        plans=False,
+        teacher="dd_lookahead",
+        updates=1000,
+    ),
 ):
     register_method(_method)
 
