@@ -63,7 +63,7 @@ def test_every_unlabelled_step_gets_the_action_of_its_own_window(now, batch_size
     data = make_data(act=window + 1)
     controller = WindowController(now, window)
     result = relabel(controller, data, window=window)
-    rows = (~data["has_action"]).squeeze(-1).nonzero().flatten().tolist()
+    rows = result["relabelled"].squeeze(-1).nonzero().flatten().tolist()
     assert len(rows) == 24 and {int(data["episode"][row]) for row in rows} == {0, 1, 2}
     for row in rows:
         states = expected_window(data, row, window, now)
@@ -81,6 +81,7 @@ def test_labelled_steps_and_the_data_stay(dtype):
     kept = data["has_action"].squeeze(-1)
     assert 0 < kept.sum() < len(kept)
     assert torch.equal(result["action"][kept], data["action"][kept])
+    assert torch.equal(result["relabelled"], ~data["has_action"]) and result["relabelled"].shape == (31, 1)
     assert result["has_action"].all() and result["has_action"].dtype == torch.bool
     assert result["action"].isfinite().all() and result["action"].dtype == dtype
     assert result["state"] is data["state"]  # a shallow copy
@@ -98,6 +99,7 @@ def test_no_hidden_action_is_read():
     torch.nn.init.normal_(controller.action_decoder.linear.weight)
     clean, other = relabel(controller, data, window=16), relabel(controller, poisoned, window=16)
     assert torch.equal(clean["action"], other["action"]) and clean["action"].abs().max() < 1e6
+    assert torch.equal(clean["relabelled"], other["relabelled"])
 
 
 def test_a_known_law_is_recovered():
@@ -121,16 +123,23 @@ def test_fully_labelled_and_unlabelled_data():
     controller = WindowController()
     full = make_data(labelled=0)
     result = relabel(controller, full, window=6)
-    assert torch.equal(result["action"], full["action"])
+    assert torch.equal(result["action"], full["action"]) and not result["relabelled"].any()
     assert controller.batches == []
     nothing = full.clone()
     nothing["has_action"] = torch.zeros_like(full["has_action"])
     nothing["action"] = torch.full((31, 7), torch.nan)
-    assert relabel(controller, nothing, window=6)["action"].isfinite().all()
+    assert relabel(controller, nothing, window=6)["relabelled"].all()
 
 
-def test_actions_that_are_not_finite_are_refused():
+def test_bad_input_is_explained():
+    data = make_data()
+    with pytest.raises(KeyError, match="needs the entry 'state'; there are"):
+        relabel(WindowController(), data.exclude("state"), window=6)
+    with pytest.raises(ValueError, match="needs windows of 6 frames, got 5"):
+        relabel(WindowController(), data, window=5)
+    with pytest.raises(ValueError, match="actions have 7 columns, those of the data 2"):
+        relabel(WindowController(), data, window=6)
     model = LinearInverseDynamics(2, 2)
     torch.nn.init.constant_(model.decoder.linear.bias, torch.nan)
     with pytest.raises(ValueError, match="not finite in 24 of 24 steps"):
-        relabel(model, make_data(), window=10)
+        relabel(model, data, window=10)

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from torchrl_koap.data.trajectories import extrapolate_ends
 from torchrl_koap.data.windows import WindowTable
-from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 
+RELABELLED = "relabelled"
 _BATCH = 4096  # windows per forward pass
 
 
@@ -28,20 +29,32 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int) -> Tens
         action of step t x_t-1  x_t    x_t+1  ...
 
     Flat data ``[N]`` have ``state`` as the controller sees it, and are not changed. In the shallow copy that is
-    returned every step has an action; labelled steps keep theirs bit for bit.
+    returned every step has an action; labelled steps keep theirs bit for bit. The new entry ``relabelled`` ``[N, 1]``
+    is True where the action is the controller's.
 
     Raises:
-        ValueError: if actions of the controller are not finite.
+        KeyError: if an entry is missing.
+        ValueError: if the window is too short for the controller, or its actions are not finite or of another width.
     """
+    for key in (STATE, ACTION, HAS_ACTION, EPISODE):
+        if data.get(key, None) is None:
+            raise KeyError(f"relabelling needs the entry {key!r}; there are {sorted(map(str, data.keys()))}")
+    if window < controller.num_window_frames:
+        raise ValueError(f"the controller needs windows of {controller.num_window_frames} frames, got {window}")
     hidden = ~data.get(HAS_ACTION).reshape(-1)
     action = data.get(ACTION).clone()
     if hidden.any():
         predicted = _predict(controller, data, hidden, window)
+        if predicted.shape[-1] != action.shape[-1]:
+            raise ValueError(
+                f"the controller's actions have {predicted.shape[-1]} columns, those of the data {action.shape[-1]}"
+            )
         bad = ~predicted.isfinite().all(-1)
         if bad.any():
             raise ValueError(f"the controller's actions are not finite in {int(bad.sum())} of {len(bad)} steps")
         action[hidden] = predicted.to(action)
-    return data.copy().set(ACTION, action).set(HAS_ACTION, torch.ones_like(data.get(HAS_ACTION)))
+    result = data.copy().set(ACTION, action).set(HAS_ACTION, torch.ones_like(data.get(HAS_ACTION)))
+    return result.set(RELABELLED, hidden.reshape(data.get(HAS_ACTION).shape))
 
 
 def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window: int) -> Tensor:

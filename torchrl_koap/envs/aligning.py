@@ -56,6 +56,12 @@ class AligningEnv(ManipulationEnv):
     NaN).
 
     Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
+
+    Examples:
+        >>> from torchrl_koap.envs import AligningEnv
+        >>> env = AligningEnv(num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 20])
     """
 
     TASK, MAX_STEPS = "aligning", 400

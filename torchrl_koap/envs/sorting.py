@@ -58,6 +58,12 @@ class SortingEnv(ManipulationEnv):
     from its bin than any box that is inside, so it changes nothing and is left out here.
 
     Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
+
+    Examples:
+        >>> from torchrl_koap.envs import SortingEnv
+        >>> env = SortingEnv(num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 16])
     """
 
     MAX_STEPS = 700

@@ -59,6 +59,12 @@ class StackingEnv(ManipulationEnv):
 
     Raises:
         ValueError: for another number of boxes than 1, 2 or 3, too.
+
+    Examples:
+        >>> from torchrl_koap.envs import StackingEnv
+        >>> env = StackingEnv(num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 31])
     """
 
     MAX_STEPS, SUBSTEPS = 1000, 30

@@ -85,6 +85,15 @@ class QuantizedDynamicsLoss(WindowLoss):
 
     No label is read: actions are decoded by :class:`~torchrl_koap.objectives.ActionLoss`, afterwards. Args as for
     :class:`~torchrl_koap.objectives.base.WindowLoss`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import QuantizedInverseDynamics
+        >>> from torchrl_koap.objectives import QuantizedDynamicsLoss
+        >>> loss = QuantizedDynamicsLoss(QuantizedInverseDynamics(2, 2))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_dynamics"].shape
+        torch.Size([])
     """
 
     trains = (QuantizedInverseDynamics,)
@@ -122,6 +131,15 @@ class VariationalLoss(WindowLoss):
 
     Raises:
         ValueError: if the noise handed in has another shape than the latents.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import VariationalInverseDynamics
+        >>> from torchrl_koap.objectives import VariationalLoss
+        >>> loss = VariationalLoss(VariationalInverseDynamics(2, 2))
+        >>> sorted(loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4])).keys())
+        ['loss_kl', 'loss_reconstruction']
     """
 
     @dataclass

@@ -143,6 +143,16 @@ class DiffusionPolicyLoss(DenoisingLoss):
     noise added; what was stored there (NaN) reaches neither value nor gradient. A batch without labels gives exactly 0.
     This method learns from labels only: draw windows with
     ``labelled_share=1`` (:class:`~torchrl_koap.data.WindowSampler`).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import DiffusionPolicy, TemporalUnet
+        >>> from torchrl_koap.objectives import DiffusionPolicyLoss
+        >>> loss = DiffusionPolicyLoss(DiffusionPolicy(TemporalUnet(3, 4), state_dim=2, action_dim=3))
+        >>> batch = TensorDict({"state": torch.randn(8, 16, 2), "action": torch.randn(8, 16, 3),
+        ...                     "has_action": torch.ones(8, 16, 1, dtype=torch.bool)}, [8])
+        >>> loss(batch)["loss_policy"].backward()
     """
 
     @dataclass

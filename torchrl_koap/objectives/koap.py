@@ -67,6 +67,15 @@ class KoopmanReconstructionLoss(_KoopmanLoss):
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, T]``).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanReconstructionLoss
+        >>> loss = KoopmanReconstructionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_reconstruction"].shape
+        torch.Size([])
     """
 
     terms = (RECONSTRUCTION,)
@@ -77,6 +86,12 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
     """Computes the one-step error of the latent dynamics, ``loss_koopman``, over the frames that count.
 
     Args as of :class:`KoopmanReconstructionLoss`; with ``"none"`` the loss is ``[*B, frames]``, 0 where masked.
+
+    Examples:
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanDynamicsLoss
+        >>> KoopmanDynamicsLoss(make_koopman_inverse_dynamics(2, 2)).in_keys
+        ['state']
     """
 
     terms = (KOOPMAN,)
@@ -87,6 +102,12 @@ class LatentActionLoss(_KoopmanLoss):
     """Computes the error of the decoded actions, ``loss_action``, over the labelled frames that count.
 
     Args as of :class:`KoopmanDynamicsLoss`.
+
+    Examples:
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import LatentActionLoss
+        >>> LatentActionLoss(make_koopman_inverse_dynamics(2, 2)).in_keys
+        ['state', 'action', 'has_action']
     """
 
     terms = (ACTION,)

@@ -125,6 +125,13 @@ class VariationalInverseDynamics(LatentInverseDynamics):
     :class:`~torchrl_koap.objectives.VariationalLoss` on all windows, then :class:`~torchrl_koap.objectives.ActionLoss`
     with ``freeze_latents`` and ``sample`` on the labelled frames. Where it acts it reads the mean. Args as for
     :class:`~torchrl_koap.modules.InverseDynamics`, without ``num_past`` and ``look_ahead``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import VariationalInverseDynamics
+        >>> model = VariationalInverseDynamics(2, 2)
+        >>> model.sample(torch.randn(1, 16, 2)).shape
+        torch.Size([1, 16, 16])
     """
 
     samples_latents = True

@@ -29,6 +29,14 @@ class SupervisedInverseDynamics(InverseDynamics):
     With ``look_ahead=1`` this is the inverse dynamics of Decision Diffuser, which is told the next state and nothing
     further ahead. Trained by :class:`~torchrl_koap.objectives.ActionLoss`. Args as for
     :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 1``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import SupervisedInverseDynamics
+        >>> model = SupervisedInverseDynamics(2, 2, look_ahead=(1, 4))
+        >>> model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))["action"].shape
+        torch.Size([3, 16, 2])
     """
 
     def __init__(
@@ -58,6 +66,15 @@ class NonlinearInverseDynamics(LiftedInverseDynamics):
     All parts are perceptrons and trained together by :class:`~torchrl_koap.objectives.KOAPLoss`. As in KOAP,
     ``f`` reads steps at unit scale and never ``x_{t+1}``, which the dynamics have to predict. Sizes are those of KOAP's
     default. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import NonlinearInverseDynamics
+        >>> model = NonlinearInverseDynamics(2, 2)
+        >>> td = model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))
+        >>> td["action"].shape, td["latent_action"].shape
+        (torch.Size([3, 16, 2]), torch.Size([3, 16, 32]))
     """
 
     def __init__(

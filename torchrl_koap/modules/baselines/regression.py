@@ -72,6 +72,19 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
     A window is the present frame and the scaled steps around it, those that ``semi_supervised`` reads. The components
     come from all windows, labelled or not (:meth:`finish`); their number, 2, 4, 8, 16, 32 or 64, from the held-out
     labelled error. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import PrincipalInverseDynamics
+        >>> states = torch.randn(60, 17, 3).cumsum(1)
+        >>> model = PrincipalInverseDynamics(3, 2)
+        >>> model.prepare(states), model.finish(states)
+        (None, None)
+        >>> windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [60])
+        >>> fit = model.fit_labels(windows, torch.ones(60, 17, dtype=torch.bool))
+        >>> model(windows.select("state"))["action"].shape
+        torch.Size([60, 17, 2])
     """
 
     basis: Tensor

@@ -102,6 +102,14 @@ class CommandRegression(Follower):
     state, the last command ``c``, which the policy knows, and the feedback gain ``rho = 0.3``. The first part moves
     what is seen; the second keeps what is not seen where demonstrations had it. The rule of actions tells the other
     entries.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import CommandDecoder, CommandRegression
+        >>> decoder = CommandDecoder(2, [0, 1], [0, 1], width=8)
+        >>> decoder.set_scales(torch.randn(9, 2), torch.randn(9, 2))
+        >>> CommandRegression(decoder)(torch.zeros(3, 1, 4), torch.zeros(3, 1, 2), torch.zeros(3, 14, 2)).shape
+        torch.Size([3, 1, 2])
     """
 
     knows_command = True

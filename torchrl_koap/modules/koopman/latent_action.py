@@ -106,6 +106,14 @@ class LatentActionLSTM(LatentActionModule):
 
     Keyword Args:
         hidden_dim (int): width of the LSTM. Defaults to ``128``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import LatentActionLSTM
+        >>> infer = LatentActionLSTM(2, 8, hidden_dim=16)
+        >>> infer(TensorDict({"state": torch.randn(5, 16, 2)}, [5]))["latent_action"].shape
+        torch.Size([5, 16, 8])
     """
 
     def __init__(self, state_dim: int, latent_dim: int, *, hidden_dim: int = 128, **kwargs):
@@ -125,6 +133,14 @@ class LatentActionMLP(LatentActionModule):
     """Infers latent actions by a perceptron on the concatenated frames, of widths ``hidden_dims``.
 
     Args as for :class:`LatentActionModule`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import LatentActionMLP
+        >>> infer = LatentActionMLP(2, 8, num_past=4, look_ahead=(2, 4, 8), relative=True)
+        >>> infer(TensorDict({"state": torch.randn(5, 16, 2)}, [5]))["latent_action"].shape
+        torch.Size([5, 16, 8])
     """
 
     def __init__(self, state_dim: int, latent_dim: int, *, hidden_dims: Sequence[int] = (128, 128), **kwargs):

@@ -106,6 +106,13 @@ class MLPDenoiser(Denoiser):
         width (int): hidden width. Defaults to 512.
         depth (int): number of residual layers. Defaults to 4.
         frequencies (int): octaves of the condition's Fourier features. Defaults to 1.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.planning.denoisers import MLPDenoiser
+        >>> network = MLPDenoiser(state_dim=2, condition_dim=4, horizon=14)
+        >>> network(torch.randn(3, 14, 2), torch.zeros(3), torch.randn(3, 4)).shape
+        torch.Size([3, 14, 2])
     """
 
     def __init__(

@@ -39,6 +39,15 @@ class DiffusionPolicy(ConditionalSampler):
 
     Raises:
         ValueError: for an ``action_dim`` below 1.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import DiffusionPolicy, TemporalUnet
+        >>> policy = DiffusionPolicy(TemporalUnet(3, 4), state_dim=2, action_dim=3, num_steps=4)
+        >>> policy.fit_normalizers(torch.randn(100, 16, 2), torch.randn(500, 3))
+        >>> policy(TensorDict({"history": torch.randn(5, 2, 2)}, [5]))["action_chunk"].shape
+        torch.Size([5, 14, 3])
     """
 
     def __init__(
