@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Literal
 
 import torch
 import tyro
@@ -62,7 +63,7 @@ def score(task: str, trained: Trained, execution: ExecutionConfig) -> float:
 
 
 def main(
-    task: Positional[str],
+    task: Positional[Literal["avoiding", "pusht"]],
     dataset: Positional[Path],
     *,
     labels: tuple[float, ...],
@@ -74,7 +75,7 @@ def main(
     """Trains each method with each number of updates and scores it by each execution.
 
     Args:
-        task: "avoiding" or "pusht".
+        task: where to tune.
         dataset: its demonstrations; those of Push-T are written where there are none.
         labels: share of the windows (below 1) or number of the demonstrations whose labels may be seen.
         methods: what is trained.
