@@ -38,6 +38,7 @@ from torchrl_koap.vision.encoder import SCOOPING, Projection, projection_of
 RESULTS = Path(__file__).parent / "results"
 Task = Literal["scooping", "scooping_moving_bowl"]
 Unlabelled = Literal["robot", "hand", "both", "none"]
+NETWORK = "torchrl_koap.vision.backbones:lite0_cells"
 FEW_ROBOTS = ("hand", "none")  # the labelled demonstrations are all there are of the robot
 METHODS = ("koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear")
 KEYS = ("labels", "unlabelled", "method", "seed", "n")
@@ -147,7 +148,7 @@ def main(
             record_videos(folder / who, who, demonstrations, task=task)
     if fit:
         recordings, _ = read_sources([folder / who for who in EMBODIMENTS], get_task(task))
-        print(embed_recordings(recordings, get_task(task), folder / "fit"))
+        print(embed_recordings(recordings, get_task(task), folder / "fit", network=NETWORK))
         shutil.copy(folder / "fit" / "cameras" / f"{CAMERA}.safetensors", SCOOPING.with_stem(task))
         return
     evaluation = EvalConfig(episodes=episodes, threads=1, execution=ExecutionConfig(replan_interval=8))

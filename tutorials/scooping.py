@@ -40,7 +40,8 @@ from torchrl_koap.vision import load_backbone, load_encoder
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
 
 torch.set_num_threads(1)
-load_backbone()  # says at once what to install where its weights are missing
+NETWORK = "torchrl_koap.vision.backbones:lite0_cells"
+load_backbone(NETWORK)  # says at once what to install where its weights are missing
 folder, task = Path(tempfile.mkdtemp()), get_task("scooping")
 EACH, LABELLED, TRIALS = 24, 5, 15
 for embodiment in ("robot", "hand"):
@@ -50,12 +51,12 @@ for embodiment in ("robot", "hand"):
 # %%
 # Frames to embeddings
 # --------------------
-# EfficientNet-Lite0 was trained on ImageNet. Averages over a coarse grid keep positions. Principal components are
+# EfficientNet-Lite0 was trained on ImageNet. Averages over 6 x 6 cells keep positions. Principal components are
 # fitted on these frames, without labels. To test them, a linear map from embeddings to the spoon's position is fitted
 # on 75 % of the robot's videos. The policy never reads the position.
 
 sources, _ = read_sources([folder / embodiment for embodiment in ("robot", "hand")], task)
-report = embed_recordings(sources, task, folder / "data")[CAMERA]
+report = embed_recordings(sources, task, folder / "data", network=NETWORK)[CAMERA]
 encoder = load_encoder(folder / "data" / "cameras" / f"{CAMERA}.safetensors")
 stored, _ = load_ted(folder / "data" / "ted")
 

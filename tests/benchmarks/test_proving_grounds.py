@@ -78,7 +78,7 @@ def test_frames_of_recorded_states_become_columns(monkeypatch, tmp_path):
     monkeypatch.setattr("torchrl_koap.vision.embedding.load_backbone", lambda network: load_backbone(OWN))
     pusht.write_pixels(tmp_path / "data")
     steps, task = open_dataset(str(tmp_path / "data"))
-    assert len(steps) == 87 and task.robot == (0, 1) and task.targets == (0, 1) and task.state_dim == 2 + 64
+    assert len(steps) == 87 and task.robot == (0, 1) and task.targets == (0, 1) and task.state_dim == 2 + 32
     env, other = pusht.make_pixels(), pusht.make_pixels()
     env.reset(seed=3), other.reset(seed=1)
     for step in range(40):  # the agent runs into the block
@@ -88,7 +88,7 @@ def test_frames_of_recorded_states_become_columns(monkeypatch, tmp_path):
         np.testing.assert_array_equal(drawn, seen["pixels"], str(step))
     frame = pusht.draw(other.unwrapped, states[1, 4])
     seen = Observer(task, cameras_of(tmp_path / "data"))({"state": states[1, 4, :2].astype(np.float32), "top": frame})
-    torch.testing.assert_close(seen, steps["observation"][29 + 4], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(seen.float(), steps["observation"][29 + 4], rtol=1e-4, atol=1e-4)
 
 
 def test_what_is_missing_is_skipped_by_name(monkeypatch, capsys, tmp_path):

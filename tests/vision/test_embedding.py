@@ -95,8 +95,8 @@ def test_a_task_with_embeddings_of_its_own_takes_several_sources(tmp_path):
     pytest.importorskip("pyarrow")
     robot, hand = (write(tmp_path / who, who) for who in ("robot", "hand"))
     recordings, task = read_sources([robot, hand], get_task("scooping"))
-    fitted = Projection.fit(torch.randn(200, 144, generator=torch.Generator().manual_seed(0)), 96)
-    fitted.about = {**embedder_of(8).identity}
+    components = torch.randn(40, 96, generator=torch.Generator().manual_seed(0))
+    fitted = Projection(torch.zeros(40), components, embedder_of(8).identity)
     embed_recordings(recordings, task, tmp_path / "both", network=OWN, projection=fitted)
     data, about = load_ted(tmp_path / "both" / "ted")[0], read_about(tmp_path / "both" / "ted")
     assert about["lengths"] == [6, 7, 6, 7] and about["labelled_steps"] == 13 and about["task"] == "scooping"

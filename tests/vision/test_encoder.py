@@ -10,9 +10,10 @@ from tensordict import TensorDict
 from tiny_network import random_layer
 
 from torchrl_koap.vision import FrozenImageEncoder, Projection, WeightsError, backbones, load_backbone, load_encoder
+from torchrl_koap.vision.encoder import pool_moments
 
 OWN, OTHER = "tiny_network:random_layer", "tiny_network:another_layer"
-FEATURES = 4 * 6 * 6
+FEATURES = 4 * 10
 HAS_WEIGHTS = all(importlib.util.find_spec(name) for name in backbones._PACKAGES)
 needs_weights = pytest.mark.skipif(not HAS_WEIGHTS, reason="the weights of the extra 'vision' are not installed")
 
@@ -39,18 +40,25 @@ def test_a_network_of_ones_own_embeds_and_stays_as_it_is():
     assert not embed.backbone.training and not any(p.requires_grad for p in embed.parameters())
     pictures = frames().permute(0, 3, 1, 2).float() / 255
     mean, std = (torch.tensor(values)[:, None, None] for values in (backbones.MEAN, backbones.STD))
-    wanted = torch.nn.functional.adaptive_avg_pool2d(random_layer()((pictures - mean) / std), 6).flatten(1)
+    wanted = pool_moments(random_layer()((pictures - mean) / std))
     torch.testing.assert_close(data["embedding"][0], wanted)
     torch.testing.assert_close(embed.embed(frames()[1]), wanted[1], rtol=1e-4, atol=1e-5)  # alone as in a batch
 
 
-def test_the_embedding_tells_left_from_right():
-    left, right = torch.zeros(2, 1, 96, 96, 3, dtype=torch.uint8)
-    left[:, 40, 16], right[:, 40, 80] = 255, 255
-    network = torch.nn.AvgPool2d(8)
-    embed = FrozenImageEncoder(backbones.Backbone(network, "none", "mean"))
-    first = [embed.embed(picture).unflatten(-1, (3, 36))[0, 0].argmax().item() for picture in (left, right)]
-    assert first == [2 * 6 + 1, 2 * 6 + 5]
+def test_moments_say_where_and_how_wide():
+    maps = torch.full((2, 1, 24, 36), 3.0)
+    maps[0, 0, 4:6, 8:16] += 2.0  # above the median
+    maps[0, 0, 20, 30] -= 5.0  # below it
+    x, y = torch.linspace(-1, 1, 36), torch.linspace(-1, 1, 24)
+    wide, high = x[8:16], y[4:6]
+    wanted = [wide.mean(), high.mean(), wide.var(correction=0), high.var(correction=0), 0, x[30], y[20], 0, 0, 0]
+    assert pool_moments(maps)[0].tolist() == pytest.approx(
+        torch.stack(list(map(torch.as_tensor, wanted))).tolist(), abs=1e-3
+    )
+    tilted = torch.zeros(1, 1, 24, 24)
+    tilted[0, 0].fill_diagonal_(1.0)
+    assert pool_moments(tilted)[0, 4] > 0.3 and pool_moments(tilted.flip(-1))[0, 4] < -0.3
+    assert pool_moments(maps)[1, :2].tolist() == pytest.approx([0, 0], abs=1e-5)  # the same everywhere
 
 
 def test_a_projection_keeps_what_varies_most_and_survives_its_file(tmp_path):
@@ -128,7 +136,7 @@ def test_networks_that_are_missing(monkeypatch):
         with pytest.raises(ValueError, match=said):
             load_backbone(name)
     monkeypatch.setattr(backbones, "_PACKAGES", ("no_such_package_of_weights",))
-    backbones._efficientnet.cache_clear()
+    backbones._lite0.cache_clear()
     with pytest.raises(WeightsError, match=r"torchrl_koap\[vision\]"):
         load_backbone()
 
@@ -144,4 +152,6 @@ def test_the_package_s_projection_fits_the_embedded_weights():
     embed = load_encoder()
     picture = torch.zeros(1, 96, 96, 3, dtype=torch.uint8)
     assert embed.embed(picture).shape == (1, 96) and embed.embed(picture).isfinite().all()
-    assert embed.identity["network"] == "efficientnet_lite0" and embed.identity["places"] == "12x12"
+    assert embed.identity.items() <= embed.projection.about.items()
+    usual = FrozenImageEncoder()
+    assert usual.identity["places"] == "24x24" and usual.embed(picture).shape == (1, 24 * 10)

@@ -17,7 +17,7 @@ def make(hidden=()):
     task = Task(name="arm", observation_parts=parts, actions={"a": Action("m")}, position="cup", hidden=hidden)
     about = FrozenImageEncoder(load_backbone(OWN), size=(16, 24)).identity
     cameras = {
-        name: Projection(torch.zeros(144), torch.randn(144, width), about)
+        name: Projection(torch.zeros(40), torch.randn(40, width), about)
         for name, width in {"top": 3, "wrist": 4}.items()
     }
     return Observer(task, cameras), cameras

@@ -48,7 +48,7 @@ class Embed(Command):
     sources: tyro.conf.Positional[tuple[Path, ...]]
     out: Path
     camera: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    components: int = 64
+    components: int = 32
     network: str | None = None
     task: str | None = None
     projection: Path | None = None

