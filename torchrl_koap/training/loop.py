@@ -215,11 +215,11 @@ def limit_outlier(optimizer: torch.optim.AdamW) -> Tensor | None:
         return None
     gradients = [parameter.grad for parameter in parameters]
     length = torch.nn.utils.get_total_norm(gradients)
-    # the second moment is positive: its sum is the 1-norm
-    moment = torch.stack(torch._foreach_norm([state["exp_avg_sq"] for state in states], 1)).sum()
+    moment = torch.stack([state["exp_avg_sq"].sum() for state in states]).sum()
     share = 1 - group["betas"][1] ** updates.double()
     typical = (moment / share.to(moment.dtype)).sqrt()
     factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or one that is not finite
     factor = torch.where(updates < SETTLED, 1.0, factor)  # not read on a GPU, which would have to be waited for
-    torch._foreach_mul_(gradients, factor)
+    if factor.is_cuda or factor < 1:
+        torch._foreach_mul_(gradients, factor)
     return factor
