@@ -3,11 +3,13 @@
 
     OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner
     OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part precision
+    OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part loop
     python benchmarks/training_speed.py --part cuda
 
 Controller: every preset of KOAP, batches of 256 windows of 16 frames (17 for "semi_supervised"), sampling included.
 Planner: the default U-Net on 256 windows, and one plan and 60. Precision: updates of wide MLPs with matrix products in
-float32 and bfloat16, which a processor without units for it emulates. CUDA: the whole training loop on a GPU, windows
+float32 and bfloat16, which a processor without units for it emulates. Loop: the whole training loop beside a bare one
+around the same network, as it is and compiled, by turns. CUDA: the whole training loop on a GPU, windows
 and augmentation included, step by step, with a compiled denoiser, and with the update replayed as a graph.
 """
 
@@ -49,6 +51,7 @@ SPEED = ("part", "variant", "parameters", "updates_per_second", "plan_1_ms", "pl
 PRECISION = ("processor", "units", "width", "depth", "batch", "float32", "bfloat16", "ratio")
 COMMAND = "OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner"
 CUDA = ("device", "network", "batch", "precision", "eager", "compiled", "replayed", "one_core", "beside")
+LOOP = ("processor", "units", "network", "batch", "loop_ms", "bare_ms", "compiled_ms", "over_bare", "over_compiled")
 BATCH, UPDATES = 512, 600
 SIZES = ((512, 4, 512), (512, 4, 256), (256, 3, 128))  # width, residual layers, batch
 
@@ -149,6 +152,49 @@ def loop_rate(network: str, *, device: str, replay: bool = False, compiled: bool
     return (UPDATES - 100) / (times[-1] - times[0])
 
 
+def bare_update(network: str, *, compiled: bool) -> Callable[[], None]:
+    """An update of the network of :func:`loop_rate` with nothing around it: noise, squared error, AdamW."""
+    torch.manual_seed(0)
+    denoiser = MLPDenoiser(19, 38, horizon=14) if network == "mlp" else TemporalUnet(19, 38)
+    if compiled:
+        denoiser.compile()
+    optimizer = torch.optim.AdamW(denoiser.parameters(), 1e-3, fused=True)
+    clean, condition = torch.randn(BATCH, 14, 19), torch.randn(BATCH, 38)
+
+    def update() -> None:
+        with torch.autocast("cpu", torch.bfloat16):
+            predicted = denoiser(0.7 * clean + 0.7 * torch.randn_like(clean), torch.rand(BATCH), condition)
+        (predicted - clean).square().mean().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return update
+
+
+def beside_bare() -> None:
+    """Writes a row per network: milliseconds of an update of the loop and of bare ones, and shares of their rates."""
+    known = (torch.cpu.get_capabilities()["cpu_name"], int(has_bfloat16_units()))
+    done, write = open_table(RESULTS / "training_loop.csv", LOOP, LOOP[:4])
+    for network in ("mlp", "unet"):
+        if tuple(map(str, (*known, network, BATCH))) in done:
+            continue
+        updates = [bare_update(network, compiled=compiled) for compiled in (False, True)]
+        rounds = []
+        for _ in range(3):
+            bare = [1e3 * median_seconds(update, 60, warm_up=10) for update in updates]
+            rounds.append((1e3 / loop_rate(network, device="cpu"), *bare))
+        times = [sorted(column)[1] for column in zip(*rounds, strict=True)]
+        row = (
+            *known,
+            network,
+            BATCH,
+            *(f"{each:.1f}" for each in times),
+            *(f"{each / times[0]:.2f}" for each in times[1:]),
+        )
+        print(*row, flush=True)
+        write(row)
+
+
 def on_gpu() -> None:
     """Writes a row per network with the rates on the GPU that is there, and on one core of its machine."""
     device = torch.cuda.get_device_name()
@@ -163,7 +209,7 @@ def on_gpu() -> None:
             write(row)
 
 
-def main(*, part: tuple[Literal["controller", "planner", "precision", "cuda"], ...], repeats: int = 40) -> None:
+def main(*, part: tuple[Literal["controller", "planner", "precision", "loop", "cuda"], ...], repeats: int = 40) -> None:
     """Measures what the tables lack.
 
     Args:
@@ -179,6 +225,8 @@ def main(*, part: tuple[Literal["controller", "planner", "precision", "cuda"], .
                 write(row)
     if "cuda" in part:
         on_gpu()
+    if "loop" in part:
+        beside_bare()
     if "precision" not in part:
         return
     known = (torch.cpu.get_capabilities()["cpu_name"], int(has_bfloat16_units()))

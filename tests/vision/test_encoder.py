@@ -122,6 +122,8 @@ def test_networks_may_be_modules_files_and_without_maps(tmp_path):
     )
     backbone = load_backbone(f"{tmp_path}/own.py:network")
     assert FrozenImageEncoder(backbone, size=32).embed(frames()).shape == (3, 12)
+    single = FrozenImageEncoder(backbones.Backbone(torch.nn.AvgPool2d(32), "none", "mean"), size=32)
+    assert single.embed(frames()).shape == (3, 3) and single.embed(frames()).std(0).min() > 0
     with pytest.raises(ValueError, match=r"must return \[B, C, h, w\] or \[B, F\], got \[1, 3, 1024\]"):
         FrozenImageEncoder(backbones.Backbone(Tokens(), "none", "tokens"), size=32).embed(frames(1))
     with pytest.raises(ValueError, match="is no nn.Module and makes none, it makes int"):

@@ -81,7 +81,7 @@ class FrozenImageEncoder(ObservationTransform):
             "weights": self.backbone.digest,
             "network": self.backbone.name,
             "places": "x".join(map(str, maps.shape[2:])),
-            "pooling": "moments" if maps.ndim == 4 else "of the network",
+            "pooling": "moments" if maps.shape[2:].numel() > 1 else "of the network",
             "size": "x".join(map(str, self.size)),
         }
 
@@ -111,7 +111,7 @@ class FrozenImageEncoder(ObservationTransform):
         if not isinstance(maps, Tensor) or maps.ndim not in (2, 4):
             got = list(maps.shape) if isinstance(maps, Tensor) else type(maps).__name__
             raise ValueError(f"network {self.backbone.name!r} must return [B, C, h, w] or [B, F], got {got}")
-        return pool_moments(maps) if maps.ndim == 4 else maps
+        return pool_moments(maps) if maps.shape[2:].numel() > 1 else maps.flatten(1)
 
     def embed(self, frames: Tensor) -> Tensor:
         """Computes embeddings ``[*B, d]`` of frames, uint8 ``[*B, H, W, 3]``."""
