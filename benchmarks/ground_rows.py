@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ COMPARED = {
     "linear_steps": ("ridge regression", ORANGE),
     "dd_lookahead": ("supervised, look-ahead", GREEN),
     "dd": ("Decision Diffuser", "#9fd3ad"),
+    "vpt": ("VPT", "#b39ddb"),
     "dp": ("Diffusion Policy", MUTED),
 }
 STEP = 0.9 / len(COMPARED)  # between two bars
@@ -79,10 +81,10 @@ def ground_score(ground: str, method: str, labels: int | None = None, execution:
     Args:
         ground (str): its name.
         method (str): a name of ``koap methods``.
-        labels (int, optional): labelled demonstrations. Default: the fewest that were run.
+        labels (int, optional): labelled demonstrations. Default: :func:`usual_labels`.
         execution (str): how plans were executed.
     """
-    count = labels or min(label_counts(ground), default=0)
+    count = labels or usual_labels(ground)
     rows = read_rows("proving_grounds", ground=ground, method=method, execution=execution, labels=count)
     if not rows:
         return None
@@ -102,9 +104,10 @@ def ground_score(ground: str, method: str, labels: int | None = None, execution:
     )
 
 
-def label_counts(ground: str) -> list[int]:
-    """Lists the numbers of labelled demonstrations that KOAP was run with."""
-    return sorted({int(row["labels"]) for row in read_rows("proving_grounds", ground=ground, method="koap")})
+def usual_labels(ground: str) -> int:
+    """Finds the number of labelled demonstrations that most trainings on a ground had; 0 where there are none."""
+    counts = Counter(int(row["labels"]) for row in read_rows("proving_grounds", ground=ground))
+    return max(counts, key=lambda labels: counts[labels], default=0)
 
 
 def ground_text(ground: str, method: str, labels: int | None = None, execution: str = "default") -> str:
@@ -115,7 +118,7 @@ def ground_text(ground: str, method: str, labels: int | None = None, execution: 
 
 def _cells() -> Iterator[tuple[str, int]]:
     for ground in TITLES:
-        for labels in label_counts(ground):
+        if labels := usual_labels(ground):
             yield ground, labels
 
 
