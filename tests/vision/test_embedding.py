@@ -97,6 +97,9 @@ def test_a_task_with_embeddings_of_its_own_takes_several_sources(tmp_path):
     recordings, task = read_sources([robot, hand], get_task("scooping"))
     components = torch.randn(40, 96, generator=torch.Generator().manual_seed(0))
     fitted = Projection(torch.zeros(40), components, embedder_of(8).identity)
+    old = Projection(torch.zeros(144), torch.randn(144, 96), fitted.about)
+    with pytest.raises(ValueError, match="fitted on 144 features, got 40"):
+        embed_recordings(recordings, task, tmp_path / "old", network=OWN, projection=old)
     embed_recordings(recordings, task, tmp_path / "both", network=OWN, projection=fitted)
     data, about = load_ted(tmp_path / "both" / "ted")[0], read_about(tmp_path / "both" / "ted")
     assert about["lengths"] == [6, 7, 6, 7] and about["labelled_steps"] == 13 and about["task"] == "scooping"
