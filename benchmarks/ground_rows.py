@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,17 +74,15 @@ class Score:
         return percent({"successes": self.successes, "n": self.n}, 0)
 
 
-def ground_score(ground: str, method: str, labels: int | None = None, execution: str = "default") -> Score | None:
-    """Pools the rows of a method on a ground; None if there are none.
+def ground_score(ground: str, method: str) -> Score | None:
+    """Pools the rows of a method on a ground, with :func:`usual_labels` and its own execution; None if there are none.
 
     Args:
         ground (str): its name.
         method (str): a name of ``koap methods``.
-        labels (int, optional): labelled demonstrations. Default: :func:`usual_labels`.
-        execution (str): how plans were executed.
     """
-    count = labels or usual_labels(ground)
-    rows = read_rows("proving_grounds", ground=ground, method=method, execution=execution, labels=count)
+    named = {"ground": ground, "method": method, "execution": "default", "labels": usual_labels(ground)}
+    rows = read_rows("proving_grounds", **named)
     if not rows:
         return None
 
@@ -105,32 +102,26 @@ def ground_score(ground: str, method: str, labels: int | None = None, execution:
 
 
 def usual_labels(ground: str) -> int:
-    """Finds the number of labelled demonstrations that most trainings on a ground had; 0 where there are none."""
+    """Finds the number of labelled demonstrations that most trainings on a ground had."""
     counts = Counter(int(row["labels"]) for row in read_rows("proving_grounds", ground=ground))
-    return max(counts, key=lambda labels: counts[labels], default=0)
+    return counts.most_common(1)[0][0]
 
 
-def ground_text(ground: str, method: str, labels: int | None = None, execution: str = "default") -> str:
+def ground_text(ground: str, method: str) -> str:
     """Formats the score of a method on a ground, or says that it was not run."""
-    score = ground_score(ground, method, labels, execution)
+    score = ground_score(ground, method)
     return "not run" if score is None else score.text
 
 
-def _cells() -> Iterator[tuple[str, int]]:
-    for ground in TITLES:
-        if labels := usual_labels(ground):
-            yield ground, labels
-
-
 def grounds_table() -> str:
-    """Formats a row per ground and number of labelled demonstrations, a column per method."""
+    """Formats a row per ground, a column per method."""
     published = {row["key"] for row in read_rows("facts")}
     body = []
-    for ground, labels in _cells():
-        scores = [ground_score(ground, method, labels) for method in COMPARED]
+    for ground, title in TITLES.items():
+        scores = [ground_score(ground, method) for method in COMPARED]
         first = next(score for score in scores if score is not None)
         key = f"{ground}_published_mean"
-        row = [TITLES[ground], str(labels), f"{first.seeds} x {first.n // first.seeds}"]
+        row = [title, str(usual_labels(ground)), f"{first.seeds} x {first.n // first.seeds}"]
         row += ["not run" if score is None else score.text for score in scores]
         body.append([*row, fact(key) if key in published else "none"])
     heads = [name for name, _ in COMPARED.values()]
@@ -143,26 +134,25 @@ def draw_grounds(path: Path) -> Path:
     Args:
         path (Path): png to write.
     """
-    cells = list(_cells())
-    rolled = [cell for cell in cells if (score := ground_score(cell[0], "koap", cell[1])) and score.plan is None]
-    judged = [cell for cell in cells if cell not in rolled]
+    rolled = [ground for ground in TITLES if (score := ground_score(ground, "koap")) and score.plan is None]
+    judged = [ground for ground in TITLES if ground not in rolled]
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[max(2, len(rolled)), 2 * max(1, len(judged))])
     for number, (method, (name, color)) in enumerate(COMPARED.items()):
-        for place, (ground, labels) in enumerate(rolled):
-            score = ground_score(ground, method, labels)
+        for place, ground in enumerate(rolled):
+            score = ground_score(ground, method)
             if score is not None:
                 _bar(left, place + STEP * number, *score.interval, color, name)
-        for place, (ground, labels) in enumerate(judged):
-            score = ground_score(ground, method, labels)
+        for place, ground in enumerate(judged):
+            score = ground_score(ground, method)
             for step, share in enumerate(() if score is None else (score.action, score.plan)):
                 if share is not None:
                     _bar(right, 2 * place + step + STEP * number, share, share, share, color, name)
-    texts = [f"{TITLES[ground].replace(' ', chr(10), 1)}\n{labels} labelled" for ground, labels in rolled]
+    texts = [f"{TITLES[ground].replace(' ', chr(10), 1)}\n{usual_labels(ground)} labelled" for ground in rolled]
     left.set_xticks([place + 0.4 for place in range(len(rolled))], texts, fontsize=8)
     left.set(ylim=(0, 1.12), ylabel="largest reward, or success")
     kinds = ("actions,\nridge = 1", "plans,\nstanding still = 1")
-    texts = [f"{TITLES[ground]}\n{kind}" for ground, _ in judged for kind in kinds]
+    texts = [f"{TITLES[ground]}\n{kind}" for ground in judged for kind in kinds]
     right.set_xticks([place + 0.4 for place in range(len(texts))], texts, fontsize=8)
     right.axhline(1, color=MUTED, linewidth=0.7, linestyle=":")
     right.set_ylabel("error on recordings")

@@ -124,10 +124,15 @@ def wide_update(width: int, depth: int, batch: int, dtype: torch.dtype | None) -
     return update_of(PlannerLoss(planner, dtype=dtype), lambda: windows)
 
 
+def make_denoiser(network: str) -> torch.nn.Module:
+    """A network of a planner for 19 columns."""
+    return MLPDenoiser(19, 38, horizon=14) if network == "mlp" else TemporalUnet(19, 38)
+
+
 def loop_rate(network: str, *, device: str, replay: bool = False, compiled: bool = False) -> float:
     """Updates per second of the training loop after its first hundred, in bfloat16, for 19 columns."""
     torch.manual_seed(0)
-    denoiser = MLPDenoiser(19, 38, horizon=14) if network == "mlp" else TemporalUnet(19, 38)
+    denoiser = make_denoiser(network)
     planner = StatePlanner(denoiser, state_dim=19)
     paths = [torch.randn(200, 19).cumsum(0) * 0.01 for _ in range(100)]
     data = select_state(flatten_trajectories(paths, None, action_dim=1), range(19)).to(device)
@@ -155,7 +160,7 @@ def loop_rate(network: str, *, device: str, replay: bool = False, compiled: bool
 def bare_update(network: str, *, compiled: bool) -> Callable[[], None]:
     """An update of the network of :func:`loop_rate` with nothing around it: noise, squared error, AdamW."""
     torch.manual_seed(0)
-    denoiser = MLPDenoiser(19, 38, horizon=14) if network == "mlp" else TemporalUnet(19, 38)
+    denoiser = make_denoiser(network)
     if compiled:
         denoiser.compile()
     optimizer = torch.optim.AdamW(denoiser.parameters(), 1e-3, fused=True)
