@@ -43,7 +43,6 @@ COVERED_BY = {
     "training/checkpoints.py": "training/test_loop.py",
     "training/controller.py": "training/test_methods.py",
     "training/method.py": "training/test_methods.py",
-    "training/policy_facts.py": "modules/execution/test_command_limits.py",
     "vision/backbones.py": "vision/test_encoder.py",
 }
 

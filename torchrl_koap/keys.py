@@ -7,6 +7,7 @@ Storage layout (TorchRL's TED, flat over steps; ``N`` steps of all trajectories 
     state                  [N, d]     float   the part of it that planner and controller may see (optional)
     action                 [N, act]   float   NaN where the label is not in the budget
     has_action             [N, 1]     bool    False where ``action`` is NaN
+    label_command          [N, J]     float   the last command at labelled steps, else NaN (optional)
     episode                [N]        int64   trajectory index, constant inside a trajectory
     step_count             [N]        int64   0, 1, 2, ... inside a trajectory
     next/observation       [N, obs]   float
@@ -40,6 +41,7 @@ OBSERVATION = "observation"
 STATE = "state"
 ACTION = "action"
 HAS_ACTION = "has_action"
+LABEL_COMMAND = "label_command"
 EPISODE = "episode"
 STEP_COUNT = "step_count"
 NEXT_OBSERVATION = ("next", "observation")

@@ -7,15 +7,10 @@ from small_controllers import controller_of
 from tensordict import TensorDict
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories
+from torchrl_koap.keys import LABEL_COMMAND
 from torchrl_koap.modules import CommandDecoder
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.command_model import (
-    LABEL_COMMAND,
-    build_decoder,
-    fit_decoder,
-    gripper_columns,
-    with_label_commands,
-)
+from torchrl_koap.training.command_model import build_decoder, fit_decoder, gripper_columns
 
 
 def recordings(episodes: int = 6, length: int = 60) -> TensorDict:
@@ -38,19 +33,20 @@ def small_decoder() -> CommandDecoder:
 
 def test_commands_are_found_from_windows():
     data = recordings()
-    labelled = LabelBudget(fraction=0.1, unit="window").apply(data, command=slice(0, 2))[0]
+    budget = LabelBudget(fraction=0.1, unit="window")
+    labelled, report = budget.apply(data, command=slice(0, 2), tell_commands=True)
     assert labelled["observation"][:, :2].isnan().all()
     module = small_decoder()
-    found = fit_decoder(module, with_label_commands(labelled, data, slice(0, 2)), updates=600)
-    assert found["labels_used"] == found["commands_told"] == int(labelled["has_action"].sum())
+    found = fit_decoder(module, labelled, updates=600)
+    assert found["labels_used"] == report.commands_told == int(labelled["has_action"].sum())
     x = torch.linspace(0.5, 1.3, 9).unsqueeze(-1)
     torch.testing.assert_close(module(x), torch.cat([x, (3 * x).sin()], -1), atol=0.08, rtol=0)
 
 
 def test_trajectories_that_are_labelled_throughout_need_nothing_added():
-    labelled = LabelBudget(count=2).apply(recordings(), command=slice(0, 2))[0]
+    labelled, report = LabelBudget(count=2).apply(recordings(), command=slice(0, 2), tell_commands=True)
     found = fit_decoder(small_decoder(), labelled, updates=20)
-    assert found["labels_used"] == int(labelled["has_action"].sum()) and found["commands_told"] == 0
+    assert found["labels_used"] == int(labelled["has_action"].sum()) and report.commands_told == 0
 
 
 def test_steps_without_label_are_not_read():
@@ -62,7 +58,7 @@ def test_steps_without_label_are_not_read():
         if weights:
             other["observation"][free] = 1e6
             other["action"][free] = 1e6
-        labelled = with_label_commands(budget.apply(other, command=slice(0, 2))[0], other, slice(0, 2))
+        labelled = budget.apply(other, command=slice(0, 2), tell_commands=True)[0]
         assert labelled[LABEL_COMMAND][free].isnan().all() and labelled[LABEL_COMMAND][~free].isfinite().all()
         module = small_decoder()
         torch.manual_seed(1)

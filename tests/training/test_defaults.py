@@ -3,6 +3,7 @@
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 
 from torchrl_koap import ControllerConfig, Execution, ExecutionConfig, LabelConfig, PlannerConfig, TrainConfig
@@ -48,6 +49,20 @@ class TestTheTasksPreset:
     )
     def test_is_not_that_of_other_methods(self, method, own):
         assert resolved("po_sorting", method).controller.preset == own
+
+    @pytest.mark.parametrize(("method", "own"), [("koap", "absolute"), ("linear_steps", "absolute"), ("dd", "default")])
+    def test_is_every_methods_where_it_says_what_labels_are(self, method, own):
+        assert resolved("stacking", method).controller.preset == own
+        assert resolved("stacking_unobserved_joints", method).controller.preset == "default"
+
+    def test_needs_commands_that_are_known_to_move_the_state(self):
+        places, reads = ControllerConfig(preset="absolute"), "it is not known which state columns its commands move"
+        assert resolved("aligning", controller=places).controller.preset == "absolute"
+        with pytest.raises(ValueError, match=f"'stacking_unobserved_joints' has no preset 'absolute': {reads}"):
+            resolved("stacking_unobserved_joints", "koap", controller=places)
+        _, arm = make_demonstrations([np.random.rand(20, 2)], [np.random.rand(20, 2)], control_hz=30)
+        with pytest.raises(ValueError, match="has no preset 'absolute': its observation has no part that repeats"):
+            resolve(TrainConfig(out="run", controller=places), arm)
 
     def test_must_be_one_of_the_methods(self):
         with pytest.raises(ValueError, match="method 'pca' has no preset 'paper', it has"):

@@ -39,22 +39,21 @@ def train_tiny(out, demonstrations, planner, method, /, **options):
     return train(TrainConfig(out=out, dataset=str(demonstrations), method=method, **options))
 
 
-def poisoned(data, budget, *, inside=False, told=False):
+def poisoned(data, budget, *, inside=False):
     """Fully labelled data whose actions and commands outside the budget are senseless; or whose labels are others.
 
-    Of a trajectory with a hidden action all commands are: their differences are its actions. But for those of labelled
-    steps where a label tells the command too.
+    Of a trajectory with a hidden action all commands are, as their differences are its actions, but those that labels
+    tell.
     """
     labelled = budget.apply(data, command=TASK.command_columns)[0]
     data = data.clone()
     if inside:
         data["action"] = torch.where(labelled["has_action"], data["action"] * 1.5, data["action"])
-        if told:
-            data["observation"] = torch.where(labelled["has_action"], data["observation"] * 1.5, data["observation"])
+        data["observation"] = torch.where(labelled["has_action"], data["observation"] * 1.5, data["observation"])
         return data
     data["action"] = torch.where(labelled["has_action"], data["action"], POISON)
     for key in ("observation", ("next", "observation")):
-        kept = labelled["has_action"] if told and key == "observation" else torch.zeros_like(labelled["has_action"])
+        kept = labelled["has_action"] if key == "observation" else torch.zeros_like(labelled["has_action"])
         data[key] = torch.where(labelled[key].isnan() & ~kept, POISON, data[key])
     return data
 
@@ -64,17 +63,17 @@ def weights(folder: Path) -> bytes:
 
 
 # a trajectory that is labelled throughout tells its commands too
-CASES = [(method, "window") for method in METHODS]
-CASES += [(name, "trajectory") for name, method in METHODS.items() if name == "koap" or method.knows_commands]
+CASES = [(method, "window", None) for method in METHODS] + [("koap", "window", "absolute")]
+CASES += [(method, "trajectory", None) for method in ("koap", "command_regression")]
 
 
-@pytest.mark.parametrize(("method", "unit"), CASES)
+@pytest.mark.parametrize(("method", "unit", "preset"), CASES)
 def test_no_weight_of_any_method_depends_on_a_hidden_label(
-    method, unit, demonstrations, planner, tmp_path, monkeypatch
+    method, unit, preset, demonstrations, planner, tmp_path, monkeypatch
 ):
     budget = LabelBudget(count=2, unit=unit, seed=0)
     real = open_dataset(demonstrations, task=TASK)[0]
-    outside, inside = (poisoned(real, budget, inside=at, told=METHODS[method].knows_commands) for at in (False, True))
+    outside, inside = (poisoned(real, budget, inside=at) for at in (False, True))
     variants = {"clean": real, "outside": outside, "inside": inside}
     kept = budget.apply(real)[0]["has_action"].squeeze(-1)
     assert (variants["outside"]["action"][~kept] == POISON).all() and 0 < kept.sum() < len(kept)
@@ -82,8 +81,8 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
     assert (variants["outside"]["observation"] > POISON / 2).any()
     for name, data in variants.items():
         monkeypatch.setattr(on_disk, "open_dataset", lambda *a, data=data, **o: (data.clone(), TASK))
-        labels = LabelConfig(count=2, unit=unit)
-        train_tiny(tmp_path / name, demonstrations, planner, method, labels=labels)
+        options = {"labels": LabelConfig(count=2, unit=unit), "controller": ControllerConfig(preset=preset, steps=4)}
+        train_tiny(tmp_path / name, demonstrations, planner, method, **options)
     assert weights(tmp_path / "outside") == weights(tmp_path / "clean")
     assert weights(tmp_path / "inside") != weights(tmp_path / "clean")  # else the test could not fail
     drawn = [(tmp_path / name / "demonstrations.safetensors").read_bytes() for name in ("clean", "outside")]

@@ -42,6 +42,7 @@ class LabelReport:
     seed: int  # of the draw
     available_units: int  # with a label in the data as they came: those that could be drawn
     available_transitions: int  # with a label in the data as they came
+    commands_told: int = 0  # labelled transitions whose command is blank in the observation, and told nevertheless
 
     def __str__(self) -> str:
         share, units = self.labelled_transitions / self.total_transitions, plural_of(self.unit)
@@ -114,13 +115,17 @@ class LabelBudget:
                 raise ValueError(f"labels: episodes are trajectories, got unit {self.unit!r}")
             object.__setattr__(self, "episodes", chosen)
 
-    def apply(self, data: TensorDictBase, *, command: slice | None = None) -> tuple[TensorDictBase, LabelReport]:
+    def apply(
+        self, data: TensorDictBase, *, command: slice | None = None, tell_commands: bool = False
+    ) -> tuple[TensorDictBase, LabelReport]:
         """Hides all labels outside the budget.
 
         Args:
             data (TensorDictBase): flat data ``[N]``; not changed. Without ``has_action``, actions that are NaN
                 throughout are taken to be missing (:func:`mark_labels`).
             command (slice, optional): columns of the observation that repeat the command, for :func:`hide_commands`.
+            tell_commands (bool): a label tells the command that its action changes, too: labelled steps keep it in
+                ``label_command``. Of hidden actions nothing but the sum of those between two labels follows from it.
 
         Returns:
             tuple: a copy of the data within the budget, and what was spent.
@@ -148,10 +153,15 @@ class LabelBudget:
             kept[begin:behind] = available[begin:behind]
 
         has_action = torch.from_numpy(kept).to(data.get(keys.ACTION).device).unsqueeze(-1)
-        labelled = data.clone().set(keys.HAS_ACTION, has_action)
+        labelled, told = data.clone().set(keys.HAS_ACTION, has_action), 0
         labelled.set(keys.ACTION, torch.where(has_action, data.get(keys.ACTION), math.nan))
         if command is not None:
             labelled = hide_commands(labelled, command)
+            if tell_commands:
+                last = data.get(keys.LABEL_COMMAND, data.get(keys.OBSERVATION)[:, command])
+                labelled.set(keys.LABEL_COMMAND, torch.where(has_action, last, math.nan))
+                blank = labelled.get(keys.OBSERVATION)[:, command].isnan().any(-1, keepdim=True)
+                told = int((blank & has_action).sum())
         touched = np.add.reduceat(kept, starts, dtype=np.int64) > 0
         report = LabelReport(
             unit=self.unit,
@@ -165,6 +175,7 @@ class LabelBudget:
             seed=self.seed,
             available_units=int(usable.sum()),
             available_transitions=int(available.sum()),
+            commands_told=told,
         )
         return labelled, report
 

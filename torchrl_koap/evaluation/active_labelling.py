@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
@@ -195,7 +194,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
             " train with `--method koap`"
         )
     data, report = trained.hide_labels(trained.data(config.dataset))
-    steps = infer_steps(controller, controller_view(data, trained.columns, targets=task.targets))
+    steps = infer_steps(controller, trained.seen(data))
     left = int(steps[EPISODE][~steps[HAS_ACTION]].unique().numel())
     count = max(1, min(_FEW, left)) if config.count is None else config.count
     choices = rank_trajectories(

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import controller_view
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.closed_loop import find_environment
 from torchrl_koap.evaluation.config import RolloutConfig, check_rollouts
@@ -165,5 +164,4 @@ def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) ->
         for name, part in task.state_slices.items()
     }
     parts = {name: places for name, places in parts.items() if places}
-    view = controller_view(data, columns, targets=task.targets)
-    return analyse_latent(controller, view, labelled, parts)
+    return analyse_latent(controller, trained.seen(data), labelled, parts)

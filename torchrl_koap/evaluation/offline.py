@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.data_errors import errors_left_out, errors_of_chunks, errors_outside_budget, plan_errors
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.loop_on_labels import check_loop
@@ -105,8 +104,7 @@ def _outside_budget(
         return {"note": f"method {trained.config.method!r} samples actions: it decodes no recorded states"}, {}
     if trained.method.fit is not None:
         return {"note": _COMMANDS}, {}
-    view, seen = (controller_view(part, trained.columns, targets=trained.task.targets) for part in (data, labelled))
-    return errors_outside_budget(trained.controller.cpu(), view, seen, trained.task)
+    return errors_outside_budget(trained.controller.cpu(), trained.seen(data), trained.seen(labelled), trained.task)
 
 
 def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, Any]) -> dict[str, Any]:
@@ -118,8 +116,7 @@ def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, 
         return {"note": _COMMANDS}
     if not trained.method.closed_form:
         return {"note": "the decoder is not fitted in closed form: leaving a trajectory out would mean to train again"}
-    seen = controller_view(labelled, trained.columns, targets=trained.task.targets)
-    return errors_left_out(trained.controller.cpu(), seen, trained.task, trained.columns)
+    return errors_left_out(trained.controller.cpu(), trained.seen(labelled), trained.task, trained.columns)
 
 
 def _per_trajectory(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[dict[str, Any]]:

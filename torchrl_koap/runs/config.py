@@ -95,7 +95,8 @@ class ControllerConfig:
     """The controller, which turns states into actions. None: the method's default, else the task's.
 
     Attributes:
-        preset: variant of KOAP: "default", "semi_supervised" or "paper".
+        preset: variant of KOAP: "default", "semi_supervised", "paper", or "absolute", which learns commands in place of
+            their changes (labels then tell the command too).
         steps: updates (default: 500); with 0 only a closed form is fitted.
         columns: what it reads: "robot" (the robot's own columns) or "all" (KOAP's configurations).
 

@@ -99,7 +99,12 @@ _STACKING = register_task(
             " never moved and for those dropped on the way.",
             camera="front",
         ),
-        defaults=Defaults(method="mpc", demonstrations=1000, planner={"steps": 18000, "network": "mlp"}),
+        defaults=Defaults(
+            method="mpc",
+            demonstrations=1000,
+            planner={"steps": 18000, "network": "mlp"},
+            controller={"preset": "absolute"},  # joints follow their commands alike, wherever they are
+        ),
     )
 )
 _STACKING_1 = register_task(
@@ -125,6 +130,7 @@ register_task(
         robot=tuple(range(4)),  # position of the tool, width of the gripper
         tool_kinematics=None,
         actions=_JOINTS | {"gripper": Action("m", "absolute")},
-        defaults=replace(_STACKING.defaults, method="command_regression"),  # what the commands move is not seen
+        # what the commands move is not seen
+        defaults=replace(_STACKING.defaults, method="command_regression", controller={}),
     )
 )

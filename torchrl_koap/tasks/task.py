@@ -43,7 +43,8 @@ class Defaults:
             no column is a position that could be shifted.
         planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
             another one that is asked for by name comes with its own.
-        controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``.
+        controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``, but
+            ``"absolute"`` that of every method which has it.
         execution (dict): fields of :class:`~torchrl_koap.Execution`.
     """
 

@@ -9,14 +9,13 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
+from torchrl_koap.keys import HAS_ACTION, LABEL_COMMAND, OBSERVATION, STATE
 from torchrl_koap.modules import CommandDecoder
 from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.policy_facts import check_commanded
 
-LABEL_COMMAND = "label_command"  # last commands at labelled steps [N, J], NaN elsewhere
 SHARE = 16  # updates for each of another controller's, up to UPDATES
 UPDATES, BATCH, RATE, WEIGHT_DECAY = 8000, 512, 2e-3, 1e-4
 
@@ -49,34 +48,17 @@ def gripper_columns(task: Task) -> list[int] | None:
     return next(([i, part.start] for i, part in widths if part is not None), None)
 
 
-def with_label_commands(labelled: TensorDictBase, data: TensorDictBase, command: slice) -> TensorDictBase:
-    """Adds the last commands at labelled steps, which the budget has blanked where other steps are not labelled.
-
-    A recording holds commands, and an action is the difference of two of them: whoever labels a step knows both. What
-    is added is what labelled steps have, one command each; of the steps between nothing but the sum of their actions
-    could be told from it.
-
-    ``labelled`` are flat data ``[N]`` after the label budget was applied, ``data`` the same before, ``command`` the
-    columns of the observation that repeat the command. A shallow copy is returned.
-    """
-    known = data[OBSERVATION][:, command].to(labelled[OBSERVATION].device)
-    return labelled.copy().set(LABEL_COMMAND, torch.where(labelled[HAS_ACTION], known, torch.nan))
-
-
 def fit_decoder(decoder: CommandDecoder, data: TensorDictBase, *, updates: int = UPDATES) -> dict[str, Any]:
     """Regresses the commands at labelled steps of flat data ``[N]`` on the whole state, in updates of 512 steps each.
 
-    Commands are those of :data:`LABEL_COMMAND` where it is there (:func:`with_label_commands`), else those of the
-    observation, which the budget leaves in trajectories that are labelled throughout.
+    Commands are those that labels tell (``label_command``), or of the observation where none does.
 
-    Returned are ``labels_used``; ``commands_told``, how many of them told a command that the budget blanks because it
-    is the sum of actions some of which are hidden; and ``fit_error``: root mean square over the labels used, in the
-    unit of the commands.
+    Returned are ``labels_used`` and ``fit_error``: root mean square over the labels used, in the unit of the commands.
 
     Raises:
         ValueError: if no labelled step has a known command.
     """
-    states, commands, told = _labelled(data, decoder)
+    states, commands = _labelled(data, decoder)
     if not len(states):
         raise ValueError("a regression of commands needs labelled steps whose command is known, there are none")
     decoder.set_scales(states, commands)
@@ -95,13 +77,15 @@ def fit_decoder(decoder: CommandDecoder, data: TensorDictBase, *, updates: int =
     with torch.no_grad():
         errors = [decoder(x) - c for x, c in zip(states.split(8192), commands.split(8192), strict=True)]
     error = torch.cat(errors).square().mean().sqrt().item()
-    return {"labels_used": len(states), "commands_told": told, "fit_error": float(f"{error:.4g}")}
+    return {"labels_used": len(states), "fit_error": float(f"{error:.4g}")}
 
 
-def _labelled(data: TensorDictBase, decoder: CommandDecoder) -> tuple[Tensor, Tensor, int]:
-    """States ``[n, d]`` and commands ``[n, J]`` of labelled steps whose command is known, and how many were told."""
-    seen = data[OBSERVATION][:, decoder.commands]
-    commands = data[LABEL_COMMAND][:, decoder.actions] if LABEL_COMMAND in data.keys() else seen
+def _labelled(data: TensorDictBase, decoder: CommandDecoder) -> tuple[Tensor, Tensor]:
+    """States ``[n, d]`` and commands ``[n, J]`` of labelled steps whose command is known."""
+    if LABEL_COMMAND in data.keys():
+        commands = data[LABEL_COMMAND][:, decoder.actions]
+    else:
+        commands = data[OBSERVATION][:, decoder.commands]
     states = data[STATE].float()
     rows = data[HAS_ACTION].reshape(-1) & ~commands.isnan().any(-1) & ~states.isnan().any(-1)
-    return states[rows], commands[rows].float(), int(seen[rows].isnan().any(-1).sum())
+    return states[rows], commands[rows].float()

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import controller_view, cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
@@ -22,7 +22,7 @@ from torchrl_koap.training.method import LABELLED_SHARES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import augmentation
-from torchrl_koap.training.policy_facts import command_ranges
+from torchrl_koap.training.policy_facts import command_ranges, controller_data
 
 BATCH_SIZE, LEARNING_RATE = 256, 1e-3
 _KEYS = ["state", "action", "has_action"]
@@ -56,16 +56,11 @@ def learn_controller(
     }
 
 
-def _view(task: Task, config: TrainConfig, data: TensorDictBase) -> TensorDictBase:
-    """Flat data ``[N]`` as the controller sees them: its columns, and actions as distances to their targets."""
-    return controller_view(data, task.controller_columns(config.controller.columns), targets=task.targets)
-
-
 def _train_network(
     task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
     """A controller's phases, and its closed form if it has one."""
-    data, budget = _view(task, config, data), config.controller.steps
+    data, budget = controller_data(task, config.controller, data), config.controller.steps
     controller = build_controller(task, method, config.controller, data).to(config.run.device)
     history = controller.num_past
     window = max(WINDOW, controller.num_window_frames)
@@ -137,7 +132,7 @@ def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDi
     """The data with the teacher's actions where there is no label."""
     phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
     controller, _, _ = _train_network(task, config, replace(teacher, phases=phases), data, loop)
-    view = _view(task, config, data)
+    view = controller_data(task, config.controller, data)
     labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
     if task.targets:
         labelled["action"] = labelled["action"] + data["state"][..., list(task.targets)]

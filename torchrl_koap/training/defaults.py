@@ -18,9 +18,9 @@ from torchrl_koap.tasks import HISTORY, Task
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import NETWORKS
+from torchrl_koap.training.policy_facts import PLACES, decoded_commands
 
 CONTROLLER_UPDATES = 500
-PLACES = "absolute"  # what the default preset is where actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.7  # of plans where no figure counts the modes
@@ -95,8 +95,8 @@ def _taken_over(asked: PlannerConfig) -> PlannerConfig:
 
 def _controller(asked: ControllerConfig, method: Method, task: Task) -> ControllerConfig:
     own = dict(task.defaults.controller)
-    if method.name != task.defaults.method:
-        own.pop("preset", None)  # of the task's own method
+    if own.get("preset") not in method.presets or (method.name != task.defaults.method and own["preset"] != PLACES):
+        own.pop("preset", None)  # of the task's own method; what its labels are learned as is every method's
     declared = {"columns": method.columns, "steps": method.updates}
     library = {"preset": method.presets[0], "steps": CONTROLLER_UPDATES, "columns": "robot"}
     section = _filled(asked, {k: v for k, v in declared.items() if v is not None}, own, library)
@@ -105,6 +105,7 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
     preset = "default" if places and section.preset == PLACES else section.preset
     if preset not in method.presets:
         raise ValueError(f"method {method.name!r} has no preset {preset!r}, it has {list(method.presets)}")
+    decoded_commands(task, preset)
     return replace(section, preset=PLACES if places and preset == "default" else preset)
 
 

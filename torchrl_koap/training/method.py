@@ -13,6 +13,8 @@ from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import Execution
+from torchrl_koap.tasks import Task
+from torchrl_koap.training.policy_facts import decoded_commands
 
 # share of every batch that has labels; None: as it comes
 LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
@@ -79,8 +81,7 @@ class Method:
         fit (callable, optional): ``fit(controller, data, updates) -> dict`` fits a controller that is no inverse
             dynamics to flat data after the label budget was applied, in place of phases and closed form; returns
             numbers for the summary.
-        knows_commands (bool): it is told the last command at every labelled step, which is a recording's as the action
-            is (:func:`~torchrl_koap.training.command_model.with_label_commands`).
+        knows_commands (bool): its labels tell the command that an action changes, too, in all tasks.
 
     Raises:
         ValueError: for a name that cannot be a folder's, two phases of one name, or an unknown default.
@@ -121,3 +122,7 @@ class Method:
         if self.fit is not None and (names or self.closed_form):
             raise ValueError(f"method {self.name!r}: fit comes without phases or closed form")
         Execution().replaced(**self.execution)
+
+    def told_commands(self, task: Task, preset: str) -> bool:
+        """Says whether its labels tell the command that an action changes, too (:meth:`LabelBudget.apply`)."""
+        return self.knows_commands or decoded_commands(task, preset) is not None

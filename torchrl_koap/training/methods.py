@@ -45,6 +45,7 @@ from torchrl_koap.objectives import ActionLoss, DiffusionPolicyLoss, KOAPLoss, Q
 from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, fit_decoder
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.networks import build_sampler
+from torchrl_koap.training.policy_facts import PLACES
 from torchrl_koap.training.response import fit_response, tracked_columns
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
@@ -181,7 +182,13 @@ for _method in (
         updates=1000,
         execution=_AS_PLANNED,
     ),
-    Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
+    Method(
+        "linear_steps",
+        "ridge on KOAP's scaled steps",
+        partial(_koap, num_features=0),
+        closed_form=True,
+        presets=("default", PLACES),
+    ),
     Method(
         "pca",
         "ridge on principal components of unlabelled windows",

@@ -28,7 +28,6 @@ from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory
 from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
 from torchrl_koap.tasks import WINDOW, Task
 from torchrl_koap.tasks.registry import task_from
-from torchrl_koap.training.command_model import with_label_commands
 from torchrl_koap.training.controller import learn_controller
 from torchrl_koap.training.datasets import (
     choose_held_out,
@@ -185,9 +184,8 @@ def _read_data(
         data["action"] = torch.full_like(data["action"], torch.nan)
         data["has_action"] = torch.zeros_like(data["has_action"])
         return subsample_trajectories(data, share).to(config.run.device), held_out, None
-    labelled, report = config.labels.budget(seed).apply(data, command=task.command_columns)
-    if get_method(config.method).knows_commands:
-        labelled = with_label_commands(labelled, data, task.command_columns)
+    told = get_method(config.method).told_commands(task, config.controller.preset)
+    labelled, report = config.labels.budget(seed).apply(data, command=task.command_columns, tell_commands=told)
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:

@@ -28,7 +28,7 @@ from torchrl_koap.training.command_model import gripper_columns
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
-from torchrl_koap.training.policy_facts import policy_facts
+from torchrl_koap.training.policy_facts import controller_data, policy_facts
 from torchrl_koap.vision import Observer, Projection
 from torchrl_koap.vision.encoder import load_cameras
 
@@ -203,7 +203,8 @@ class Trained:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
         gripper = gripper_columns(self.task) if isinstance(self.controller, CommandDecoder) else None
         ranges = self.results.get("command_ranges")
-        facts = policy_facts(self.task, columns=self.columns, gripper=gripper, ranges=ranges)
+        preset = self.config.controller.preset
+        facts = policy_facts(self.task, columns=self.columns, preset=preset, gripper=gripper, ranges=ranges)
         facts["observe"] = Observer.of(self.task, self.cameras)
         if self.method.plans:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
@@ -228,6 +229,10 @@ class Trained:
             )
         return open_dataset(where, task=self.task)[0]
 
+    def seen(self, data: TensorDictBase) -> TensorDictBase:
+        """Flat data ``[N]`` as the controller sees them: its columns, and what actions are learned as."""
+        return controller_data(self.task, self.config.controller, data)
+
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
         """Hides all labels of :meth:`data` that the training did not see: their actions are NaN; the budget reports.
 
@@ -235,7 +240,8 @@ class Trained:
             RunDirectoryError: if they are not the demonstrations that it was trained on.
         """
         budget = self.config.labels.budget(self.config.run.seed)
-        hidden, report = budget.apply(data, command=self.task.command_columns)
+        told = self.method.told_commands(self.task, self.config.controller.preset)
+        hidden, report = budget.apply(data, command=self.task.command_columns, tell_commands=told)
         if "labels" not in self.results:
             raise RunDirectoryError(f"{self.folder}: summary.json has no entry 'labels'")
         recorded = self.results["labels"]

@@ -27,6 +27,7 @@ def make_policy(
     action_rule: ActionRule | None = None,
     changes: Sequence[int] = (),
     commanded: Mapping[str, Sequence[int]] | None = None,
+    decodes_commands: bool = False,
     ranges: Ranges | None = None,
     max_steps: int = 400,
     control_hz: float | None = None,
@@ -53,6 +54,7 @@ def make_policy(
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
         commanded (mapping, optional): for each of these the observation column that repeats the command
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
+        decodes_commands (bool): an inverse dynamics decodes what the state lacks of the commands in ``commanded``.
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
         follower (Follower, optional): follows plans in place of the controller.
@@ -74,7 +76,8 @@ def make_policy(
     """
     execution = Execution() if execution is None else execution
     if follower is None and controller is not None:
-        follower = _follow(planner, controller, execution, columns, action_rule)
+        decoded = commanded if decodes_commands else None
+        follower = _follow(planner, controller, execution, columns, action_rule, decoded)
     limits, margin = None, execution.limits
     ranges = None if ranges is None or margin == math.inf else [_widened(r, margin) for r in ranges]
     if execution.gain != 1 or execution.lead or ranges is not None:
@@ -115,6 +118,7 @@ def _follow(
     execution: Execution,
     columns: Sequence[int] | None,
     action_rule: ActionRule | None,
+    commands: Mapping[str, Sequence[int]] | None,
 ) -> Follower:
     options: dict[str, Any] = {"blend": execution.blend, "action_rule": action_rule}
     if isinstance(controller, ResponseModel):
@@ -122,4 +126,4 @@ def _follow(
         return MPC(controller, look_ahead=look_ahead, **options)
     if isinstance(controller, CommandDecoder):
         return CommandRegression(controller, **options)
-    return InverseDynamicsFollower(controller, columns=columns, **options)
+    return InverseDynamicsFollower(controller, columns=columns, commands=commands, **options)

@@ -32,7 +32,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     # decoder in closed form
     "default": _DEFAULT
     | {"num_features": 512, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "position_weight": 0.0},
-    # actions that say where the robot is to be: what is read off the present frame counts more than the steps around it
+    # actions, or commands, that say where the robot is to be: what is read off the present frame counts more than the
+    # steps around it
     "absolute": _DEFAULT
     | {
         # such places are far from zero compared with their spread; among principal components size is information
