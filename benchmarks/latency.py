@@ -42,6 +42,7 @@ from torchrl_koap.modules.execution.export import (
     exportable,
     relative_gap,
 )
+from torchrl_koap.modules.windows import StateReader
 
 RESULTS = Path(__file__).resolve().parent / "results" / "exported_policy.csv"
 TOLERANCE = 1e-5
@@ -63,7 +64,8 @@ class SlowPlanner(StatePlanner):
 def default_policy() -> tuple[PlanningPolicy, int]:
     """A policy for seven joints and their goals, of the size that ``koap train`` gives it, and its observation."""
     planner = StatePlanner(TemporalUnet(14, 28, channels=(64, 128)), state_dim=14)
-    return make_policy(planner, make_koopman_inverse_dynamics(7, 7), state_of=range(14), columns=range(7)), 14
+    controller = make_koopman_inverse_dynamics(7, 7)
+    return make_policy(planner, controller, state_of=range(14), reads=StateReader(range(7))), 14
 
 
 def compiled(what: Exportable) -> Callable:

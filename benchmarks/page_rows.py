@@ -17,12 +17,12 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from paper_rows import count_by_observations, count_successes, finished_cells, label_shares, paper_cells_beside
-from tables import SOURCE, fact, percent, planner_rows, read_rows, table
+from tables import SOURCE, fact, percent, read_rows, table
 from unlabelled_rows import REGIMES, followed
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, set_title, tidy
-from torchrl_koap.studies.paper import Entry, default_entries
+from torchrl_koap.studies.paper import Entry
 from torchrl_koap.tasks.scooping import CAMERA, FRAME_HZ
 
 STARTS = ("left", "near", "right")
@@ -30,6 +30,8 @@ _CELL = ("labels", "unlabelled", "method")
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "scooping.png"
 SHOWN = 5  # frames of each film
 LABELS = ("2", "5")
+# what is labelled of a task
+CONTROLLERS = {"avoiding": "1 trajectory", "stacking": "1 % of windows"}
 COLORS = {"koap": BLUE, "koap_untrained": PALE_BLUE, "dp": MUTED, "linear": ORANGE}
 NAMES = {
     "koap": "KOAP",
@@ -37,11 +39,6 @@ NAMES = {
     "dp": "Diffusion Policy",
     "linear": "ridge, raw frames",
 }
-
-
-def rate(rows: Sequence[Mapping[str, str]]) -> str:
-    """Formats the success of several rows together in whole percent, with its interval."""
-    return percent({key: sum(int(row[key]) for row in rows) for key in ("successes", "n")}, 0)
 
 
 def bench_rate(name: str, task: str, method: str, level: int = 0) -> str:
@@ -62,19 +59,16 @@ def minutes(name: str, column: str) -> str:
 
 
 def paper_success_table(name: str) -> str:
-    """Formats a row per task and method: success of ours and of the paper's KOAP, a column per label level.
+    """Formats a row per task: success of KOAP and of the paper's KOAP, a column per label level.
 
     Between them an arrow says that ours is above or below what the paper prints around its mean, "=" that it is within.
     """
-    entries = paper_cells_beside(name)
-    rows: dict[tuple[str, str], dict[int, str]] = {}
-    for entry in [*(each for each in entries if each.method == "koap"), *default_entries(entries)]:
-        if entry.method != "koap" and entry.task != "stacking_unobserved_joints":
-            continue
-        called = "`koap`" if entry.method == "koap" else "`command_regression`"
-        rows.setdefault((f"`{entry.task}`", called), {})[entry.level] = _beside_the_paper(entry)
-    body = [[*names, *(cells.get(level, "not run") for level in range(1, 6))] for names, cells in rows.items()]
-    return table(["task", "method", *(f"level {level}" for level in range(1, 6))], body)
+    rows: dict[str, dict[int, str]] = {}
+    for entry in paper_cells_beside(name):
+        if entry.method == "koap":
+            rows.setdefault(f"`{entry.task}`", {})[entry.level] = _beside_the_paper(entry)
+    body = [[task, *(cells.get(level, "not run") for level in range(1, 6))] for task, cells in rows.items()]
+    return table(["task", *(f"level {level}" for level in range(1, 6))], body)
 
 
 def _beside_the_paper(entry: Entry) -> str:
@@ -87,21 +81,14 @@ def _beside_the_paper(entry: Entry) -> str:
 
 
 def controllers_table() -> str:
-    """Formats success of KOAP and of another controller behind the same planner."""
+    """Formats success of KOAP, its controls and `mpc` behind the same planner."""
     body = []
-    for task, other, text in (
-        ("avoiding", "mpc", "1 trajectory"),
-        ("stacking", "mpc", "1 % of windows"),
-    ):
-        found = (planner_rows(task, method) for method in ("koap", other))
-        body.append([f"`{task}`", text, *(f"{rate(rows)} of {sum(int(row['n']) for row in rows)}" for rows in found)])
-        body[-1].insert(3, f"`{other}`")
-    cells = [
-        count_successes("table_1", "stacking_unobserved_joints", name, 0.01) for name in ("koap", "command_regression")
-    ]
-    told = [f"{percent(counts, 0)} of {counts['n']}" for counts in cells]
-    body.append(["`stacking_unobserved_joints`", "1 % of windows", told[0], "`command_regression`", told[1]])
-    return table(["task", "labelled", "KOAP", "other controller", "its success"], body)
+    for task, text in CONTROLLERS.items():
+        names = ("koap", "koap_untrained", "linear_steps", "mpc")
+        cells = [count_successes("controllers", task, name, 0.01) for name in names]
+        told = [f"{percent(counts, 0)} of {counts['n']}" if counts["n"] else "not run" for counts in cells]
+        body.append([f"`{task}`", text, *told])
+    return table(["task", "labelled", "KOAP", "random features", "ridge regression", "`mpc`"], body)
 
 
 FOLLOWED = {
@@ -187,12 +174,6 @@ def speed_table() -> str:
         ["60 copies of Avoiding", f"{int(env['median']):,} control steps per second"],
     ]
     return table(["what", "time or rate"], body)
-
-
-def planner_minutes(task: str, method: str) -> str:
-    """Formats how long each planner of a task was trained."""
-    seconds = [float(row["train_seconds"]) for row in planner_rows(task, method) if row["train_seconds"]]
-    return f"{max(seconds) / 60:.0f} minutes of training"
 
 
 def observation_rate(name: str, method: str, part: float) -> str:

@@ -128,8 +128,10 @@ def bench_sentence(name: str, method: str = "") -> str:
 
 
 def draw_bench_average(name: str, path: Path) -> Path:
-    """Draws the success of a comparison averaged over its tasks."""
-    return draw_average(paper_cells_beside(name), path)
+    """Draws the success of a comparison averaged over the tasks on which KOAP was run at every level."""
+    entries = paper_cells_beside(name)
+    gaps = {entry.task for entry in entries if entry.method == "koap" and entry.success is None}
+    return draw_average([entry for entry in entries if entry.task not in gaps], path)
 
 
 def few_labels_table(name: str, all_labels: str) -> str:
@@ -152,14 +154,8 @@ def few_labels_table(name: str, all_labels: str) -> str:
 
 
 def bench_rollouts(name: str) -> str:
-    """Rollouts of all seeds together of KOAP with the fewest labels, the same number for every task."""
-    (number,) = {count_successes(name, task, "koap", label_shares(name, task)[0])["n"] for task in PAPER_TASKS}
-    return str(number)
-
-
-def bench_pooled(name: str, task: str, method: str) -> str:
-    """Success of all seeds of a method with the fewest labels of a task."""
-    return _pooled(name, task, method) + " %"
+    """Rollouts of all seeds together of KOAP with the fewest labels, of the task that has most."""
+    return str(max(count_successes(name, task, "koap", label_shares(name, task)[0])["n"] for task in PAPER_TASKS))
 
 
 def label_shares(name: str, task: str) -> list[float]:
@@ -179,6 +175,8 @@ def count_successes(name: str, task: str, method: str, labels: float) -> Counter
 def _pooled(name: str, task: str, method: str, labels: float | None = None) -> str:
     """Success of all seeds in whole percent with its Wilson interval; by default with the fewest labels of the task."""
     counts = count_successes(name, task, method, labels or label_shares(name, task)[0])
+    if not counts["n"]:
+        return "not run"
     low, high = (100 * end for end in wilson_interval(counts["successes"], counts["n"]))
     return f"{100 * counts['successes'] / counts['n']:.0f} ({low:.0f}-{high:.0f})"
 

@@ -11,25 +11,15 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-from matplotlib.ticker import FixedLocator, NullLocator
+from page_rows import CONTROLLERS
 from paper_rows import count_by_observations, count_successes, draw_bench_average, label_shares
-from tables import fact, planner_rows, read_rows
+from tables import fact, read_rows
 from unlabelled_rows import draw_unlabelled
 
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, set_title, tidy
-from torchrl_koap.studies.plots import method_styles
+from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, tidy
 from torchrl_koap.studies.study import PAPER_TASKS
 
-_NAMES = {
-    "koap": "KOAP",
-    "koap_untrained": "KOAP, features untrained",
-    "linear_steps": "ridge, KOAP's inputs",
-    "linear": "ridge, raw frames",
-    "dd_lookahead": "supervised, look-ahead",
-    "dd": "supervised, next state",
-    "dp": "Diffusion Policy",
-}
 Point = tuple[float, float, float, float]  # x, mean, low, high
 Bar = tuple[str, float, float, float]  # name, mean, low, high
 COLORS = (BLUE, ORANGE, "#0b6e4f", "#7a7a7a")
@@ -46,7 +36,6 @@ def draw_all(folder: Path) -> list[Path]:
     latent = {"Koopman model": "latent_koopman", "linear model on states": "latent_linear", "no motion": "latent_still"}
     ways = [(row["way"], float(row["p50_ms"]), float(row["p99_ms"])) for row in read_rows("exported_policy")]
     return [
-        draw_label_curves(label_curves(), folder / "success_and_entropy.png"),
         draw_pipeline(folder / "pipeline.svg"),
         draw_bench_average("table_1", folder / "paper_average.png"),
         draw_unlabelled(folder / "unlabelled_data.png"),
@@ -74,53 +63,6 @@ def draw_all(folder: Path) -> list[Path]:
             folder / "speed.png",
         ),
     ]
-
-
-def label_curves() -> dict[str, list[dict[str, float]]]:
-    """Success with its interval and entropy against the labels on Avoiding, by method."""
-    lines: dict[str, list[dict[str, float]]] = {method: [] for method in _NAMES}
-    for row in read_rows("label_curves", study="avoiding"):
-        if row["method"] in lines:
-            won, of = int(row["successes"]), int(row["n"])
-            point = dict(zip(("low", "high"), wilson_interval(won, of), strict=True)) | {"success": won / of}
-            point |= {"fraction": float(row["label_fraction"]), "entropy": float(row["entropy"])}
-            lines[row["method"]].append(point)
-    return lines
-
-
-def draw_label_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> Path:
-    """Success with its interval, and entropy, against the labelled share, a line per method.
-
-    Args:
-        curves (mapping): by method its points, each with ``fraction``, ``success``, ``low``, ``high``, ``entropy``.
-        path (Path): png to write.
-    """
-    figure = Figure(figsize=(9.6, 3.9), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    styles = method_styles(list(curves))
-    for index, (method, points) in enumerate(curves.items()):
-        style = styles[method]
-        shift = 1.02 ** (index - (len(curves) - 1) / 2)  # whiskers beside each other
-        place = [point["fraction"] * shift for point in points]
-        line = {"color": style["color"], "marker": style["marker"], "linestyle": style["linestyle"], "markersize": 4.5}
-        line |= {"linewidth": 1.5, "label": _NAMES.get(method, method)}
-        left.plot(place, [100 * point["success"] for point in points], **line)
-        ends = [100 * point["low"] for point in points], [100 * point["high"] for point in points]
-        left.vlines(place, *ends, color=style["color"], linewidth=0.9, alpha=0.5)
-        right.plot(place, [point["entropy"] for point in points], **line)
-    shares = sorted({point["fraction"] for points in curves.values() for point in points})
-    for axes, label, limits in ((left, "success (%)", (38, 102)), (right, "entropy of the modes", (-0.04, 1.04))):
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(FixedLocator(shares))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
-        axes.set(ylabel=label, ylim=limits, xlabel="demonstrations whose actions are known")
-        axes.grid(axis="y", color=FAINT, linewidth=0.5)
-        tidy(axes)
-    set_title(left, "Avoiding: success, 95 % intervals")
-    set_title(right, "variety of the successful rollouts (1: all modes alike often)")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
-    return _save(figure, path)
 
 
 def draw_pipeline(path: Path) -> Path:
@@ -186,14 +128,10 @@ def _interval(successes: int, trials: int) -> tuple[float, float, float]:
 def _controllers() -> list[Bar]:
     """Success of KOAP and of another controller behind the same planner."""
     bars = []
-    for task, other in (("avoiding", "mpc"), ("stacking", "mpc")):
-        for method in ("koap", other):
-            rows = planner_rows(task, method)
-            counts = (sum(int(row[key]) for row in rows) for key in ("successes", "n"))
-            bars.append((f"{task}: {method}", *_interval(*counts)))
-    for method in ("koap", "command_regression"):
-        counts = count_successes("table_1", "stacking_unobserved_joints", method, 0.01)
-        bars.append((f"joints hidden: {method}", *_interval(counts["successes"], counts["n"])))
+    for task in CONTROLLERS:
+        for method in ("koap", "mpc"):
+            counts = count_successes("controllers", task, method, 0.01)
+            bars.append((f"{task}: {method}", *_interval(counts["successes"], counts["n"])))
     return bars
 
 
@@ -234,7 +172,8 @@ def draw_few_labels(path: Path) -> Path:
                 (100 * part, count_successes("table_1", task, method, part)) for part in label_shares("table_1", task)
             ]
             points = [(part, *_interval(own["successes"], own["n"])) for part, own in counts if own]
-            _line(axes, points, SHOWN[method], number)
+            if points:
+                _line(axes, points, SHOWN[method], number)
         axes.set_title(task.replace("_unobserved_joints", ", joints hidden").replace("_", " "), fontsize=9)
         axes.set(xscale="log", ylim=(-3, 103))
         axes.set_xticks(

@@ -12,28 +12,6 @@ from torchrl_koap.evaluation.statistics import wilson_interval
 
 SOURCE = Path(__file__).resolve().parent / "results"
 Row = Mapping[str, str]
-WIDE = (
-    "mlp denoiser_width=512 denoiser_depth=4 condition_octaves=1 precision=bfloat16 recovery_sigma=0.004"
-    " planner_learning_rate=0.001"
-)
-# rows of planner_ablations.csv: the planner that a task is trained with unless told otherwise
-_PLANNERS: dict[str, dict[str, Any]] = {
-    "avoiding": {
-        "denoiser": "unet channels=(32, 64) recovery_sigma=0.004 planner_learning_rate=0.003",
-        "labels": "1 trajectory",
-        "demonstrations": 96,
-    },
-    "aligning": {
-        "denoiser": f"{WIDE} observed_frames=1",
-        "labels": "0.02 of windows",
-        "disturbed": 0.5,
-        "updates": 8000,
-    },
-    "sorting": {"denoiser": f"{WIDE} observed_frames=1", "labels": "0.01 of windows"},
-    "po_sorting": {"denoiser": f"{WIDE} observed_frames=1", "labels": "0.01 of windows", "action_gain": 1.15},
-    "stacking": {"labels": "0.01 of windows"},
-    "stacking_unobserved_joints": {"labels": "0.01 of windows"},
-}
 
 
 def read_rows(name: str, **wanted: Any) -> list[dict[str, str]]:
@@ -60,14 +38,6 @@ def percent(row: Mapping[str, Any], digits: int = 1) -> str:
     successes, trials = int(row["successes"]), int(row["n"])
     low, high = (100 * end for end in wilson_interval(successes, trials))
     return f"{100 * successes / trials:.{digits}f} % ({low:.{digits}f}-{high:.{digits}f})"
-
-
-def success(row: Row) -> str:
-    """Formats the success of a row in percent, its interval in whole percent, and the entropy."""
-    successes, trials = int(row["successes"]), int(row["n"])
-    low, high = (100 * end for end in wilson_interval(successes, trials))
-    entropy = f", {float(row['entropy']):.2f}" if row.get("entropy") else ""
-    return f"{100 * successes / trials:.1f} ({low:.0f}-{high:.0f}){entropy}"
 
 
 def share(fraction: str | float) -> str:
@@ -107,30 +77,6 @@ def total(rows: Sequence[Row], **first: str) -> list[dict[str, str]]:
     return [*map(dict, rows), dict.fromkeys(rows[0], "") | sums | first]
 
 
-def pivot(rows: Sequence[Row], cell: Any, *, by: str = "label_fraction", head: str = "method") -> str:
-    """Formats a table with a row per method and a column per share of labels.
-
-    Args:
-        rows (sequence of mapping): rows of a file.
-        cell (callable or str): from a row to a text, or a column.
-
-    Keyword Args:
-        by (str): column that tells the columns apart.
-        head (str): heading of the first column.
-    """
-    levels = list(dict.fromkeys(row[by] for row in rows))
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    text = cell if callable(cell) else lambda row: row[cell]
-    found = {(row["method"], row[by]): text(row) for row in rows}
-    body = [[f"`{method}`", *(found.get((method, level), "") for level in levels)] for method in methods]
-    return table([head, *map(share, levels)], body)
-
-
-def difference(row: Row) -> str:
-    """Formats a difference in percentage points with its interval."""
-    return f"{float(row['difference']):+.1f} ({int(row['low']):+d} to {int(row['high']):+d})"
-
-
 def fact(key: str, form: str = "") -> str:
     """Formats a single figure of ``facts.csv`` with its unit.
 
@@ -144,15 +90,6 @@ def fact(key: str, form: str = "") -> str:
     if form == "count":
         return f"{row['successes']} of {row['n']}"
     return row["value"] if form == "bare" or not row["unit"] else f"{row['value']} {row['unit']}"
-
-
-def label_sizes(study: str) -> str:
-    """Formats a table of what every share of the labels of a study is."""
-    found = {row["label_fraction"]: row for row in read_rows("label_curves", study=study)}
-    rows = [row | {"share": share(fraction)} for fraction, row in found.items()]
-    return columns(
-        rows, share="{share}", demonstrations="{labelled_trajectories}", transitions="{labelled_transitions:,}"
-    )
 
 
 def kills(rows: Sequence[Row]) -> list[dict[str, str]]:
@@ -175,14 +112,6 @@ def kills(rows: Sequence[Row]) -> list[dict[str, str]]:
 def every(rows: Sequence[Row], count: int = 4) -> list[Row]:
     """Picks the first row, the last, and a few between."""
     return [*rows[: -1 : max(1, len(rows) // count)], rows[-1]]
-
-
-def planner_rows(task: str, method: str, **wanted: Any) -> list[dict[str, str]]:
-    """Reads rollouts of a method behind the default planner of a task, one candidate plan, a row per training seed."""
-    known = _PLANNERS[task] | {"task": task, "method": method, "controller": "learned", "candidates": 1} | wanted
-    rows = [row for row in read_rows("planner_ablations", **known) if row["note"] in ("", wanted.get("note", ""))]
-    best = max((row["denoiser"] for row in rows), key=len, default="")  # with fingers that close on nothing
-    return [row for row in rows if row["denoiser"] == best]
 
 
 def commands(rows: Sequence[Row]) -> str:

@@ -69,8 +69,8 @@ Cell = tuple[str, int]  # method, number of labelled trajectories
 
 
 def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
-    """Flat data with the robot's own columns as ``state``."""
-    return controller_view(data, task.controller_columns("robot"), targets=task.targets)
+    """Flat data with the robot's own columns as ``state``, and targets, but no commands, as distances from it."""
+    return controller_view(data, task.controller_columns("robot"), distances=tuple(enumerate(task.targets)))
 
 
 def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:

@@ -38,7 +38,7 @@ def test_seeds_of_a_cell_with_the_fewest_labels_are_counted_together(rows, made)
         cell("dp", 0.5, 9) | {"seed": 1},
     ]
     made["made"] = cells
-    assert rows.bench_pooled("made", "avoiding", "dp") == "42 (33-51) %"  # 50 of 120
+    assert rows.count_successes("made", "avoiding", "dp", 0.02) == {"successes": 50, "n": 120}
 
 
 def test_cells_of_another_comparison_stand_beside(rows, made):

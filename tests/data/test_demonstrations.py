@@ -92,7 +92,7 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
     names = {"state_names": NAMES, "robot": ["q1", "q2"]}
     folder = save_demonstrations(tmp_path / "reach", STATES, targets, control_hz=20, action_kind="absolute", **names)
     data, task = open_dataset(folder)
-    view, known = controller_view(data, task.robot, targets=task.targets), data["has_action"].squeeze(-1)
+    view, known = controller_view(data, task.robot, distances=task.distances), data["has_action"].squeeze(-1)
     torch.testing.assert_close(view["action"][known], torch.from_numpy(ACTIONS[0]).float(), atol=1e-5, rtol=0)
     assert view["action"][~known].isnan().all()
     again = task.action_rule(data["state"], view["action"])

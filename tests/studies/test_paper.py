@@ -3,12 +3,9 @@
 
 import pytest
 
-from torchrl_koap.studies import paper
 from torchrl_koap.studies.paper import (
-    DEFAULT,
     above_the_paper,
     average_over_tasks,
-    default_entries,
     draw_average,
     layout_rows,
     paper_cell,
@@ -113,20 +110,3 @@ def test_what_is_written(tmp_path):
     assert no_level["rows"] == [] and not (tmp_path / "none").exists()
     with pytest.raises(ValueError, match="nothing to average"):
         draw_average(paper_entries([cell("sorting", "koap", 0.01)]), tmp_path / "a.png")
-
-
-def test_default_methods_are_one_line_where_tasks_differ(tmp_path, monkeypatch):
-    here = "stacking_unobserved_joints"
-    rows = [cell("avoiding", "koap", 0.02, 54), cell(here, "koap", 0.01, 0), cell(here, "command_regression", 0.01, 30)]
-    entries = paper_entries(rows)
-    assert {(entry.task, entry.success) for entry in default_entries(entries)} == {("avoiding", 0.9), (here, 0.5)}
-    ((level, mean, *_),) = average_over_tasks(default_entries(entries))[DEFAULT]
-    assert (level, mean) == (1, pytest.approx(0.7))
-    drawn = {}
-    note = lambda averages, points, tasks, path: drawn.update(averages=averages, points=points)  # noqa: E731
-    monkeypatch.setattr(paper, "plot_average", note)
-    draw_average(entries, tmp_path / "two.png")
-    means = {name: [mean for _, mean, *_ in points] for name, points in drawn["averages"].items()}
-    assert means == {DEFAULT: [pytest.approx(0.7)], "koap": [0.45]} and set(drawn["points"]) == {"koap"}
-    draw_average(paper_entries(ROWS), tmp_path / "one.png")  # both are trained with koap
-    assert set(drawn["averages"]) == {"koap"}

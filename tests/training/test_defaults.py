@@ -3,7 +3,6 @@
 
 from dataclasses import fields, replace
 
-import numpy as np
 import pytest
 
 from torchrl_koap import ControllerConfig, Execution, ExecutionConfig, LabelConfig, PlannerConfig, TrainConfig
@@ -34,7 +33,7 @@ def test_nothing_is_left_open_and_a_second_pass_changes_nothing(task):
 class TestTheTasksMethod:
     def test_is_trained_unless_another_is_asked_for(self):
         own = {"avoiding": "koap", "stacking": "mpc", "stacking_1": "mpc"}
-        for task, method in (own | {"stacking_unobserved_joints": "command_regression"}).items():
+        for task, method in (own | {"stacking_unobserved_joints": "koap"}).items():
             assert resolved(task).method == method and resolved(task, "linear").method == "linear"
 
 
@@ -53,16 +52,8 @@ class TestTheTasksPreset:
     @pytest.mark.parametrize(("method", "own"), [("koap", "absolute"), ("linear_steps", "absolute"), ("dd", "default")])
     def test_is_every_methods_where_it_says_what_labels_are(self, method, own):
         assert resolved("stacking", method).controller.preset == own
-        assert resolved("stacking_unobserved_joints", method).controller.preset == "default"
-
-    def test_needs_commands_that_are_known_to_move_the_state(self):
-        places, reads = ControllerConfig(preset="absolute"), "it is not known which state columns its commands move"
-        assert resolved("aligning", controller=places).controller.preset == "absolute"
-        with pytest.raises(ValueError, match=f"'stacking_unobserved_joints' has no preset 'absolute': {reads}"):
-            resolved("stacking_unobserved_joints", "koap", controller=places)
-        _, arm = make_demonstrations([np.random.rand(20, 2)], [np.random.rand(20, 2)], control_hz=30)
-        with pytest.raises(ValueError, match="has no preset 'absolute': its observation has no part that repeats"):
-            resolve(TrainConfig(out="run", controller=places), arm)
+        hidden = resolved("stacking_unobserved_joints", method).controller
+        assert hidden.preset == ("scene" if method == "koap" else "default") and hidden.columns == "related"
 
     def test_must_be_one_of_the_methods(self):
         with pytest.raises(ValueError, match="method 'pca' has no preset 'paper', it has"):

@@ -2,6 +2,7 @@
 """Every method through ``koap train``: hidden labels reach no weight, and a killed run ends as if it was not."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,14 +64,16 @@ def weights(folder: Path) -> bytes:
 
 
 # a trajectory that is labelled throughout tells its commands too
-CASES = [(method, "window", None) for method in METHODS] + [("koap", "window", "absolute")]
-CASES += [(method, "trajectory", None) for method in ("koap", "command_regression")]
+CASES = [(method, "window", False) for method in METHODS] + [("koap", "trajectory", False)]
+CASES += [(method, "window", True) for method in ("koap", "dd", "dp", "vpt", "mpc")] + [("koap", "trajectory", True)]
 
 
-@pytest.mark.parametrize(("method", "unit", "preset"), CASES)
+@pytest.mark.parametrize(("method", "unit", "commands"), CASES)
 def test_no_weight_of_any_method_depends_on_a_hidden_label(
-    method, unit, preset, demonstrations, planner, tmp_path, monkeypatch
+    method, unit, commands, demonstrations, planner, tmp_path, monkeypatch
 ):
+    task = replace(TASK, defaults=replace(TASK.defaults, commands=commands))
+    monkeypatch.setattr(on_disk, "find_task_of", lambda *a: task)
     budget = LabelBudget(count=2, unit=unit, seed=0)
     real = open_dataset(demonstrations, task=TASK)[0]
     outside, inside = (poisoned(real, budget, inside=at) for at in (False, True))
@@ -80,9 +83,9 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
     assert torch.equal(variants["outside"]["action"][kept], real["action"][kept])
     assert (variants["outside"]["observation"] > POISON / 2).any()
     for name, data in variants.items():
-        monkeypatch.setattr(on_disk, "open_dataset", lambda *a, data=data, **o: (data.clone(), TASK))
-        options = {"labels": LabelConfig(count=2, unit=unit), "controller": ControllerConfig(preset=preset, steps=4)}
-        train_tiny(tmp_path / name, demonstrations, planner, method, **options)
+        monkeypatch.setattr(on_disk, "open_dataset", lambda *a, data=data, **o: (data.clone(), task))
+        labels = LabelConfig(count=2, unit=unit)
+        train_tiny(tmp_path / name, demonstrations, planner, method, labels=labels)
     assert weights(tmp_path / "outside") == weights(tmp_path / "clean")
     assert weights(tmp_path / "inside") != weights(tmp_path / "clean")  # else the test could not fail
     drawn = [(tmp_path / name / "demonstrations.safetensors").read_bytes() for name in ("clean", "outside")]

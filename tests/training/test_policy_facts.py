@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What labels are learned as: changes of a command, or the command itself where it is known."""
+"""What labels are learned as: changes of a command, or the command itself where a task asks for it."""
 
 from dataclasses import replace
 
@@ -9,10 +9,11 @@ import torch
 from torchrl_koap import ControllerConfig
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.policy_facts import controller_data, decoded_commands
+from torchrl_koap.training.methods import METHODS
+from torchrl_koap.training.policy_facts import decoded_commands, state_reader, tells_commands, with_commands
 
-TASK = get_task("avoiding")  # observes the commanded and the measured position
-SECTION = ControllerConfig(preset="absolute", columns="robot")
+CHANGES = get_task("avoiding")  # observes the commanded and the measured position
+TASK = replace(CHANGES, defaults=replace(CHANGES.defaults, commands=True))
 
 
 def recordings():
@@ -24,25 +25,38 @@ def recordings():
 
 
 @pytest.mark.parametrize("unit", ["trajectory", "window"])
-def test_a_label_is_learned_as_what_the_state_lacks_of_the_command(unit):
+def test_a_label_is_learned_as_the_command_that_it_leads_to(unit):
     data, budget = recordings(), LabelBudget(count=2, unit=unit)
     labelled, _ = budget.apply(data, command=TASK.command_columns, tell_commands=True)
-    view, kept = controller_data(TASK, SECTION, labelled), labelled["has_action"].squeeze(-1)
-    reached = data["next", "observation"][:, :2] - data["observation"][:, 2:]
-    torch.testing.assert_close(view["action"][kept], reached[kept])
-    assert torch.equal(view["has_action"], labelled["has_action"]) and view["action"][~kept].isnan().all()
-    torch.testing.assert_close(controller_data(TASK, SECTION, data)["action"], reached)  # all labels, nothing told
-    changes = controller_data(TASK, replace(SECTION, preset="default"), labelled)
-    assert torch.equal(changes["action"][kept], data["action"][kept])
+    learned, kept = with_commands(TASK, labelled), labelled["has_action"].squeeze(-1)
+    torch.testing.assert_close(learned["action"][kept], data["next", "observation"][kept][:, :2])
+    assert torch.equal(learned["has_action"], labelled["has_action"]) and learned["action"][~kept].isnan().all()
+    everything = with_commands(TASK, data)["action"]  # nobody told, as nothing is hidden
+    torch.testing.assert_close(everything, data["next", "observation"][:, :2])
+    assert with_commands(CHANGES, labelled) is labelled
 
 
 def test_a_labelled_step_whose_command_is_not_known_is_none():
     labelled, _ = LabelBudget(count=2, unit="window").apply(recordings(), command=TASK.command_columns)
-    assert labelled["has_action"].any() and not controller_data(TASK, SECTION, labelled)["has_action"].any()
+    assert labelled["has_action"].any() and not with_commands(TASK, labelled)["has_action"].any()
 
 
-def test_only_changes_of_commands_are_learned_otherwise():
-    assert decoded_commands(TASK, "absolute") == {"states": [0, 1], "commands": [0, 1], "actions": [0, 1]}
-    assert decoded_commands(get_task("stacking"), "absolute")["states"] == list(range(7))
-    assert decoded_commands(TASK, "default") is None
-    assert decoded_commands(get_task("scooping"), "absolute") is None  # its actions are commands
+def test_which_commands_are_decoded_and_who_is_told():
+    assert decoded_commands(TASK) == {"commands": [0, 1], "actions": [0, 1]} and decoded_commands(CHANGES) is None
+    assert TASK.distances == ((0, 0), (1, 1)) and CHANGES.distances == ()
+    assert decoded_commands(get_task("stacking"))["actions"] == list(range(7))
+    assert len(get_task("stacking").distances) == 7 and get_task("stacking_unobserved_joints").distances == ()
+    assert tells_commands(TASK, METHODS["koap"]) and not tells_commands(TASK, METHODS["mpc"])  # it reads changes
+    assert not tells_commands(CHANGES, METHODS["koap"])
+    with pytest.raises(ValueError, match=r"defaults.commands: no action is the change of a command that"):
+        replace(TASK, command=None)
+
+
+def test_relative_positions_are_read_beside_the_columns_where_asked():
+    task = get_task("stacking_unobserved_joints")
+    widths = {name: state_reader(task, ControllerConfig(columns=name)).width for name in ("robot", "all", "related")}
+    assert widths["robot"] == 4 and widths["all"] == task.state_dim < widths["related"]
+    reader, states = state_reader(task, ControllerConfig(columns="related")), torch.rand(2, 3, task.state_dim)
+    read = reader(states)
+    assert read.shape == (2, 3, reader.width) and torch.equal(read[..., : task.state_dim], states)
+    torch.testing.assert_close(read[..., task.state_dim :][..., :3], states[..., :3] - states[..., 4:7])

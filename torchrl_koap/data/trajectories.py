@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from torchrl_koap import keys
 
@@ -151,19 +152,24 @@ def select_state(
     return data.copy().set(keys.STATE, data.get(keys.OBSERVATION)[..., columns])
 
 
-def controller_view(data: TensorDictBase, columns: Sequence[int], *, targets: Sequence[int] = ()) -> TensorDictBase:
+def controller_view(
+    data: TensorDictBase,
+    reads: Sequence[int] | Callable[[Tensor], Tensor],
+    *,
+    distances: Sequence[tuple[int, int]] = (),
+) -> TensorDictBase:
     """The same data as a controller with a mask sees them.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` with ``state``; not changed.
-        columns (sequence of int): columns of the state to keep.
+        reads (sequence of int, or callable): columns of the state to keep, or what is read of states ``[N, d]``.
 
     Keyword Args:
-        targets (sequence of int): for actions that are targets, the state column of each: what is left of an
-            action is the distance to it. Default: actions stay as they are.
+        distances (sequence of tuple): action column and state column of actions that become the distance from that
+            state. Default: actions stay as they are.
 
     Returns:
-        TensorDictBase: a copy ``[N]`` with another ``state`` and, with targets, another ``action``.
+        TensorDictBase: a copy ``[N]`` with another ``state`` and, with distances, another ``action``.
 
     Examples:
         >>> import torch
@@ -173,9 +179,17 @@ def controller_view(data: TensorDictBase, columns: Sequence[int], *, targets: Se
         tensor([[1., 3.]])
     """
     state, view = data.get(keys.STATE), data.copy()
-    if targets:
-        view.set(keys.ACTION, view.get(keys.ACTION) - state[..., list(targets)])
-    return view.set(keys.STATE, state[..., list(columns)])
+    if distances:
+        view.set(keys.ACTION, shift_actions(view.get(keys.ACTION), state, distances, -1))
+    return view.set(keys.STATE, reads(state) if callable(reads) else state[..., list(reads)])
+
+
+def shift_actions(actions: Tensor, states: Tensor, distances: Sequence[tuple[int, int]], sign: int = 1) -> Tensor:
+    """Adds to actions ``[*B, act]`` the states ``[*B, d]`` that they are distances from; with ``sign`` -1 subtracts."""
+    entries, columns = ([pair[end] for pair in distances] for end in (0, 1))
+    moved = actions.clone()
+    moved[..., entries] = moved[..., entries] + sign * states[..., columns]
+    return moved
 
 
 def extrapolate_ends(data: TensorDictBase, frames: int) -> TensorDict:

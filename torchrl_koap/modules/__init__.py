@@ -9,7 +9,6 @@ from torchrl_koap.modules.baselines.networks import NonlinearInverseDynamics, Su
 from torchrl_koap.modules.baselines.regression import LinearInverseDynamics, PrincipalInverseDynamics
 from torchrl_koap.modules.execution.agent import Agent
 from torchrl_koap.modules.execution.asynchronous import AsynchronousAgent
-from torchrl_koap.modules.execution.command_decoder import CommandDecoder, CommandRegression
 from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
 from torchrl_koap.modules.execution.factory import make_policy
 from torchrl_koap.modules.execution.followers import blend_plan
@@ -40,8 +39,6 @@ __all__ = [
     "PRESETS",
     "Agent",
     "AsynchronousAgent",
-    "CommandDecoder",
-    "CommandRegression",
     "DiffusionPolicy",
     "Execution",
     "ExecutionConfig",

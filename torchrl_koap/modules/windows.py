@@ -21,6 +21,36 @@ import torch
 from torch import Tensor, nn
 
 
+class StateReader(nn.Module):
+    """Reads some columns of states ``[*B, T, d]``, and features of every state beside them.
+
+    Args:
+        columns (sequence of int): columns to read.
+        features (Module, optional): from ``[*B, T, 1, d]`` to ``[*B, T, num_features]``, such as relative positions.
+            Default: none.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.windows import StateReader
+        >>> StateReader((0, 2))(torch.tensor([[1.0, 2.0, 3.0]]))
+        tensor([[1., 3.]])
+    """
+
+    def __init__(self, columns: Sequence[int], features: nn.Module | None = None):
+        super().__init__()
+        self.columns, self.features = list(columns), features
+
+    @property
+    def width(self) -> int:
+        """Number of columns that are written."""
+        return len(self.columns) + (0 if self.features is None else self.features.num_features)
+
+    def forward(self, states: Tensor) -> Tensor:
+        """What is read of states, ``[*B, T, width]``."""
+        read = states[..., self.columns]
+        return read if self.features is None else torch.cat([read, self.features(states.unsqueeze(-2))], -1)
+
+
 class WindowReader(nn.Module):
     r"""Reads for every frame of a window the present state and the steps between the frames around it.
 

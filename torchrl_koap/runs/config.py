@@ -17,7 +17,7 @@ from torchrl_koap.runs.progress import LOGGERS
 from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import HISTORY
 
-COLUMNS = ("robot", "all")
+COLUMNS = ("robot", "all", "related")
 
 
 @dataclass(frozen=True)
@@ -95,10 +95,10 @@ class ControllerConfig:
     """The controller, which turns states into actions. None: the method's default, else the task's.
 
     Attributes:
-        preset: variant of KOAP: "default", "semi_supervised", "paper", or "absolute", which learns commands in place of
-            their changes (labels then tell the command too).
+        preset: variant of KOAP: "default", "absolute", "semi_supervised", "scene" or "paper".
         steps: updates (default: 500); with 0 only a closed form is fitted.
-        columns: what it reads: "robot" (the robot's own columns) or "all" (KOAP's configurations).
+        columns: what it reads: "robot" (the robot's own columns), "all" (KOAP's configurations), or "related" (all, and
+            the relative positions that the planner reads).
 
     Raises:
         ValueError: for a number out of range.

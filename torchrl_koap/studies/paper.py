@@ -12,7 +12,7 @@ import functools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from torchrl_koap.studies.table import Summary, as_markdown, percent, summarise
 from torchrl_koap.tasks import TASKS
 
 AVERAGE = "plots/average.png"
-DEFAULT = "task's default"  # what pictures call the method that a task is trained with unless told otherwise
 
 
 @dataclass(frozen=True)
@@ -145,15 +144,6 @@ def above_the_paper(entries: Sequence[Entry], method: str = "koap") -> tuple[int
     return sum(entry.success > entry.paper.success for entry in both), len(both)
 
 
-def default_entries(entries: Sequence[Entry]) -> list[Entry]:
-    """Cells of the method that a task is trained with unless told otherwise, under one name, beside the paper's KOAP.
-
-    Their method is :data:`DEFAULT`; tasks that nobody registered have none.
-    """
-    own = [entry for entry in entries if (task := TASKS.get(entry.task)) and entry.method == task.defaults.method]
-    return [replace(entry, method=DEFAULT, paper=paper_cell(entry.task, "koap", entry.level)) for entry in own]
-
-
 def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, float, float, float]]]:
     """Success averaged over the tasks at every level, by method: level, mean and the ends of its 95 % interval.
 
@@ -177,8 +167,6 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
 
 def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
     """Draws success averaged over tasks against the label level; tasks' default methods together have a line too."""
-    if len({entry.method for entry in entries if default_entries([entry])}) > 1:  # the paper's line is koap's own
-        entries = [*(replace(entry, paper=None) for entry in default_entries(entries)), *entries]
     averages = average_over_tasks(entries)
     paper: dict[str, list[tuple[int, float]]] = {}
     for method, points in averages.items():

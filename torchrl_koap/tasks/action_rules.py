@@ -50,16 +50,15 @@ class ActionRule:
 
     # action column and state column of a gripper whose command is read off the widths (:func:`gripper_command`)
     gripper: tuple[int, int] | None = None
-    # state columns that absolute actions are the targets of: the controller has decoded the distance to them
-    targets: Sequence[int] = ()
+    # action column and state column of each action of which the controller has decoded the distance from the state
+    distances: Sequence[tuple[int, int]] = ()
     constants: Mapping[int, float] = field(default_factory=dict)  # what action columns always are, by number
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
         """Returns the actions ``[*B, T, act]`` in states ``[*B, T, d]``."""
-        if self.targets:
-            actions = actions + states[..., list(self.targets)]
-        if self.gripper is not None or self.constants:
-            actions = actions.clone()
+        actions = actions.clone()
+        for entry, column in self.distances:
+            actions[..., entry] = actions[..., entry] + states[..., column]
         for entry, value in self.constants.items():
             actions[..., entry] = value
         if self.gripper is not None:  # the last frame, which nothing follows, stays as it is

@@ -51,6 +51,8 @@ def _action_faults(task: Task) -> list[str]:
         for name, action in task.actions.items()
         if action.kind == "raw" and action.column is not None
     ]
+    if task.defaults.commands and (task.command is None or not task.delta_actions):
+        faults.append("defaults.commands: no action is the change of a command that the observation repeats (command)")
     if sum(action.kind == "gripper" for action in task.actions.values()) > 1:
         faults.append("actions: at most one is a gripper")
     return faults

@@ -103,7 +103,8 @@ _STACKING = register_task(
             method="mpc",
             demonstrations=1000,
             planner={"steps": 18000, "network": "mlp"},
-            controller={"preset": "absolute"},  # joints follow their commands alike, wherever they are
+            commands=True,  # joints follow their commands alike, wherever they are
+            controller={"preset": "absolute"},
         ),
     )
 )
@@ -119,7 +120,7 @@ _STACKING_1 = register_task(
         data_from="stacking",
     )
 )
-# as the paper has it: joints are commanded but not seen, and the gripper's number is decoded like any other action
+# as the paper has it: joints are commanded but not seen
 register_task(
     replace(
         _STACKING_1,
@@ -129,8 +130,12 @@ register_task(
         hidden=("measured_joints",),
         robot=tuple(range(4)),  # position of the tool, width of the gripper
         tool_kinematics=None,
-        actions=_JOINTS | {"gripper": Action("m", "absolute")},
-        # what the commands move is not seen
-        defaults=replace(_STACKING.defaults, method="command_regression", controller={}),
+        actions=_JOINTS | {"gripper": Action("m", "gripper", column=3)},
+        # what the commands move is not seen: they are read off the scene
+        defaults=replace(
+            _STACKING.defaults,
+            method="koap",
+            controller={"preset": "scene", "columns": "related", "steps": 3000},
+        ),
     )
 )

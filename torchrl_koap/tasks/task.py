@@ -45,6 +45,8 @@ class Defaults:
             another one that is asked for by name comes with its own.
         controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``, but
             ``"absolute"`` that of every method which has it.
+        commands (bool): controllers learn the command that an action leads to, not its change; labels then tell the
+            command, and the observation has to repeat it.
         execution (dict): fields of :class:`~torchrl_koap.Execution`.
     """
 
@@ -57,6 +59,7 @@ class Defaults:
     planner: Mapping[str, Any] = field(default_factory=dict)
     controller: Mapping[str, Any] = field(default_factory=dict)
     execution: Mapping[str, Any] = field(default_factory=dict)
+    commands: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +164,18 @@ class Task(Columns):
         known = tuple(column for column in columns if column is not None)
         return known if len(known) == self.action_dim else ()
 
+    @cached_property
+    def distances(self) -> tuple[tuple[int, int], ...]:
+        """Action column and state column of the actions that controllers learn as the distance from the state.
+
+        These are absolute actions with targets, and commands that move a known column.
+        """
+        if self.targets:
+            return tuple(enumerate(self.targets))
+        moved = self.moved_columns(or_robot=True)
+        known = self.defaults.commands and len(moved) == len(self.delta_actions)
+        return tuple(zip(self.delta_actions, moved, strict=True)) if known else ()
+
     @property
     def origins(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """What was subtracted from every observation column and every action; None: nothing."""
@@ -192,7 +207,8 @@ class Task(Columns):
         """What has the last word on decoded actions, None if nothing has."""
         actions = enumerate(self.actions.values())
         constants = {index: action.constant for index, action in actions if action.constant is not None}
-        return ActionRule(self.gripper, self.targets, constants) if self.gripper or self.targets or constants else None
+        told = self.gripper or self.distances or constants
+        return ActionRule(self.gripper, self.distances, constants) if told else None
 
     @property
     def num_modes(self) -> int:
@@ -233,9 +249,10 @@ class Task(Columns):
         return next(iter(self.state_parts.items())) == (self.position, "plain")
 
     def controller_columns(self, part: str) -> tuple[int, ...]:
-        """Returns the state columns that a controller reads: ``"all"`` or the ``"robot"``'s, which actions command."""
+        """Returns the state columns that a controller reads: the ``"robot"``'s, which actions command, or all."""
         everything = tuple(range(self.state_dim))
-        return lookup({"robot": self.robot or everything, "all": everything}, part, "part of the state")
+        parts = {"robot": self.robot or everything, "all": everything, "related": everything}
+        return lookup(parts, part, "part of the state")
 
     def relative_columns(self) -> list[tuple[slice, ...]]:
         """Returns the state columns of ``relative_positions``: a position, another, a yaw, another yaw."""

@@ -10,8 +10,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data import controller_view, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
+from torchrl_koap.data.trajectories import shift_actions
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
@@ -22,7 +23,7 @@ from torchrl_koap.training.method import LABELLED_SHARES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import augmentation
-from torchrl_koap.training.policy_facts import command_ranges, controller_data
+from torchrl_koap.training.policy_facts import command_ranges, state_reader, with_commands
 
 BATCH_SIZE, LEARNING_RATE = 256, 1e-3
 _KEYS = ["state", "action", "has_action"]
@@ -38,6 +39,7 @@ def learn_controller(
     """
     method, before = get_method(config.method), loop.updates
     ranges = command_ranges(task, data)  # of labels, not of what a teacher says
+    data = data if method.fit is not None else with_commands(task, data)
     if method.teacher:
         data = _relabelled(task, config, get_method(method.teacher), data, loop)
     fit, losses = dict[str, Any](), dict[str, float]()
@@ -56,11 +58,16 @@ def learn_controller(
     }
 
 
+def _view(task: Task, config: TrainConfig, data: TensorDictBase) -> TensorDictBase:
+    """Flat data ``[N]`` as the controller sees them: what it reads, and actions as distances from the state."""
+    return controller_view(data, state_reader(task, config.controller), distances=task.distances)
+
+
 def _train_network(
     task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
     """A controller's phases, and its closed form if it has one."""
-    data, budget = controller_data(task, config.controller, data), config.controller.steps
+    data, budget = _view(task, config, data), config.controller.steps
     controller = build_controller(task, method, config.controller, data).to(config.run.device)
     history = controller.num_past
     window = max(WINDOW, controller.num_window_frames)
@@ -70,7 +77,7 @@ def _train_network(
     losses: dict[str, float] = {}
     with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
         controller.prepare(windows["state"], updates=budget if method.phases else 0, progress=count_up_to(bar))
-    for phase in method.phases if budget else ():
+    for phase in method.phases_of(config.controller.preset) if budget else ():
         buffer = make_window_buffer(
             data, window, BATCH_SIZE, select=_KEYS, pad_before=history, labelled_share=LABELLED_SHARES[phase.windows]
         )
@@ -132,8 +139,8 @@ def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDi
     """The data with the teacher's actions where there is no label."""
     phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
     controller, _, _ = _train_network(task, config, replace(teacher, phases=phases), data, loop)
-    view = controller_data(task, config.controller, data)
+    view = _view(task, config, data)
     labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
-    if task.targets:
-        labelled["action"] = labelled["action"] + data["state"][..., list(task.targets)]
+    if task.distances:
+        labelled["action"] = shift_actions(labelled["action"], data["state"], task.distances)
     return data.copy().update(labelled.select("action", "has_action"))

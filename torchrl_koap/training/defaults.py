@@ -18,9 +18,9 @@ from torchrl_koap.tasks import HISTORY, Task
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import NETWORKS
-from torchrl_koap.training.policy_facts import PLACES, decoded_commands
 
 CONTROLLER_UPDATES = 500
+PLACES = "absolute"  # what the default preset is where actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.7  # of plans where no figure counts the modes
@@ -105,7 +105,6 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
     preset = "default" if places and section.preset == PLACES else section.preset
     if preset not in method.presets:
         raise ValueError(f"method {method.name!r} has no preset {preset!r}, it has {list(method.presets)}")
-    decoded_commands(task, preset)
     return replace(section, preset=PLACES if places and preset == "default" else preset)
 
 

@@ -13,8 +13,6 @@ from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import Execution
-from torchrl_koap.tasks import Task
-from torchrl_koap.training.policy_facts import decoded_commands
 
 # share of every batch that has labels; None: as it comes
 LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
@@ -67,8 +65,9 @@ class Method:
         name (str): what ``--method`` calls it.
         title (str): what tables and legends call it.
         build (callable): ``build(task, columns, normalizers, preset)`` with the state columns that the controller
-            reads, and ``state_normalizer`` and ``action_normalizer`` as keyword arguments in ``normalizers``; of a
-            method that does not plan ``build(task, section)`` with the planner's section.
+            reads (relative positions are counted on from the last one), and ``state_normalizer`` and
+            ``action_normalizer`` as keyword arguments in ``normalizers``; of a method that does not plan
+            ``build(task, section)`` with the planner's section.
         phases (tuple of Phase): how it is trained.
         closed_form (bool): its decoder is fitted in closed form at the end.
         sees (str): ``"all"`` windows, or ``"labelled"`` ones and nothing else, statistics of the states included.
@@ -81,7 +80,7 @@ class Method:
         fit (callable, optional): ``fit(controller, data, updates) -> dict`` fits a controller that is no inverse
             dynamics to flat data after the label budget was applied, in place of phases and closed form; returns
             numbers for the summary.
-        knows_commands (bool): its labels tell the command that an action changes, too, in all tasks.
+        phases_by_preset (mapping): the phases of a preset that is trained otherwise.
 
     Raises:
         ValueError: for a name that cannot be a folder's, two phases of one name, or an unknown default.
@@ -108,7 +107,7 @@ class Method:
     updates: int | None = None
     execution: Mapping[str, Any] = field(default_factory=dict)
     fit: Callable[[Any, Any, int], dict[str, Any]] | None = None
-    knows_commands: bool = False
+    phases_by_preset: Mapping[str, tuple[Phase, ...]] = field(default_factory=dict)
 
     def __post_init__(self):
         lookup(SEES, self.sees, "kind of windows")
@@ -123,6 +122,6 @@ class Method:
             raise ValueError(f"method {self.name!r}: fit comes without phases or closed form")
         Execution().replaced(**self.execution)
 
-    def told_commands(self, task: Task, preset: str) -> bool:
-        """Says whether its labels tell the command that an action changes, too (:meth:`LabelBudget.apply`)."""
-        return self.knows_commands or decoded_commands(task, preset) is not None
+    def phases_of(self, preset: str) -> tuple[Phase, ...]:
+        """Returns how it is trained with a preset."""
+        return self.phases_by_preset.get(preset, self.phases)

@@ -12,8 +12,8 @@ and up to 5 after the present one, but for two that are defined otherwise: Decis
 ``dp`` and ``vpt`` have no planner and make its number of updates instead; relabelling costs the updates of the
 teacher besides.
 
-Two controllers are no inverse dynamics and have nothing of KOAP: ``mpc`` follows plans by an identified model of how
-the robot answers commands, ``command_regression`` by the commands that belong to states.
+One controller is no inverse dynamics and has nothing of KOAP: ``mpc`` follows plans by an identified model of how the
+robot answers commands.
 
 Four controls say what the Koopman model itself adds: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
 none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
@@ -42,10 +42,8 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
 )
 from torchrl_koap.objectives import ActionLoss, DiffusionPolicyLoss, KOAPLoss, QuantizedDynamicsLoss, VariationalLoss
-from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, fit_decoder
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.networks import build_sampler
-from torchrl_koap.training.policy_facts import PLACES
 from torchrl_koap.training.response import fit_response, tracked_columns
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
@@ -62,14 +60,6 @@ def _response(task, columns, normalizers, preset):
 
 def _fit_response(response, data, updates):
     return fit_response(response, data)
-
-
-def _command_decoder(task, columns, normalizers, preset):
-    return build_decoder(task)
-
-
-def _fit_command_decoder(decoder, data, updates):
-    return fit_decoder(decoder, data, updates=min(max(SHARE * updates, 1), UPDATES))
 
 
 def _linear(task, columns, normalizers, preset):
@@ -134,16 +124,16 @@ def register_method(method: Method) -> Method:
 
 
 for _method in (
-    Method("koap", "KOAP", _koap, (_UNLABELLED,), closed_form=True, presets=_ANY_PRESET),
-    Method("mpc", "MPC with an identified response", _response, fit=_fit_response, execution=_EVERY_STEP),
     Method(
-        "command_regression",
-        "regression of the command on the state",
-        _command_decoder,
-        fit=_fit_command_decoder,
-        knows_commands=True,
-        execution=_EVERY_STEP,
+        "koap",
+        "KOAP",
+        _koap,
+        (_UNLABELLED,),
+        closed_form=True,
+        presets=_ANY_PRESET,
+        phases_by_preset={"scene": _JOINT},  # labels shape the latent action, too
     ),
+    Method("mpc", "MPC with an identified response", _response, fit=_fit_response, execution=_EVERY_STEP),
     Method(
         "koap_sgd",
         "KOAP, decoder trained by gradients",
@@ -187,7 +177,7 @@ for _method in (
         "ridge on KOAP's scaled steps",
         partial(_koap, num_features=0),
         closed_form=True,
-        presets=("default", PLACES),
+        presets=("default", "absolute"),
     ),
     Method(
         "pca",

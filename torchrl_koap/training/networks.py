@@ -14,6 +14,7 @@ from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig
 from torchrl_koap.tasks import HORIZON, Task
 from torchrl_koap.training.method import Method
+from torchrl_koap.training.policy_facts import state_reader
 
 WEIGHT_DECAY = 1e-4  # decoupled, of all networks that denoise
 # the networks of planners, and what they are built and trained with where nothing else is asked for
@@ -65,7 +66,8 @@ def build_controller(
     others), action statistics from the labelled steps alone.
     """
     modes = lookup(PRESETS, section.preset, "preset")["normalization"]
-    columns = task.controller_columns(section.columns)
+    reader = state_reader(task, section)
+    columns = (*reader.columns, *range(task.state_dim, task.state_dim + reader.width - len(reader.columns)))
     if labelled is None:
         state, action = Normalizer(len(columns)), Normalizer(task.action_dim)
     else:

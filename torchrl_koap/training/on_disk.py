@@ -40,6 +40,7 @@ from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_planner
 from torchrl_koap.training.planner import learn_planner
+from torchrl_koap.training.policy_facts import tells_commands
 from torchrl_koap.training.trained import Trained, build_networks, facts_of
 from torchrl_koap.vision.encoder import cameras_of
 
@@ -184,8 +185,8 @@ def _read_data(
         data["action"] = torch.full_like(data["action"], torch.nan)
         data["has_action"] = torch.zeros_like(data["has_action"])
         return subsample_trajectories(data, share).to(config.run.device), held_out, None
-    told = get_method(config.method).told_commands(task, config.controller.preset)
-    labelled, report = config.labels.budget(seed).apply(data, command=task.command_columns, tell_commands=told)
+    budget, told = config.labels.budget(seed), tells_commands(task, get_method(config.method))
+    labelled, report = budget.apply(data, command=task.command_columns, tell_commands=told)
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:

@@ -9,40 +9,33 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import controller_view
 from torchrl_koap.keys import ACTION, HAS_ACTION, LABEL_COMMAND, OBSERVATION, STATE
+from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
+from torchrl_koap.modules.windows import StateReader
 from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.action_rules import ActionRule
 from torchrl_koap.tasks.columns import unit_groups
-
-PLACES = "absolute"  # preset of controllers that decode where the robot is to be
+from torchrl_koap.training.method import Method
 
 
 def policy_facts(
     task: Task,
     *,
-    columns: Sequence[int] | None = None,
-    preset: str = "default",
-    gripper: Sequence[int] | None = None,
+    reads: StateReader | None = None,
     ranges: Sequence[Sequence[float] | None] | None = None,
 ) -> dict[str, Any]:
     """The facts of a task as keyword arguments of :func:`~torchrl_koap.modules.make_policy`.
 
-    ``columns`` of the state are those that the controller reads (default: all), ``preset`` is its variant, ``ranges``
-    are those of :func:`command_ranges`. A ``gripper`` is its action column and the state column of its width: its
-    number is read off planned widths, where the task has no rule for actions of its own.
+    ``reads`` is what the controller reads of states (default: all columns), ``ranges`` are those of
+    :func:`command_ranges`.
     """
-    rule = task.action_rule
-    if rule is None and gripper is not None:
-        rule = ActionRule((gripper[0], gripper[1]))
     return {
         "state_of": task.state_of,
-        "columns": columns,
-        "action_rule": rule,
+        "reads": reads,
+        "action_rule": task.action_rule,
         "changes": tuple(task.delta_actions),
         "commanded": None if task.targets else commanded_columns(task),
-        "decodes_commands": decoded_commands(task, preset) is not None,
+        "decoded": decoded_commands(task),
         "ranges": ranges,
         "max_steps": task.max_steps,
         "control_hz": task.control_hz,
@@ -65,54 +58,41 @@ def commanded_columns(task: Task) -> dict[str, list[int]] | None:
     return {"states": moved, "commands": commands, "actions": actions}
 
 
-def decoded_commands(task: Task, preset: str) -> dict[str, list[int]] | None:
-    """The columns of :func:`commanded_columns` where a controller decodes commands whose changes are the actions.
-
-    None for every other preset than :data:`PLACES`, and where no action is a change of a command.
-
-    Raises:
-        ValueError: if the observation does not repeat the last command, or it is not known what the commands move.
-    """
-    if preset != PLACES or not task.delta_actions:
+def decoded_commands(task: Task) -> dict[str, list[int]] | None:
+    """The columns of action and observation (``"commands"``) of the commands that controllers decode; None if none."""
+    if not task.defaults.commands:
         return None
-    columns, what = commanded_columns(task), f"has no preset {PLACES!r}"
-    if columns is None:
-        check_commanded(task, what, range(task.action_dim), None)
-        raise ValueError(f"task {task.name!r} {what}: it is not known which state columns its commands move")
-    return columns
+    actions = list(task.delta_actions)
+    return {"actions": actions, "commands": list(range(task.observation_dim))[task.command_columns][: len(actions)]}
 
 
-def controller_data(task: Task, section: ControllerConfig, data: TensorDictBase) -> TensorDictBase:
-    """Flat data ``[N]`` as a controller sees them: its columns, and what actions are learned as.
+def tells_commands(task: Task, method: Method) -> bool:
+    """Whether labels tell a method the commands that actions change: one that has a fit of its own reads changes."""
+    return task.defaults.commands and method.fit is None
 
-    Absolute actions are learned as the distance to their targets, so are commands (:func:`decoded_commands`); other
-    actions as they are. A labelled step whose command is not known is none.
+
+def with_commands(task: Task, data: TensorDictBase) -> TensorDictBase:
+    """Flat data ``[N]`` whose actions are the commands that they lead to, where controllers decode these.
+
+    The last command is the one that a label tells (``label_command``), or of the observation where none does. A
+    labelled step whose command is not known is none.
     """
-    view = controller_view(data, task.controller_columns(section.columns), targets=task.targets)
-    decoded = decoded_commands(task, section.preset)
+    decoded = decoded_commands(task)
     if decoded is None:
-        return view
-    actions, moved = decoded["actions"], data[STATE][:, decoded["states"]]
+        return data
+    actions = decoded["actions"]
     told = LABEL_COMMAND in data.keys()
     last = data[LABEL_COMMAND][:, : len(actions)] if told else data[OBSERVATION][:, decoded["commands"]]
-    learned = view[ACTION].clone()
-    learned[:, actions] += (last - moved).to(learned.dtype)
-    known = view[HAS_ACTION] & ~learned.isnan().any(-1, keepdim=True)
-    return view.set(ACTION, learned).set(HAS_ACTION, known)
+    commands = data[ACTION].clone()
+    commands[:, actions] += last.to(commands.dtype)
+    known = data[HAS_ACTION] & ~commands.isnan().any(-1, keepdim=True)
+    return data.copy().set(ACTION, commands).set(HAS_ACTION, known)
 
 
-def check_commanded(task: Task, what: str, told: Sequence[int], gripper: Sequence[int] | None) -> None:
-    """Refuses a task whose observation does not repeat the last command, or with actions that nothing tells.
-
-    ``what`` says what it cannot do then; ``told`` are the actions that are known, besides that of the gripper.
-    """
-    if task.command is None:
-        lacks = "its observation has no part that repeats the last command (Task.command)"
-        raise ValueError(f"task {task.name!r} {what}: {lacks}")
-    rest = set(range(task.action_dim)) - set(told) - {gripper[0] if gripper else None}
-    if rest:
-        names = ", ".join(task.action_names[column] for column in sorted(rest))
-        raise ValueError(f"task {task.name!r} {what}: nothing tells the actions {names}")
+def state_reader(task: Task, section: ControllerConfig) -> StateReader:
+    """Makes what a controller reads of states: its columns, and relative positions where these are asked for."""
+    pairs = task.relative_columns() if section.columns == "related" else ()
+    return StateReader(task.controller_columns(section.columns), RelativePositionFeatures(pairs) if pairs else None)
 
 
 def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]:

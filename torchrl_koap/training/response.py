@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.policy_facts import check_commanded, commanded_columns
+from torchrl_koap.training.policy_facts import commanded_columns
 
 AHEAD = 12  # control steps that are predicted, in the fit and where labelled steps are left out
 PENALTY = 1e-5  # relative; larger ones shrink momentum, and plans are lost
@@ -31,13 +31,23 @@ def tracked_columns(task: Task) -> dict[str, Any]:
     Raises:
         ValueError: if its observation does not repeat the last command, or it is not known what the actions move.
     """
-    columns, what = commanded_columns(task), "cannot follow plans by prediction"
-    check_commanded(task, what, range(task.action_dim) if columns is None else columns["actions"], task.gripper)
-    if columns is None:
-        raise ValueError(
-            f"task {task.name!r} {what}: its {task.action_dim} actions, the commands ({task.command!r}) and the state"
-            " columns that they move (Action.column or Task.robot) differ in number"
+    columns, gripper = commanded_columns(task), task.gripper
+    told = (
+        range(task.action_dim) if columns is None else (*columns["actions"], *(() if gripper is None else gripper[:1]))
+    )
+    rest = [name for column, name in enumerate(task.action_names) if column not in told]
+    lacks = None
+    if task.command is None:
+        lacks = "its observation has no part that repeats the last command (Task.command)"
+    elif rest:
+        lacks = f"nothing tells the actions {', '.join(rest)}"
+    elif columns is None:
+        lacks = (
+            f"its {task.action_dim} actions, the commands ({task.command!r}) and the state columns that they move"
+            " (Action.column or Task.robot) differ in number"
         )
+    if columns is None or lacks:
+        raise ValueError(f"task {task.name!r} cannot follow plans by prediction: {lacks}")
     return columns | {"absolute": bool(task.targets)}
 
 

@@ -11,11 +11,11 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import open_dataset
+from torchrl_koap.data import controller_view, open_dataset
 from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.files import some
-from torchrl_koap.modules import CommandDecoder, Execution, PlanningPolicy, StatePlanner, make_policy
+from torchrl_koap.modules import Execution, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.modules.execution.followers import Follower
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
@@ -24,11 +24,10 @@ from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryE
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
-from torchrl_koap.training.command_model import gripper_columns
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
-from torchrl_koap.training.policy_facts import controller_data, policy_facts
+from torchrl_koap.training.policy_facts import policy_facts, state_reader, tells_commands, with_commands
 from torchrl_koap.vision import Observer, Projection
 from torchrl_koap.vision.encoder import load_cameras
 
@@ -201,10 +200,8 @@ class Trained:
         missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
         if self.method.plans and missing:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
-        gripper = gripper_columns(self.task) if isinstance(self.controller, CommandDecoder) else None
-        ranges = self.results.get("command_ranges")
-        preset = self.config.controller.preset
-        facts = policy_facts(self.task, columns=self.columns, preset=preset, gripper=gripper, ranges=ranges)
+        reads = state_reader(self.task, self.config.controller)
+        facts = policy_facts(self.task, reads=reads, ranges=self.results.get("command_ranges"))
         facts["observe"] = Observer.of(self.task, self.cameras)
         if self.method.plans:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
@@ -230,8 +227,9 @@ class Trained:
         return open_dataset(where, task=self.task)[0]
 
     def seen(self, data: TensorDictBase) -> TensorDictBase:
-        """Flat data ``[N]`` as the controller sees them: its columns, and what actions are learned as."""
-        return controller_data(self.task, self.config.controller, data)
+        """Flat data ``[N]`` as the controller sees them: what it reads, and what actions are learned as."""
+        reads = state_reader(self.task, self.config.controller)
+        return controller_view(with_commands(self.task, data), reads, distances=self.task.distances)
 
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
         """Hides all labels of :meth:`data` that the training did not see: their actions are NaN; the budget reports.
@@ -240,7 +238,7 @@ class Trained:
             RunDirectoryError: if they are not the demonstrations that it was trained on.
         """
         budget = self.config.labels.budget(self.config.run.seed)
-        told = self.method.told_commands(self.task, self.config.controller.preset)
+        told = tells_commands(self.task, self.method)
         hidden, report = budget.apply(data, command=self.task.command_columns, tell_commands=told)
         if "labels" not in self.results:
             raise RunDirectoryError(f"{self.folder}: summary.json has no entry 'labels'")

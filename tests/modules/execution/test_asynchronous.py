@@ -12,7 +12,6 @@ from toy_policies import CountingPlanner, EchoController
 from torchrl_koap.modules import (
     Agent,
     AsynchronousAgent,
-    CommandDecoder,
     Execution,
     ResponseModel,
     make_koopman_inverse_dynamics,
@@ -116,15 +115,9 @@ def test_refusals():
         AsynchronousAgent(policy_of(strategy="open_loop"), control_hz=30)
 
 
-@pytest.mark.parametrize("kind", ["mpc", "command_regression"])
-def test_plans_are_followed_as_the_policy_follows_them(kind):
-    planner = small_planner()
-    if kind == "mpc":
-        law = ResponseModel([0, 1], [0, 1], [0, 1])
-        law.weight[[0, 1], [0, 1], 2] = 0.3
-    else:
-        law = CommandDecoder(2, [0, 1], [0, 1], width=4)
-        law.forward = lambda states: 2 * states
+def test_plans_are_followed_as_the_policy_follows_them():
+    planner, law = small_planner(), ResponseModel([0, 1], [0, 1], [0, 1])
+    law.weight[[0, 1], [0, 1], 2] = 0.3
     policy, plain = (make_policy(planner, by, state_of=(2, 3)) for by in (law, make_koopman_inverse_dynamics(2, 2)))
     observations = np.random.default_rng(0).normal(size=(3, 4))
     acted = []

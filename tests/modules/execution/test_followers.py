@@ -7,14 +7,13 @@ from toy_policies import CountingPlanner, EchoController
 
 from torchrl_koap.modules import (
     MPC,
-    CommandDecoder,
-    CommandRegression,
     Execution,
     ResponseModel,
     blend_plan,
     make_policy,
 )
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower, command_rest, remaining_plan
+from torchrl_koap.modules.windows import StateReader
 from torchrl_koap.tasks.action_rules import ActionRule
 
 
@@ -55,31 +54,13 @@ def test_the_last_word_on_actions_sees_the_whole_window():
         seen.append(states)
         return actions + 0.5
 
-    follower = InverseDynamicsFollower(EchoController(), columns=(0, 1), action_rule=rule)
+    follower = InverseDynamicsFollower(EchoController(), reads=StateReader((0, 1)), action_rule=rule)
     states, plan = (
         torch.tensor([[[3.0, 7.0], [4.0, 7.0]]]),
         CountingPlanner().sample(torch.tensor([[[3.0, 7], [4, 7]]])),
     )
     assert follower(states, states, plan)[0, 0, :2].tolist() == [3.5, 4.5]
     assert seen[0][0, :, 0].tolist() == [3, 4] + [4 + 1000.0 * k for k in range(1, 7)]  # plans as they were made
-
-
-def test_decoded_commands_become_changes_of_the_last_one():
-    class Lacking(EchoController):
-        def forward(self, tensordict):  # the command is 0.5 ahead of the second column, wherever that is
-            return tensordict.set("action", torch.full((*tensordict["state"].shape[:-1], 3), 0.5))
-
-    columns = {"actions": [1], "commands": [2], "states": [1]}
-    states = torch.tensor([[[3.0, 7.0], [4.0, 8.0]]])
-    observed = torch.cat([states, torch.tensor([[[0.0], [8.3]]])], -1)
-    plan = torch.stack([torch.zeros(6), torch.arange(9.0, 15.0)], -1)[None]
-    actions = InverseDynamicsFollower(Lacking(), columns=(0, 1), commands=columns)(observed, states, plan, 3)
-    torch.testing.assert_close(actions[0, :, 1], torch.tensor([8.5 - 8.3, 1.0, 1.0]))
-    assert (actions[0, :, [0, 2]] == 0.5).all()  # the others are what was decoded
-    policy = make_policy(
-        CountingPlanner(), Lacking(), state_of=(0, 1), commanded=columns, decodes_commands=True, changes=(1,)
-    )
-    assert policy.follower.commands == columns and not policy.follower.knows_command
 
 
 @torch.no_grad()
@@ -100,7 +81,6 @@ def test_a_gripper_is_commanded_by_the_planned_widths():
 CONTROLLERS = {
     InverseDynamicsFollower: EchoController,
     MPC: lambda: ResponseModel([0, 1], [0, 1], [0, 1]),
-    CommandRegression: lambda: CommandDecoder(2, [0, 1], [0, 1], width=4),
 }
 
 

@@ -8,7 +8,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from toy_policies import CountingPlanner, CountingSampler, EchoController, EpisodesOfRandomLength, state_number
 
-from torchrl_koap.modules import Execution, PlanningPolicy, policy_transforms
+from torchrl_koap.modules import Execution, PlanningPolicy, ResponseModel, make_policy, policy_transforms
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 LENGTHS = ((5, 3, 11), (9,), (1, 2, 7, 4), (12, 6), (4, 4, 8))
@@ -118,3 +118,19 @@ def test_a_missing_transform_is_named():
         policy_of()(TensorDict({"observation_history": torch.zeros(2, 2, 3)}, [2]))
     with pytest.raises(ValueError, match=r"must hold 2 frames on axis -2, got \[2, 4, 3\]"):
         policy_of()(step_input(torch.zeros(2, 4, 3)))
+
+
+def test_decoded_commands_become_changes_of_the_last_one():
+    decoded = {"actions": [1], "commands": [2]}
+    options = {"state_of": (0, 1), "decoded": decoded, "execution": Execution(blend=0.0, replan_interval=3)}
+    policy = make_policy(CountingPlanner(), EchoController(), **options)
+    observed = torch.tensor([[[3.0, 7.0, 0.0], [4.0, 8.0, 3.5]]])  # the last command stands in the third column
+    plan = policy.planner.sample(observed[..., :2])
+    assert policy.act(observed, plan, 0)[0].tolist() == [3.0, 4.0 - 3.5, 1004.0, 4.0]
+    ahead, _ = policy.decode_ahead(observed, torch.zeros(1, 6, 2))
+    assert ahead[0, :, 1].tolist() == [0.5, 1000.0, 1000.0]  # each is the change of the one before it
+    law = make_policy(CountingPlanner(), ResponseModel([0, 1], [0, 1], [0, 1]), **options)
+    assert law.decoded is None  # it knows the command, and gives changes
+    sampled = make_policy(CountingSampler(), **options)
+    chunk = sampled.plan(observed)
+    assert sampled.act(observed, chunk, 2)[0, 1] == chunk[0, 2, 1] - 3.5

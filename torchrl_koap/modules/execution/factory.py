@@ -9,7 +9,6 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from torchrl_koap.modules.execution.command_decoder import CommandDecoder, CommandRegression
 from torchrl_koap.modules.execution.command_limits import CommandLimits, Ranges
 from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import ActionRule, Follower, InverseDynamicsFollower
@@ -23,11 +22,11 @@ def make_policy(
     *,
     state_of: Callable[[Tensor], Tensor] | Sequence[int],
     execution: Execution | None = None,
-    columns: Sequence[int] | None = None,
+    reads: Callable[[Tensor], Tensor] | None = None,
     action_rule: ActionRule | None = None,
     changes: Sequence[int] = (),
     commanded: Mapping[str, Sequence[int]] | None = None,
-    decodes_commands: bool = False,
+    decoded: Mapping[str, Sequence[int]] | None = None,
     ranges: Ranges | None = None,
     max_steps: int = 400,
     control_hz: float | None = None,
@@ -42,19 +41,18 @@ def make_policy(
 
     Args:
         planner (StatePlanner or DiffusionPolicy): samples plans; or actions, which no controller decodes.
-        controller (nn.Module, optional): an :class:`~torchrl_koap.modules.InverseDynamics`, a
-            :class:`~torchrl_koap.modules.ResponseModel` (plans are followed by :class:`~torchrl_koap.modules.MPC`) or a
-            :class:`~torchrl_koap.modules.CommandDecoder` (:class:`~torchrl_koap.modules.CommandRegression`).
+        controller (nn.Module, optional): an :class:`~torchrl_koap.modules.InverseDynamics` or a
+            :class:`~torchrl_koap.modules.ResponseModel` (plans are followed by :class:`~torchrl_koap.modules.MPC`).
 
     Keyword Args:
         state_of (callable, or sequence of int): as for :class:`~torchrl_koap.modules.PlanningPolicy`, like
             ``execution``, ``max_steps``, ``control_hz``, ``observe`` and ``origins``.
-        columns (sequence of int, optional): columns of the state that an inverse dynamics reads. Default: all.
+        reads (callable, optional): what an inverse dynamics reads of states ``[*B, T, d]``. Default: all.
         action_rule (callable, optional): as for ``Follower``.
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
         commanded (mapping, optional): for each of these the observation column that repeats the command
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
-        decodes_commands (bool): an inverse dynamics decodes what the state lacks of the commands in ``commanded``.
+        decoded (mapping, optional): as for :class:`~torchrl_koap.modules.PlanningPolicy`.
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
         follower (Follower, optional): follows plans in place of the controller.
@@ -76,8 +74,7 @@ def make_policy(
     """
     execution = Execution() if execution is None else execution
     if follower is None and controller is not None:
-        decoded = commanded if decodes_commands else None
-        follower = _follow(planner, controller, execution, columns, action_rule, decoded)
+        follower = _follow(planner, controller, execution, reads, action_rule)
     limits, margin = None, execution.limits
     ranges = None if ranges is None or margin == math.inf else [_widened(r, margin) for r in ranges]
     if execution.gain != 1 or execution.lead or ranges is not None:
@@ -96,6 +93,7 @@ def make_policy(
         follower,
         state_of=state_of,
         execution=execution,
+        decoded=decoded,
         limits=limits,
         max_steps=max_steps,
         control_hz=control_hz,
@@ -116,14 +114,11 @@ def _follow(
     planner: nn.Module,
     controller: nn.Module,
     execution: Execution,
-    columns: Sequence[int] | None,
+    reads: Callable[[Tensor], Tensor] | None,
     action_rule: ActionRule | None,
-    commands: Mapping[str, Sequence[int]] | None,
 ) -> Follower:
     options: dict[str, Any] = {"blend": execution.blend, "action_rule": action_rule}
     if isinstance(controller, ResponseModel):
         look_ahead = planner.horizon - execution.replan_interval + 1  # what every plan tells at its last step
         return MPC(controller, look_ahead=look_ahead, **options)
-    if isinstance(controller, CommandDecoder):
-        return CommandRegression(controller, **options)
-    return InverseDynamicsFollower(controller, columns=columns, commands=commands, **options)
+    return InverseDynamicsFollower(controller, reads=reads, **options)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -66,42 +66,23 @@ class InverseDynamicsFollower(Follower):
     fitted to motions that happened, in which no step leaps; a plan that begins beside the robot it follows badly.
 
     The controller is an InverseDynamics, or another module with ``num_past`` that reads a window of states ``[*B, T,
-    d]`` and writes actions ``[*B, T, act]``; ``columns`` of the state are those that it reads, all by default.
-
-    One that decodes ``commands`` writes what the state lacks of them: ``a_t = x_t + f_t - c_t`` with the last command
-    ``c``. These are the columns of the ``"actions"``, of the observations that repeat the ``"commands"`` and of the
-    ``"states"`` that they move.
+    d]`` and writes actions ``[*B, T, act]``. What it reads of states ``[*B, T, w]`` is ``reads``, all by default.
     """
 
-    def __init__(
-        self,
-        controller: InverseDynamics,
-        *,
-        columns: Sequence[int] | None = None,
-        commands: Mapping[str, Sequence[int]] | None = None,
-        **options: Any,
-    ):
+    def __init__(self, controller: InverseDynamics, *, reads: Callable[[Tensor], Tensor] | None = None, **options: Any):
         super().__init__(controller, num_frames=controller.num_past + 1, **options)
-        self.register_buffer("columns", None if columns is None else torch.as_tensor(columns), persistent=False)
-        self.commands = None if commands is None else {name: list(each) for name, each in commands.items()}
+        self.reads = reads
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
         """The actions of the next steps; arguments as for :class:`Follower`."""
-        path = torch.cat([states, blend_plan(states, plan, self.blend)], -2)
-        window = path if self.columns is None else path[..., self.columns]
+        window = torch.cat([states, blend_plan(states, plan, self.blend)], -2)
+        window = window if self.reads is None else self.reads(window)
         out = self.controller(TensorDict({self.controller.in_keys[0]: window}, batch_size=window.shape[:-2]))
         actions = out.get(self.controller.out_keys[-1])
         if self.action_rule is not None:
             actions = self.action_rule(torch.cat([states, plan], -2), actions)
-        now = slice(states.shape[-2] - 1, states.shape[-2] - 1 + steps)
-        actions = actions[..., now, :]
-        if self.commands is not None:
-            decoded, moved = self.commands["actions"], path[..., now, self.commands["states"]]
-            last = observations[..., -1:, self.commands["commands"]]
-            commands = torch.cat([last, (moved + actions[..., decoded]).to(last.dtype)], -2)
-            actions = actions.clone()
-            actions[..., decoded] = commands.diff(dim=-2).to(actions.dtype)
-        return actions
+        now = states.shape[-2] - 1
+        return actions[..., now : now + steps, :]
 
 
 def command_rest(action_rule: ActionRule | None, states: Tensor, plan: Tensor, width: int, steps: int) -> Tensor:

@@ -47,6 +47,8 @@ class PlanningPolicy(TensorDictModuleBase):
         state_of (callable, or sequence of int): from observations ``[*B, obs]`` to states ``[*B, d]``, or the columns
             that make up the state.
         execution (Execution, optional): how plans become actions. Default: ``Execution()``.
+        decoded (mapping, optional): for actions that are decoded as commands and taken as their changes, the columns of
+            the ``"actions"`` and of the observations that repeat the last ``"commands"``.
         limits (CommandLimits, optional): has the last word on actions. How many of how many left their range is in
             ``limited``, int64 ``[2]``.
         max_steps (int): steps of an episode, whose start noise is drawn at once.
@@ -82,6 +84,7 @@ class PlanningPolicy(TensorDictModuleBase):
         *,
         state_of: Callable[[Tensor], Tensor] | Sequence[int],
         execution: Execution | None = None,
+        decoded: Mapping[str, Sequence[int]] | None = None,
         limits: CommandLimits | None = None,
         max_steps: int = 400,
         control_hz: float | None = None,
@@ -104,6 +107,10 @@ class PlanningPolicy(TensorDictModuleBase):
                 f"replan_interval must be in 1..{planner.horizon} (the horizon), got {execution.replan_interval}"
             )
         self.planner, self.follower, self.limits = planner, follower, limits
+        if decoded is None or (follower is not None and follower.knows_command):  # its actions are changes
+            self.decoded = None
+        else:
+            self.decoded = {name: list(columns) for name, columns in decoded.items()}
         self.execution, self.max_steps, self.control_hz = execution, max_steps, control_hz
         self.observe = observe
         self.register_buffer("limited", torch.zeros(2, dtype=torch.long), persistent=False)
@@ -185,7 +192,7 @@ class PlanningPolicy(TensorDictModuleBase):
         left = remaining_plan(plan, age)
         if self._decodes:
             left = self.follower(observations, self.state_of(observations), left)
-        action = left[..., 0, :]
+        action = self._taken(observations, left[..., :1, :]).squeeze(-2)
         if self.limits is None:
             return action
         action, outside = self.limits(observations, action)
@@ -206,10 +213,21 @@ class PlanningPolicy(TensorDictModuleBase):
         actions = self.sample(states, noise)
         if self.follower is not None:
             actions = self.follower(observations, states, actions, steps)
-        actions = actions[..., :steps, :]
+        actions = self._taken(observations, actions[..., :steps, :])
         if self.limits is None:
             return actions, torch.zeros_like(actions[..., 0], dtype=torch.bool)
         return self.limits(observations.unsqueeze(-3), actions)
+
+    def _taken(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Actions ``[*B, n, act]`` of decoded ones, after observations ``[*B, history, obs]``."""
+        if self.decoded is None:
+            return actions
+        commands, taken = actions[..., self.decoded["actions"]], actions.clone()
+        last = observations[..., -1:, self.decoded["commands"]]
+        taken[..., self.decoded["actions"]] = (
+            torch.cat([last, commands.to(last.dtype)], -2).diff(dim=-2).to(taken.dtype)
+        )
+        return taken
 
     def attach(self, env: EnvBase) -> None:
         """Tells the follower the batch of environments whose episodes are about to begin."""

@@ -52,6 +52,18 @@ PRESETS: dict[str, dict[str, Any]] = {
         "look_ahead": (2, 3, 4, 5, 6, 7, 8),
     }
     | {"num_features": 512},
+    # commands of joints that are not observed: the paper's networks, wider, and labels shape the latent action, too
+    "scene": _DEFAULT
+    | {
+        "normalization": {"state": "standard", "action": "standard"},
+        "network": LatentActionLSTM,
+        "latent_dim": 64,
+        "hidden_dim": 256,
+        "include_state": False,
+        "num_past": 1,
+        "look_ahead": 8,
+    }
+    | {"relative": False},
     # the paper: g MLP, f LSTM, dense K, look-ahead k = 8
     "paper": _DEFAULT
     | {
