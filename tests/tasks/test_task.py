@@ -26,8 +26,9 @@ def test_stacking_without_joints_shows_and_commands_what_the_paper_does():
     assert torch.equal(state[:, :3], observation[:, task.observation["tcp_position"]])
     assert torch.equal(state[:, 3:4], observation[:, task.observation["gripper_width"]])
     assert torch.equal(state[:, 4:], whole.state_of(observation)[:, whole.state_slices["red_position"].start :])
-    # joints and gripper are commanded, and the controller decodes both
-    assert task.action_units == whole.action_units and task.action_rule is None and whole.action_rule is not None
+    # joints and gripper are commanded; the gripper follows planned widths, and only joints that are seen are subtracted
+    assert task.action_units == whole.action_units and task.gripper == (7, 3) and whole.gripper == (7, 7)
+    assert not task.action_rule.distances and len(whole.action_rule.distances) == 7
     assert task.controller_columns("robot") == (0, 1, 2, 3) and task.source == "stacking"
 
 
