@@ -94,6 +94,20 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
     assert settled(reports[0]) == settled(reports[1])
 
 
+@pytest.mark.parametrize(("preset", "shaped"), [("default", False), ("scene", True)])
+def test_labels_shape_the_latent_action_where_the_preset_says_so(
+    preset, shaped, demonstrations, planner, tmp_path, monkeypatch
+):
+    real, found = open_dataset(demonstrations, task=TASK)[0], []
+    for data in (real, poisoned(real, LabelBudget(count=2), inside=True)):
+        monkeypatch.setattr(on_disk, "open_dataset", lambda *a, data=data, **o: (data.clone(), TASK))
+        out = tmp_path / str(len(found))
+        train_tiny(out, demonstrations, planner, "koap", controller=ControllerConfig(preset=preset, steps=4))
+        tensors = load_tensors(out / "controller.safetensors")[0]
+        found.append(torch.cat([each.flatten() for name, each in tensors.items() if name.startswith("latent_action.")]))
+    assert torch.equal(*found) is not shaped
+
+
 def test_no_weight_of_a_planner_depends_on_any_label(demonstrations, planner, tmp_path, monkeypatch):
     budget = LabelBudget(count=2)
     data = poisoned(poisoned(open_dataset(demonstrations, task=TASK)[0], budget), budget, inside=True)

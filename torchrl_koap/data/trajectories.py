@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap import keys
+from torchrl_koap.tasks.action_rules import shift_actions
 
 _VELOCITY = 3  # steps whose mean is the last velocity
 
@@ -182,14 +183,6 @@ def controller_view(
     if distances:
         view.set(keys.ACTION, shift_actions(view.get(keys.ACTION), state, distances, -1))
     return view.set(keys.STATE, reads(state) if callable(reads) else state[..., list(reads)])
-
-
-def shift_actions(actions: Tensor, states: Tensor, distances: Sequence[tuple[int, int]], sign: int = 1) -> Tensor:
-    """Adds to actions ``[*B, act]`` the states ``[*B, d]`` that they are distances from; with ``sign`` -1 subtracts."""
-    entries, columns = ([pair[end] for pair in distances] for end in (0, 1))
-    moved = actions.clone()
-    moved[..., entries] = moved[..., entries] + sign * states[..., columns]
-    return moved
 
 
 def extrapolate_ends(data: TensorDictBase, frames: int) -> TensorDict:

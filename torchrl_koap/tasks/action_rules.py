@@ -56,15 +56,21 @@ class ActionRule:
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
         """Returns the actions ``[*B, T, act]`` in states ``[*B, T, d]``."""
-        actions = actions.clone()
-        for entry, column in self.distances:
-            actions[..., entry] = actions[..., entry] + states[..., column]
+        actions = shift_actions(actions, states, self.distances)
         for entry, value in self.constants.items():
             actions[..., entry] = value
         if self.gripper is not None:  # the last frame, which nothing follows, stays as it is
             entry, column = self.gripper
             actions[..., :-1, entry] = gripper_command(states[..., column], open_above=PLANNED_OPEN_ABOVE)
         return actions
+
+
+def shift_actions(actions: Tensor, states: Tensor, distances: Sequence[tuple[int, int]], sign: int = 1) -> Tensor:
+    """Adds to actions ``[*B, act]`` the states ``[*B, d]`` that they are distances from; with ``sign`` -1 subtracts."""
+    moved = actions.clone()
+    for entry, column in distances:
+        moved[..., entry] = moved[..., entry] + sign * states[..., column]
+    return moved
 
 
 def gripper_command(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:

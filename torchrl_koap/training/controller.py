@@ -10,20 +10,20 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import controller_view, cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
-from torchrl_koap.data.trajectories import shift_actions
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
+from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import LABELLED_SHARES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import augmentation
-from torchrl_koap.training.policy_facts import command_ranges, state_reader, with_commands
+from torchrl_koap.training.policy_facts import command_ranges, controller_data, with_commands
 
 BATCH_SIZE, LEARNING_RATE = 256, 1e-3
 _KEYS = ["state", "action", "has_action"]
@@ -58,16 +58,11 @@ def learn_controller(
     }
 
 
-def _view(task: Task, config: TrainConfig, data: TensorDictBase) -> TensorDictBase:
-    """Flat data ``[N]`` as the controller sees them: what it reads, and actions as distances from the state."""
-    return controller_view(data, state_reader(task, config.controller), distances=task.distances)
-
-
 def _train_network(
     task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
     """A controller's phases, and its closed form if it has one."""
-    data, budget = _view(task, config, data), config.controller.steps
+    data, budget = controller_data(task, config.controller, data), config.controller.steps
     controller = build_controller(task, method, config.controller, data).to(config.run.device)
     history = controller.num_past
     window = max(WINDOW, controller.num_window_frames)
@@ -139,7 +134,7 @@ def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDi
     """The data with the teacher's actions where there is no label."""
     phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
     controller, _, _ = _train_network(task, config, replace(teacher, phases=phases), data, loop)
-    view = _view(task, config, data)
+    view = controller_data(task, config.controller, data)
     labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
     if task.distances:
         labelled["action"] = shift_actions(labelled["action"], data["state"], task.distances)

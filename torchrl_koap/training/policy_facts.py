@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_koap.data import controller_view
 from torchrl_koap.keys import ACTION, HAS_ACTION, LABEL_COMMAND, OBSERVATION, STATE
 from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.modules.windows import StateReader
@@ -93,6 +94,11 @@ def state_reader(task: Task, section: ControllerConfig) -> StateReader:
     """Makes what a controller reads of states: its columns, and relative positions where these are asked for."""
     pairs = task.relative_columns() if section.columns == "related" else ()
     return StateReader(task.controller_columns(section.columns), RelativePositionFeatures(pairs) if pairs else None)
+
+
+def controller_data(task: Task, section: ControllerConfig, data: TensorDictBase) -> TensorDictBase:
+    """Flat data ``[N]`` of :func:`with_commands` as a controller sees them: what it reads, and actions as distances."""
+    return controller_view(data, state_reader(task, section), distances=task.distances)
 
 
 def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]:

@@ -11,7 +11,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import controller_view, open_dataset
+from torchrl_koap.data import open_dataset
 from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.files import some
@@ -27,7 +27,13 @@ from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
-from torchrl_koap.training.policy_facts import policy_facts, state_reader, tells_commands, with_commands
+from torchrl_koap.training.policy_facts import (
+    controller_data,
+    policy_facts,
+    state_reader,
+    tells_commands,
+    with_commands,
+)
 from torchrl_koap.vision import Observer, Projection
 from torchrl_koap.vision.encoder import load_cameras
 
@@ -228,8 +234,7 @@ class Trained:
 
     def seen(self, data: TensorDictBase) -> TensorDictBase:
         """Flat data ``[N]`` as the controller sees them: what it reads, and what actions are learned as."""
-        reads = state_reader(self.task, self.config.controller)
-        return controller_view(with_commands(self.task, data), reads, distances=self.task.distances)
+        return controller_data(self.task, self.config.controller, with_commands(self.task, data))
 
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
         """Hides all labels of :meth:`data` that the training did not see: their actions are NaN; the budget reports.
