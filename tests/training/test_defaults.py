@@ -49,11 +49,13 @@ class TestTheTasksPreset:
     def test_is_not_that_of_other_methods(self, method, own):
         assert resolved("po_sorting", method).controller.preset == own
 
-    @pytest.mark.parametrize(("method", "own"), [("koap", "absolute"), ("linear_steps", "absolute"), ("dd", "default")])
-    def test_is_every_methods_where_it_says_what_labels_are(self, method, own):
-        assert resolved("stacking", method).controller.preset == own
+    @pytest.mark.parametrize("method", ["koap", "linear_steps", "dd", "koap_untrained"])
+    def test_is_absolute_for_every_method_that_decodes_commands(self, method):
+        assert resolved("stacking", method).controller.preset == "absolute"
         hidden = resolved("stacking_unobserved_joints", method).controller
-        assert hidden.preset == ("scene" if method == "koap" else "default") and hidden.columns == "related"
+        assert hidden.preset == ("scene" if method == "koap" else "absolute") and hidden.columns == "related"
+        asked = resolved("stacking", method, controller=ControllerConfig(preset="default")).controller
+        assert asked.preset == "default" and resolved("stacking", "mpc").controller.preset == "default"
 
     def test_must_be_one_of_the_methods(self):
         with pytest.raises(ValueError, match="method 'pca' has no preset 'paper', it has"):

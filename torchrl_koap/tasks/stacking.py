@@ -104,7 +104,6 @@ _STACKING = register_task(
             demonstrations=1000,
             planner={"steps": 18000, "network": "mlp"},
             commands=True,  # joints follow their commands alike, wherever they are
-            controller={"preset": "absolute"},
         ),
     )
 )

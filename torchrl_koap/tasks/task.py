@@ -43,8 +43,7 @@ class Defaults:
             no column is a position that could be shifted.
         planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
             another one that is asked for by name comes with its own.
-        controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``, but
-            ``"absolute"`` that of every method which has it.
+        controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method`` alone.
         commands (bool): controllers learn the command that an action leads to, not its change; labels then tell the
             command, and the observation has to repeat it.
         execution (dict): fields of :class:`~torchrl_koap.Execution`.

@@ -12,6 +12,7 @@ from torch import nn
 
 from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
+from torchrl_koap.data.windows import WindowTable, spread_evenly
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
@@ -26,6 +27,7 @@ from torchrl_koap.training.planner import augmentation
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, with_commands
 
 BATCH_SIZE, LEARNING_RATE = 256, 1e-3
+FITTED = 50_000  # windows that statistics without labels are fitted to
 _KEYS = ["state", "action", "has_action"]
 
 
@@ -66,12 +68,13 @@ def _train_network(
     controller = build_controller(task, method, config.controller, data).to(config.run.device)
     history = controller.num_past
     window = max(WINDOW, controller.num_window_frames)
-    windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
+    frames, _ = WindowTable.build(data, window, pad_before=history).frames()
     if method.sees == "labelled":
-        windows = windows[windows["has_action"].squeeze(-1).any(-1)]
+        frames = frames[data["has_action"][frames].squeeze(-1).any(-1)]
+    states = data["state"][spread_evenly(frames, FITTED)]
     losses: dict[str, float] = {}
     with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
-        controller.prepare(windows["state"], updates=budget if method.phases else 0, progress=count_up_to(bar))
+        controller.prepare(states, updates=budget if method.phases else 0, progress=count_up_to(bar))
     for phase in method.phases_of(config.controller.preset) if budget else ():
         buffer = make_window_buffer(
             data, window, BATCH_SIZE, select=_KEYS, pad_before=history, labelled_share=LABELLED_SHARES[phase.windows]
@@ -86,7 +89,7 @@ def _train_network(
         )
     controller.eval()
     fit: dict[str, Any] = {}
-    controller.finish(windows["state"])
+    controller.finish(states)
     if method.closed_form:
         fit = fit_closed_form(controller, data, **axes_of(task, task.controller_columns(config.controller.columns)))
     return controller, fit, losses

@@ -18,9 +18,10 @@ from torchrl_koap.tasks import HISTORY, Task
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import NETWORKS
+from torchrl_koap.training.policy_facts import tells_commands
 
 CONTROLLER_UPDATES = 500
-PLACES = "absolute"  # what the default preset is where actions are places
+PLACES = "absolute"  # the default preset where decoded actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.7  # of plans where no figure counts the modes
@@ -95,17 +96,18 @@ def _taken_over(asked: PlannerConfig) -> PlannerConfig:
 
 def _controller(asked: ControllerConfig, method: Method, task: Task) -> ControllerConfig:
     own = dict(task.defaults.controller)
-    if own.get("preset") not in method.presets or (method.name != task.defaults.method and own["preset"] != PLACES):
-        own.pop("preset", None)  # of the task's own method; what its labels are learned as is every method's
+    if method.name != task.defaults.method or own.get("preset") not in method.presets:
+        own.pop("preset", None)  # of the task's own method
+    places = tells_commands(task, method) or not (task.delta_actions or task.targets)
+    presets = method.presets + ((PLACES,) if "default" in method.presets else ())
+    usual = PLACES if places and method.presets[0] == "default" else method.presets[0]
     declared = {"columns": method.columns, "steps": method.updates}
-    library = {"preset": method.presets[0], "steps": CONTROLLER_UPDATES, "columns": "robot"}
+    library = {"preset": usual, "steps": CONTROLLER_UPDATES, "columns": "robot"}
     section = _filled(asked, {k: v for k, v in declared.items() if v is not None}, own, library)
     lookup(PRESETS, section.preset, "preset")
-    places = not task.delta_actions and not task.targets  # every action says where the robot is to be
-    preset = "default" if places and section.preset == PLACES else section.preset
-    if preset not in method.presets:
-        raise ValueError(f"method {method.name!r} has no preset {preset!r}, it has {list(method.presets)}")
-    return replace(section, preset=PLACES if places and preset == "default" else preset)
+    if section.preset not in presets:
+        raise ValueError(f"method {method.name!r} has no preset {section.preset!r}, it has {list(method.presets)}")
+    return section
 
 
 def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionConfig:

@@ -177,7 +177,6 @@ for _method in (
         "ridge on KOAP's scaled steps",
         partial(_koap, num_features=0),
         closed_form=True,
-        presets=("default", "absolute"),
     ),
     Method(
         "pca",
