@@ -68,23 +68,28 @@ def test_samples_are_the_stored_rows(padded):
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 8), st.integers(1, 10), st.integers(0, 3), st.integers(0, 5), st.integers(1, 3))
-def test_labelled_windows_by_the_definition(seed, number, before, after, history):
+@given(st.integers(0, 8), st.integers(1, 10), st.integers(0, 3), st.integers(0, 5), st.sampled_from((0, 1, 3)))
+def test_labelled_windows_by_the_definition(seed, number, before, after, counted):
     lengths, window = (9, 14, 7), 6
     data, _ = LabelBudget(count=number, unit="transition", seed=seed).apply(demonstrations(lengths))
-    table = WindowTable.build(data, window, history=history, pad_before=before, pad_after=after)
+    table = WindowTable.build(
+        data, window, counted=range(counted, 5 - counted // 2), pad_before=before, pad_after=after
+    )
     has_action = data["has_action"].squeeze(-1)
     expected = []
-    for start, first, last in zip(table.starts.tolist(), table.first.tolist(), table.last.tolist(), strict=True):
-        inner = [start + frame for frame in range(history - 1, window - 1)]
+    for begin, first, last in zip(table.starts.tolist(), table.first.tolist(), table.last.tolist(), strict=True):
+        inner = [begin + frame for frame in range(counted, 5 - counted // 2)]
         expected.append(any(first <= row and row + 1 <= last and bool(has_action[row]) for row in inner))
     assert table.labelled.tolist() == expected
 
 
 def test_wrong_options():
     data = demonstrations()
-    with pytest.raises(ValueError, match="history 16 and window 16"):
-        WindowTable.build(data, 16, history=16)
+    for counted in (range(1, 16), range(-1, 4)):
+        with pytest.raises(ValueError, match=r"all but the last may count: got 16 and range"):
+            WindowTable.build(data, 16, counted=counted)
+    with pytest.raises(ValueError, match="a window has 2 frames or more"):
+        cut_windows(data, 1)
     with pytest.raises(ValueError, match=r"pad_before must be in 0\.\.15"):
         make_window_buffer(data, 16, 4, pad_before=16)
     with pytest.raises(KeyError, match="no entries"):

@@ -14,6 +14,7 @@ from torchrl_koap.data import LabelBudget, cut_windows, make_demonstrations, sav
 from torchrl_koap.data.ted import load_ted
 from torchrl_koap.keys import LayoutError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
+from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import WINDOW, Action
 from torchrl_koap.training import planner as planner_training
@@ -54,6 +55,20 @@ def test_the_weights_of_a_training_bit_for_bit(tmp_path):
     assert torch.equal(torch.get_rng_state(), before)
     assert same_weights(trained.planner, load_tensors(tmp_path / "run" / "planner.safetensors")[0])
     assert same_weights(trained.controller, load_tensors(tmp_path / "run" / "controller.safetensors")[0])
+
+
+def test_short_windows_hold_their_label_on_the_frame_that_counts(monkeypatch):
+    batches = []
+    monkeypatch.setattr(KOAPLoss, "forward", observed(KOAPLoss.forward, batches))
+    data, task = make_demonstrations(**few_labels())
+    data, _ = LabelBudget(count=20, unit="transition").apply(data)
+    fit_controller(data, task, steps=2, preset="scene")
+    assert [each["state"].shape[:2] for each in batches] == [(512, 10)] * 2  # one frame before, look-ahead of 8
+    assert all(each["has_action"][:, 1].sum() == 0.75 * 512 for each in batches)
+
+
+def observed(forward, batches):
+    return lambda self, batch: batches.append(batch) or forward(self, batch)
 
 
 def test_how_it_was_made_is_kept():

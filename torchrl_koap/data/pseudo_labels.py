@@ -62,7 +62,7 @@ def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window
     now = controller.num_past
     continued = extrapolate_ends(data, window - 1 - now)
     # one window per step of the data, in their order: those that have the step at frame `now`
-    frames, _ = WindowTable.build(continued, window, history=now + 1, pad_before=now).frames(hidden)
+    frames, _ = WindowTable.build(continued, window, counted=range(now, window - 1), pad_before=now).frames(hidden)
     example = next(itertools.chain(controller.parameters(), controller.buffers()), continued.get(STATE))
     was_training = controller.training
     controller.eval()  # dropout would make labels of noise

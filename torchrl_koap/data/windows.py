@@ -35,8 +35,8 @@ class WindowTable:
         starts (Tensor): int64 ``[M]``, storage index of frame 0; outside the trajectory where frames are padded.
         first (Tensor): int64 ``[M]``, index of the first step of the window's trajectory.
         last (Tensor): int64 ``[M]``, index of its last step.
-        labelled (Tensor): bool ``[M]``, whether an inner frame, ``history - 1 .. window - 2``, has an action label and
-            neither that frame nor the one after it is padded.
+        labelled (Tensor): bool ``[M]``, whether a frame that counts has an action label and neither that frame nor the
+            one after it is padded.
         window (int): frames per window.
 
     Examples:
@@ -57,19 +57,26 @@ class WindowTable:
 
     @classmethod
     def build(
-        cls, data: TensorDictBase, window: int, *, history: int = 2, pad_before: int = 0, pad_after: int = 0
+        cls,
+        data: TensorDictBase,
+        window: int,
+        *,
+        counted: range | None = None,
+        pad_before: int = 0,
+        pad_after: int = 0,
     ) -> WindowTable:
         """Tabulates the windows of ``window`` frames of flat data ``[N]``.
 
         The data have ``episode``; ``step_count`` and ``has_action`` are used if they are there. Windows may begin
         before their trajectory by ``pad_before`` frames and end behind it by ``pad_after``, which repeat its first and
-        last step. Of labels those of frames from ``history - 1`` on count, ``1 <= history < window``.
+        last step. Labels of the frames ``counted`` count; by default all but the first and the last frame.
 
         Raises:
             ValueError: if an argument is out of range, or a trajectory is too short.
         """
-        if not 1 <= history < window:
-            raise ValueError(f"wanted 1 <= history < window, got history {history} and window {window}")
+        counted = range(1, window - 1) if counted is None else counted
+        if window < 2 or not 0 <= counted.start <= counted.stop < window:
+            raise ValueError(f"a window has 2 frames or more, all but the last may count: got {window} and {counted}")
         for name, value in (("pad_before", pad_before), ("pad_after", pad_after)):
             if not 0 <= value < window:
                 raise ValueError(f"{name} must be in 0..{window - 1} frames (less than the window), got {value}")
@@ -96,8 +103,8 @@ class WindowTable:
         if has_action is not None:
             before = torch.zeros(steps + 1, dtype=torch.int64, device=device)
             before[1:] = has_action.reshape(-1).cumsum(0)
-            low = torch.maximum(starts + history - 1, first)
-            high = torch.minimum(starts + window - 2, last - 1)
+            low = torch.maximum(starts + counted.start, first)
+            high = torch.minimum(starts + counted.stop - 1, last - 1)
             labelled = before[(high + 1).clamp_min(0)] > before[low.clamp_max(steps)]
         return cls(starts, first, last, labelled, window)
 
@@ -159,6 +166,7 @@ def make_window_buffer(
     *,
     select: Sequence[NestedKey] | None = None,
     labelled_share: float | None = None,
+    counted: range | None = None,
     pad_before: int = 0,
     pad_after: int = 0,
 ) -> ReplayBuffer:
@@ -171,7 +179,7 @@ def make_window_buffer(
         batch_size (int): windows per batch.
         select (sequence of keys, optional): the entries to return; the fewer the faster. Default: all.
         labelled_share (float, optional): see :class:`WindowSampler`.
-        pad_before, pad_after (int): see :meth:`WindowTable.build`.
+        counted, pad_before, pad_after: see :meth:`WindowTable.build`.
 
     Returns:
         ReplayBuffer: samples are tensordicts ``[batch_size, window]``. With padding, a
@@ -196,7 +204,7 @@ def make_window_buffer(
         data = data.storage.get(slice(None))
     if data.batch_dims != 1:
         raise ValueError(f"windows are cut from flat data [N], got batch size {list(data.batch_size)}")
-    table = WindowTable.build(data, window, pad_before=pad_before, pad_after=pad_after)
+    table = WindowTable.build(data, window, counted=counted, pad_before=pad_before, pad_after=pad_after)
     if select is not None:
         absent = [key for key in select if data.get(key, None) is None]
         if absent:

@@ -20,13 +20,13 @@ from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.loop import Phases, moving_average
-from torchrl_koap.training.method import LABELLED_SHARES, Method
+from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import augmentation
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, with_commands
 
-BATCH_SIZE, LEARNING_RATE = 256, 1e-3
+LEARNING_RATE = 1e-3
 FITTED = 50_000  # windows that statistics without labels are fitted to
 _KEYS = ["state", "action", "has_action"]
 
@@ -66,8 +66,8 @@ def _train_network(
     """A controller's phases, and its closed form if it has one."""
     data, budget = controller_data(task, config.controller, data), config.controller.steps
     controller = build_controller(task, method, config.controller, data).to(config.run.device)
-    history = controller.num_past
-    window = max(WINDOW, controller.num_window_frames)
+    history, shortest = controller.num_past, controller.num_window_frames
+    window = max(WINDOW, shortest)
     frames, _ = WindowTable.build(data, window, pad_before=history).frames()
     if method.sees == "labelled":
         frames = frames[data["has_action"][frames].squeeze(-1).any(-1)]
@@ -76,8 +76,15 @@ def _train_network(
     with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
         controller.prepare(states, updates=budget if method.phases else 0, progress=count_up_to(bar))
     for phase in method.phases_of(config.controller.preset) if budget else ():
+        batch = BATCHES[phase.windows]
         buffer = make_window_buffer(
-            data, window, BATCH_SIZE, select=_KEYS, pad_before=history, labelled_share=LABELLED_SHARES[phase.windows]
+            data,
+            shortest if batch.shortest else window,
+            batch.size,
+            select=_KEYS,
+            labelled_share=batch.labelled_share,
+            counted=controller.valid_frames(shortest) if batch.shortest else None,
+            pad_before=history,
         )
         losses |= loop(
             phase.name,
@@ -114,7 +121,7 @@ def _train_sampler(
         select=_KEYS,
         pad_before=1,
         pad_after=HORIZON - 1,
-        labelled_share=LABELLED_SHARES[phase.windows],
+        labelled_share=BATCHES[phase.windows].labelled_share,
     )
     loss = phase.loss(sampler, dtype=DTYPES[config.run.precision])
     augment = augmentation(task, actions=True)

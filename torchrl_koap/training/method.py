@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives import LossModule
@@ -14,8 +14,25 @@ from torchrl.objectives import LossModule
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import Execution
 
-# share of every batch that has labels; None: as it comes
-LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
+
+class Batch(NamedTuple):
+    """How a batch of a controller's training is drawn: the share of windows with labels, their number and length.
+
+    A share of None takes windows as they come. In the ``shortest`` windows that a controller can read one frame counts,
+    so the labels of a batch are of as many situations as it has labelled windows.
+    """
+
+    labelled_share: float | None
+    size: int = 256
+    shortest: bool = False
+
+
+BATCHES = {
+    "all": Batch(None),
+    "mixed": Batch(0.25),
+    "labelled": Batch(1.0),
+    "short": Batch(0.75, 512, shortest=True),
+}
 SEES = ("all", "labelled")
 
 
@@ -26,7 +43,8 @@ class Phase:
     Args:
         name (str): its name in the log.
         loss (callable): the loss of a network, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
-        windows (str): ``"all"`` (labelled or not), ``"mixed"`` (25 % of every batch have labels) or ``"labelled"``.
+        windows (str): ``"all"`` (labelled or not), ``"mixed"`` (25 % of every batch have labels), ``"labelled"``, or
+            ``"short"`` (as short as can be, 75 % with labels).
         share (float): of the updates that a controller may have.
 
     Raises:
@@ -45,7 +63,7 @@ class Phase:
     share: float = 1.0
 
     def __post_init__(self):
-        lookup(LABELLED_SHARES, self.windows, "kind of windows")
+        lookup(BATCHES, self.windows, "kind of windows")
         if not 0 < self.share <= 1:
             raise ValueError(f"the share of phase {self.name!r} must be in (0, 1], got {self.share}")
 

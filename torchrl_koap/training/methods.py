@@ -131,7 +131,7 @@ for _method in (
         (_UNLABELLED,),
         closed_form=True,
         presets=_ANY_PRESET,
-        phases_by_preset={"scene": _JOINT},  # labels shape the latent action, too
+        phases_by_preset={"scene": (replace(_JOINT[0], windows="short"),)},  # labels shape the latent action, too
     ),
     Method("mpc", "MPC with an identified response", _response, fit=_fit_response, execution=_EVERY_STEP),
     Method(
