@@ -41,13 +41,6 @@ def test_sizes():
     assert shapes["wide_64"] == shapes["pictures"] == shapes["distractors"] == 64 and shapes["wide_512"] == 512
 
 
-def test_noise_is_in_steps_of_each_column():
-    data = make_data(6000)
-    data["state"] *= torch.tensor([1.0, 10.0])
-    error = (apply_regime(data, Regime("loud", "", noise=2.0))["state"] - data["state"]).std(0)
-    assert error.tolist() == pytest.approx([2.0, 20.0], rel=0.06)
-
-
 def test_hidden_columns_are_gone():
     data = make_data(columns=4)
     seen = apply_regime(data, Regime("dark", "", hidden=(0, 2)))["state"]

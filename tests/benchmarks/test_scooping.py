@@ -94,17 +94,3 @@ def test_a_data_set_holds_the_demonstrations_it_is_called_after(study, monkeypat
     (((parts, task, out), how),) = asked
     assert parts == whose and task.name == "scooping" and out.parent == tmp_path
     assert how["projection"].dim == 96
-
-
-def test_cells_pool_seeds_and_take_the_longest_row_of_each(benchmark_script):
-    base = {"labels": "5", "unlabelled": "both", "method": "koap"}
-    rates = {"left": "0.5", "near": "1.0", "right": "0.0", "action_error_mrad": "100.0"}
-    rows = [
-        base | rates | {"seed": seed, "n": n, "successes": successes, "rims": n}
-        for seed, n, successes in (("0", "15", "15"), ("0", "60", "30"), ("1", "60", "42"))
-    ]
-    rows.append(rows[0] | {"method": "dd", "action_error_mrad": ""})
-    cell, other = benchmark_script("page_rows").scooping_cells(rows)
-    assert (cell["n"], cell["successes"], cell["seeds"]) == (120, 72, ["0", "1"])
-    assert cell["left"] == pytest.approx(0.5) and cell["action_error_mrad"] == [100.0, 100.0]
-    assert other["method"] == "dd" and other["action_error_mrad"] == []

@@ -81,13 +81,3 @@ def test_rows_are_not_run_again_and_of_two_tables_that_alone_which_lacks_some(
     monkeypatch.setattr(script, "JUDGED", 2)
     script.main(**asked)  # the same error, whatever else is measured
     assert (tmp_path / "unlabelled_data.csv").read_text() == errors
-
-
-def test_rollouts_of_all_seeds_are_counted_together(benchmark_script, monkeypatch):
-    rows = benchmark_script("unlabelled_rows")
-    found = [{"regime": "plain", "method": "koap", "labels": "2", "seed": str(seed), "n": "60"} for seed in (0, 1)]
-    made = [row | {"successes": str(30 + 12 * int(row["seed"]))} for row in found]
-    monkeypatch.setattr(rows, "read_rows", lambda name, **wanted: made)
-    assert rows.followed("plain", 2, "koap") == "60 % (51-68) of 120"
-    assert rows.paired_gain([10.0, 10.0, 10.0]) == "+10 % (+10 to +10)"
-    assert rows.paired_gain([3.0], unit="points") == "+3 points (1 seeds)" and rows.paired_gain([]) == "not run"

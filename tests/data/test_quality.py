@@ -96,6 +96,21 @@ def test_labels_that_stand_alone():
     assert warning.startswith("labels stand alone in 1 trajectories: trajectory 0 (5 of 19 steps)")
 
 
+def test_odd_values_of_states_and_actions_are_warned_of():
+    rows, wave = np.arange(60)[:, None], np.sin(4 * TIME)
+    turned = np.hstack([np.cos(TIME), np.sin(TIME), 0 * TIME, 0 * TIME]) * np.where(rows % 3, 1, -1)
+    columns = [wave, (3 * TIME + np.pi) % (2 * np.pi) - np.pi, np.where(rows % 9, wave, -9999), turned]
+    labels = np.hstack([wave - 6.28 * (rows == 7), np.where(rows % 3, wave, -999)])[:59]
+    said = "\n".join(warnings([np.hstack(columns)], [torch.tensor(labels)], columns="sqmwxyz", units=(), acting="vu"))
+    for words in (
+        "angles that were wrapped",
+        "column 'm' is -9999",
+        "w, x, y, z are a quaternion that changes its sign",
+    ):
+        assert words in said
+    assert "action 'v' is -5" in said and "action 'u' is -999" in said
+
+
 def test_columns_that_differ_between_trajectories_alone_are_goals():
     frames = [np.hstack([TIME, 0 * TIME + goal, 0 * TIME]) for goal in (1, 2)]
     assert goal_columns(make_recordings(frames, action_dim=1, state_names=["x", "goal", "shelf"])) == ["goal"]

@@ -13,7 +13,6 @@ sys.path.append(str(ROOT / "docs" / "extensions"))
 
 import api_pages  # noqa: E402
 import command_pages  # noqa: E402
-import design_page  # noqa: E402
 import method_pages  # noqa: E402
 import pages  # noqa: E402
 import run_tutorials  # noqa: E402
@@ -102,16 +101,6 @@ def test_a_tutorial_that_prints_something_else_is_an_error(tmp_path, monkeypatch
     assert not (tmp_path / "story.png").exists()  # nothing is kept
 
 
-def test_rooms_stand_on_what_they_import():
-    allowed = design_page.may_import()
-    level = design_page.floors(allowed)
-    assert level["files"] == 0 and level["commands"] == max(level.values())
-    for room, others in allowed.items():
-        assert all(level[other] < level[room] for other in others - {room, "__version__"})
-    drawing = design_page.drawing(allowed)
-    assert drawing.count("<rect") == len(allowed) and drawing.count("<line") < sum(map(len, allowed.values())) / 2
-
-
 def test_the_time_picture_has_the_numbers_of_the_code():
     drawing = time_picture.drawing()
     assert re.findall(r">([+-]\d+|now)<", drawing) == ["-4", "-3", "-2", "-1", "now", *(f"+{k}" for k in range(1, 15))]
@@ -150,8 +139,3 @@ def test_defaults_of_every_task_are_a_page(generated):
     task_pages.write_defaults()
     page = (generated / "defaults.rst").read_text()
     assert all(f"``{name}``" in page for name in task_pages.TASKS) and "your own data" in page and "3,000 x" in page
-
-
-def test_tables_keep_several_lines_in_a_cell():
-    assert pages.table(("a", "b"), [("1", "x\ny")]).splitlines()[-2:] == ["     - x", "       y"]
-    assert pages.table(("a",), []) == ""

@@ -108,21 +108,6 @@ SEEN = ("embed", "{seen}", "--out", "{out}", "--network", "tiny_network:random_l
 TOP, WRIST = "1/top/000007.png", "1/wrist.npy"
 
 
-def of_array(change: Callable[[Any], Any]) -> Callable[[Path], None]:
-    """A change of the frames that the camera wrist saw."""
-
-    def do(folder: Path) -> None:
-        import numpy as np
-
-        np.save(folder / WRIST, change(np.load(folder / WRIST)))
-
-    return do
-
-
-def of_picture(size: int, channels: int) -> Callable[[Path], None]:
-    return lambda folder: (folder / TOP).write_bytes(_png(size, channels)) and None
-
-
 # frames beside own arrays: what is said where they are converted, and where they are embedded after it; the damage
 FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
     "a frame missing": (
@@ -130,35 +115,16 @@ FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
         "'top' of 1.*frame 7 is missing",
         lambda folder: (folder / TOP).unlink(),
     ),
-    "frames without end": (
-        r"'wrist' has 18 frames for 20 rows.*drop_columns .* wrist",
-        "'wrist' of 1.*frame 18 is missing",
-        of_array(lambda frames: frames[:18]),
-    ),
     "a camera absent": (
         "'wrist' has no frames in 1.npz",
         r"wrist.npy is not there \(any more\)",
         lambda folder: (folder / WRIST).unlink(),
-    ),
-    "names without numbers": (
-        "must end in a number",
-        "must end in a number",
-        lambda folder: (folder / TOP).rename(folder / "1/top/last.png"),
     ),
     "no array": (*("wrist.npy holds no array of numbers",) * 2, lambda folder: (folder / WRIST).write_bytes(b"array")),
     "a damaged picture": (
         None,
         "'top' of 1.*frame 7 .000007.png. is no picture",
         lambda folder: (folder / TOP).write_bytes(b"PNG"),
-    ),
-    "another size": (None, "'top' of 1.*frame 7 is 16 x 16, the camera's others are 32 x 32", of_picture(16, 3)),
-    "alpha": (None, "'top' of 1.*frame 7 is RGBA", of_picture(32, 4)),
-    "greyscale": (None, "'wrist' of 1.*frame 0 is greyscale.*save it as RGB", of_array(lambda frames: frames[..., 0])),
-    "floats": (None, "'wrist' of 1.*frame 0 is float64, wanted uint8", of_array(lambda frames: frames / 255.0)),
-    "colours first": (
-        None,
-        "'wrist' of 1.*put the colours last",
-        of_array(lambda frames: frames.transpose(0, 3, 1, 2)),
     ),
 }
 

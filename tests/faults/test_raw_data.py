@@ -104,13 +104,8 @@ HOSTILE = {  # all others are refused by tests/data/d3il/test_unpickling.py
     "a script": b"import os\nos.system('touch owned')\n",
 }
 CONTENT: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "a list": lambda content: [content],
     "a number": lambda content: 3,
-    "nothing": lambda content: {},
-    "no robot": lambda content: {"context": None},
-    "robot a list": lambda content: {"robot": [1]},
     "robot None": lambda content: {"robot": None},
-    "robot empty": lambda content: {"robot": {}},
     "robot of other names": lambda content: {"robot": {"xyz": np.zeros((30, 3))}},
     "robot of numbers": lambda content: {"robot": {1: np.zeros((30, 3))}},
     "one row": lambda content: {"robot": {name: array[:1] for name, array in content["robot"].items()}},

@@ -20,7 +20,6 @@ from torchrl_koap.runs.weights import CheckpointError
 from torchrl_koap.training.loop import train_phase
 
 STEPS = 24
-UNITS = ("trajectory", "window", "transition")
 
 
 class Killed(BaseException):

@@ -6,7 +6,6 @@ import torch
 
 from torchrl_koap.modules import LatentActionMLP, WindowReader
 
-T = 16
 CASES = [(1, 8), (0, 2), (4, (2, 3, 4, 6, 8)), (2, (5, 3)), (1, 7)]
 
 

@@ -156,17 +156,6 @@ def test_faults_name_file_and_column(change, problem, tmp_path):
     assert problem.replace("FILE", str(file)) in found
 
 
-def test_faults_of_all_files_come_together(tmp_path):
-    root = write(tmp_path, version="v2.1")
-    first, second = sorted((root / "data").rglob("*.parquet"))
-    first.write_bytes(b"PAR1 no more")
-    pq.write_table(pq.read_table(second).drop_columns(["observation.force", "frame_index"]), second)
-    with pytest.raises(DataError) as caught:
-        read_lerobot(root)
-    assert [problem.split(":")[0] for problem in caught.value.problems] == [str(first), str(second), str(second)]
-    assert "it is no parquet file, or damaged" in caught.value.problems[0]
-
-
 def test_the_same_fault_of_several_files_is_said_once(tmp_path):
     files = sorted((write(tmp_path, version="v2.1") / "data").rglob("*.parquet"))
     for file in files:
