@@ -20,7 +20,7 @@ BANNED = re.compile(
     r"\b(told apart|pays?|paid|buys?|bought|(is|are) worth|money|honest(ly)?|leash|by heart|luck(y|ily)?|loud(ly)?"
     r"|in force|of before|the former|was wanted|tried and not kept|for the first time|in the wild|in secret"
     r"|postures?|oracles?|regimes?|beside the demonstrations|random play|ledgers?|keeps? its bits|embodies"
-    r"|imagin(es?|ed)|dealt|forgives?|punish(es)?|verdicts?|foresee[sn]?|foresight|doubts?"
+    r"|imagin(es?|ed)|joining|adopts?|adopted|dealt|forgives?|punish(es)?|verdicts?|foresee[sn]?|foresight|doubts?"
     r"|a (tenth|hundredth|fiftieth|twentieth|third|quarter|fifth) of)\b",
     re.IGNORECASE,
 )

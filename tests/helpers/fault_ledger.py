@@ -48,13 +48,7 @@ class HangError(BaseException):
 
 @dataclass(frozen=True)
 class Place:
-    """Folders of one fault, made anew for each.
-
-    Args:
-        root (Path): an empty folder.
-        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, ``filmed`` arrays,
-            camera ``frames`` and a ``network`` for them; not written to.
-    """
+    """Folders of one fault below an empty ``root``, made anew for each from a ``template`` that is not written to."""
 
     root: Path
     template: Path
@@ -69,16 +63,10 @@ class Place:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that goes wrong.
+    """Something that goes wrong: a call, the damage done before it, and what its one line and its status must be.
 
-    Args:
-        name (str): what is wrong.
-        words (tuple of str): the call; ``{run}``, ``{data}``, ``{ted}``, ``{arrays}``, ``{frames}`` and ``{network}``
-            stand for folders that are there, ``{out}`` for one that is not.
-        says (str): regular expression that the one line matches.
-        damage (callable, optional): does the damage; called with the :class:`Place`.
-        status (int or tuple): exit status that is right.
-        accepted (bool): nothing is wrong after all; the line says so that nobody refuses it by mistake.
+    In its words ``{run}``, ``{data}``, ``{ted}``, ``{arrays}``, ``{filmed}``, ``{frames}`` and ``{network}`` stand for
+    folders of the template, ``{out}`` for none. With ``accepted`` nothing is wrong after all.
     """
 
     name: str
@@ -178,34 +166,27 @@ def make_camera_template(root: Path) -> None:
     """Demonstrations that a camera saw, and a projection fitted behind a network of one's own."""
     import numpy as np
     import torch
+    from camera_sets import write_camera_set
 
-    from torchrl_koap.data.formats.writers import LeRobotWriter, encode_png
+    from torchrl_koap.data.formats.writers import encode_png
     from torchrl_koap.tasks import get_task
     from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
 
-    task, (network, width) = get_task("scooping"), (root / "network", 32)
-    network.mkdir()
-    torch.manual_seed(0)
-    backbone = load_backbone("tiny_network:random_layer")
-    about = {"state_names": "xyz", "action_names": task.action_names, "embodiment": "robot", "task": "scoop"}
-    writer = LeRobotWriter(root / "frames", fps=10, camera="observation.images.third_person", **about)
+    write_camera_set(root / "frames", "robot")
     generator = np.random.default_rng(0)
-    for length in (4, 6):
-        frames = generator.integers(0, 256, (length + 1, width, width, 3), dtype=np.uint8)
-        action = generator.normal(size=(length, task.action_dim))
-        writer.add(generator.normal(size=(length + 1, 3)), action, frames=frames)
-    writer.close()
     for number in range(2):  # recordings with two cameras beside them
         states = generator.normal(size=(20, 2)).cumsum(0)
         (root / "filmed" / str(number) / "top").mkdir(parents=True)
         np.savez(root / "filmed" / f"{number}.npz", states=states, actions=np.diff(states, axis=0), control_hz=10.0)
-        frames = generator.integers(0, 256, (20, width, width, 3), dtype=np.uint8)
+        frames = generator.integers(0, 256, (20, 8, 8, 3), dtype=np.uint8)
         np.save(root / "filmed" / str(number) / "wrist.npy", frames)
         for index, frame in enumerate(frames):
             (root / "filmed" / str(number) / "top" / f"{index:06d}.png").write_bytes(encode_png(frame))
-    fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
-    fitted.about = FrozenImageEncoder(backbone, size=width).identity
-    fitted.save(network / "projection.safetensors")
+    torch.manual_seed(0)
+    about = FrozenImageEncoder(load_backbone("tiny_network:random_layer"), size=8).identity
+    fitted = Projection(torch.zeros(40), torch.randn(40, get_task("scooping").observation_dim - 3), about)
+    (root / "network").mkdir()
+    fitted.save(root / "network" / "projection.safetensors")
 
 
 @contextlib.contextmanager
