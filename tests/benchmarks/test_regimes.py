@@ -35,12 +35,6 @@ def test_a_seed_fixes_a_regime_and_actions_stay(name):
     assert torch.equal(seen["state"], apply_regime(data, name, seed=4)["state"]) == (not random)
 
 
-def test_sizes():
-    shapes = {name: apply_regime(make_data(120), name)["state"].shape[-1] for name in REGIMES}
-    assert shapes["plain"] == shapes["noise"] == 2
-    assert shapes["wide_64"] == shapes["pictures"] == shapes["distractors"] == 64 and shapes["wide_512"] == 512
-
-
 def test_hidden_columns_are_gone():
     data = make_data(columns=4)
     seen = apply_regime(data, Regime("dark", "", hidden=(0, 2)))["state"]

@@ -36,8 +36,3 @@ def test_old_words_are_no_public_names():
 def test_the_glossary_has_forty_terms_at_most_and_no_term_twice():
     rows = re.findall(r"^\| ([^|]+) \|", (ROOT / "docs" / "glossary.md").read_text(), re.M)[1:]
     assert 20 <= len(rows) <= 40 and len({*rows}) == len(rows)
-
-
-def test_old_words_are_found():
-    (node,) = public_definitions(ast.parse("def make_leash(lead): ..."))
-    assert words_of(node.name) & OLD_NAMES

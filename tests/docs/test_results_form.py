@@ -70,12 +70,3 @@ def test_numbers_of_templates_are_those_of_the_files(path):
         names = [str(file.relative_to(SOURCE).with_suffix("")) for file in SOURCE.rglob("*.csv")]
     commands = " ".join("".join(found) for found in COMMANDS.findall(template))
     assert not set(numbers_of_the_text(template)) - values_of(names) - set(NUMBER.findall(commands))
-
-
-def test_typed_numbers_are_found():
-    assert numbers_of_the_text(
-        "1. It is 7 % of `8` in {{ nine(9) }} of 1,000, with 95 % intervals (Chi et al. 2023)."
-    ) == ["7", "1000"]
-    assert {"200", "2.5", "50", "0.5"} <= {*values_of(["facts"]), "2.5", "50", "0.5"}
-    with pytest.raises(AssertionError):
-        assert not {"123456"} - values_of(["facts"])

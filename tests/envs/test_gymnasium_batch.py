@@ -176,16 +176,6 @@ def played(env, steps, seed=0):
     return [env.step(ACTION) for _ in range(steps)]
 
 
-def test_an_action_outside_the_box_is_clipped_and_told():
-    env, alone = (GymnasiumEpisode(Reach(), 0, max_steps=9), Reach())
-    env.reset(seed=3)
-    alone.reset(seed=3)
-    given = np.array([5.0, 0.5], dtype=np.float32)
-    observation, *_, told = env.step(given)
-    np.testing.assert_allclose(observation, alone.step(np.array([1.0, 0.5]))[0], rtol=1e-6)
-    assert told["clipped"] and not env.step(ACTION)[-1]["clipped"]
-
-
 def test_rounding_of_float32_is_no_clipping():
     env = Reach()
     env.action_space = gymnasium.spaces.Box(-0.1, 0.1, (2,), np.float64)

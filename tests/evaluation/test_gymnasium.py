@@ -4,8 +4,9 @@
 import json
 
 import pytest
+from offline_runs import record
 from tiny_runs import koap
-from toy_gym import NAMES, demonstrations
+from toy_gym import NAMES
 
 from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, save_demonstrations, train
 from torchrl_koap.evaluation import InspectConfig, inspect
@@ -18,7 +19,7 @@ from torchrl_koap.runs.run_directory import RunDirectoryError
 @pytest.fixture(scope="module")
 def arm_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("arm")
-    states, actions = demonstrations()
+    states, actions = record(5, 31, joints=2)
     actions = [steps if index < 2 else None for index, steps in enumerate(actions)]
     data = save_demonstrations(folder / "data", states, actions, control_hz=30, state_names=NAMES, robot=NAMES[:2])
     run = folder / "run"

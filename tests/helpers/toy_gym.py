@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A robot of two joints in Gymnasium, that reports success in different ways, and demonstrations of it."""
+"""A robot of two joints in Gymnasium, that reports success in different ways."""
 
 import gymnasium
 import numpy as np
@@ -71,19 +71,6 @@ class Drawn(Reach):
         picture = np.full((8, 8, 3), self.shade, np.uint8)
         picture[..., 0] = int(100 + 50 * self.joints[0])
         return picture
-
-
-def demonstrations(number=5, steps=30, seed=0):
-    """States and actions of a robot that goes to its goal."""
-    env, states, actions = Reach(length=steps), [], []
-    for index in range(number):
-        rows, taken = [env.reset(seed=seed + index)[0]], []
-        for _ in range(steps):
-            taken.append(0.15 * (rows[-1][2:] - rows[-1][:2]) + env.np_random.normal(0, 0.002, 2))
-            rows.append(env.step(taken[-1])[0])
-        states.append(np.array(rows))
-        actions.append(np.array(taken))
-    return states, actions
 
 
 for _id, _options in {

@@ -13,7 +13,7 @@ from tiny_runs import TINY, koap
 from torchrl_koap import Agent, load_policy
 from torchrl_koap.data import read_recordings
 from torchrl_koap.modules.execution.policy_env import NoiseStreams
-from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
+from torchrl_koap.runs.weights import CheckpointError
 
 INSTALL = "is not installed: pip install ./integrations/lerobot_policy_koap (docs/howto/lerobot.md)"
 pytest.importorskip("lerobot", reason=f"lerobot {INSTALL}")
@@ -196,16 +196,6 @@ def test_features_that_are_not_those_of_the_run_are_named(exported):
     three = PushtEnv(features={"action": PolicyFeature(FeatureType.ACTION, (3,))})
     with pytest.raises(ValueError, match="action has 3 columns, the policy has 2: vx, vy"):
         loaded(exported, env_cfg=three)
-
-
-def test_a_folder_without_usable_weights_is_named(exported):
-    tensors, about = load_tensors(exported / "model.safetensors")
-    save_tensors(exported / "model.safetensors", tensors, about | {"version": 1})
-    with pytest.raises(CheckpointError, match="model.safetensors is a policy of format 1, this version reads 2"):
-        KoapPolicy.from_pretrained(exported)
-    (exported / "model.safetensors").unlink()
-    with pytest.raises(FileNotFoundError, match="model.safetensors is missing: `koap export RUN --format lerobot"):
-        KoapPolicy.from_pretrained(exported)
 
 
 def test_training_is_refused(exported):

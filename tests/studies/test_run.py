@@ -96,14 +96,6 @@ def test_what_a_curve_writes(whole_curve):
     assert not [path for path in whole_curve.rglob("*") if ".tmp" in path.name]
 
 
-def test_a_second_call_redoes_nothing(curve, demonstrations):
-    before = marks(curve)
-    (curve / "index.html").unlink()
-    assert run(curve, demonstrations)["done"] == 2
-    assert len(before) == 3 and marks(curve) == before
-    assert (curve / "index.html").exists()
-
-
 def test_methods_labels_and_seeds_may_be_added(curve, demonstrations, monkeypatch):
     read, original, before = [], run_module.cell_row, marks(curve)
     monkeypatch.setattr(
@@ -236,17 +228,6 @@ def test_a_planner_that_fails_fails_the_cells_that_need_it_and_no_other(curve, d
     assert run(curve, demonstrations, methods=("dp",))["missing"] == 0  # what never began is not asked for now
     (curve / PLANNER).unlink()
     assert run(curve, demonstrations)["done"] == 2
-
-
-def test_damaged_cells_are_made_again_and_those_not_asked_for_are_named(curve, demonstrations):
-    before = {name: episodes_of(curve, name) for name in (DP, LINEAR)}
-    os.truncate(curve / DP / "result.json", 20)
-    os.truncate(curve / LINEAR / "result.json", 20)
-    counts = run(curve, demonstrations, methods=("linear",))
-    assert (counts["done"], counts["failed"]) == (1, 1)
-    assert "result.json is damaged" in rows_of(curve)[DP]["reason"]
-    assert run(curve, demonstrations)["done"] == 2
-    assert {name: episodes_of(curve, name) for name in before} == before
 
 
 def test_a_damaged_study_json_is_named(curve, demonstrations, capsys):

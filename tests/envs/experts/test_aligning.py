@@ -4,11 +4,10 @@
 import math
 
 import numpy as np
-import pytest
 from expert_test_base import ContextExpertTestBase, first_attempts
 
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.aligning import CONTACTS, FULL_PUSH, SURGE, AligningExpert
+from torchrl_koap.envs.experts.aligning import FULL_PUSH, SURGE, AligningExpert
 
 
 class TestAligningExpert(ContextExpertTestBase):
@@ -24,15 +23,6 @@ def test_most_first_attempts_succeed_in_the_asked_mode():
         assert np.degrees(tilt).max() < 10
         assert np.abs(attempt.actions).max() < 1.03 * FULL_PUSH + 0.0015  # what a hand's wobble adds
         assert np.abs(np.diff(attempt.actions, axis=0)).max() < SURGE + 0.0015
-
-
-def test_contacts_lie_at_the_walls():
-    inside, outside = CONTACTS
-    assert np.abs(inside[:, 4:6]).max() == pytest.approx(0.035) and (np.hypot(*inside[:, 4:6].T) < 0.051).all()
-    np.testing.assert_allclose(np.abs(outside[:, 4:6]).max(1), 0.065)
-    for contact in outside:  # the rod pushes towards the wall, from a radius away
-        force = np.array([math.cos(contact[2]), math.sin(contact[2])])
-        np.testing.assert_allclose(contact[4:6] + 0.01 * force, contact[:2], atol=1e-15)
 
 
 def observed(tray, tcp, target=(0.5, 0.3, 0.0)):

@@ -4,7 +4,7 @@
 import numpy as np
 from expert_test_base import ExpertTestBase, first_attempts
 
-from torchrl_koap.envs.experts.avoiding import FULL_PUSH, GAPS, AvoidingExpert, mode_gaps
+from torchrl_koap.envs.experts.avoiding import FULL_PUSH, AvoidingExpert, mode_gaps
 
 
 class TestAvoidingExpert(ExpertTestBase):
@@ -13,12 +13,6 @@ class TestAvoidingExpert(ExpertTestBase):
 
 def test_mode_gaps_count_like_the_environment():
     assert [12 * row1 + 4 * row2 + row3 for row1, row2, row3 in map(mode_gaps, range(24))] == list(range(24))
-
-
-def test_gaps_lie_between_the_cylinders():
-    edges = ([0.5], [0.425, 0.575], [0.35, 0.5, 0.65])
-    for row, gaps in zip(edges, GAPS, strict=True):
-        assert [int(np.searchsorted(row, x)) for gap in gaps for x in gap] == np.repeat(range(len(gaps)), 2).tolist()
 
 
 def test_most_first_attempts_take_the_asked_mode():

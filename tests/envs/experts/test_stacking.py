@@ -10,7 +10,6 @@ from tensordict import TensorDict
 from torchrl_koap.envs import StackingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.experts.stacking import StackingExpert
-from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
 from torchrl_koap.envs.stacking import ORDERS
 
 LIMIT = 1000
@@ -57,20 +56,3 @@ def test_a_box_that_was_taken_away_is_fetched_again():
         if out["success"].item():
             break
     assert stolen and out["success"].item() and out["mode"].tolist() == [[0, 1, 2]]
-
-
-def test_inverse_kinematics_reaches_poses():
-    generator = np.random.default_rng(0)
-    joints = np.array([StackingEnv.START_JOINTS] * 5)
-    position, quaternion = tcp_pose(joints)
-    position = position + generator.uniform(-0.02, 0.02, (5, 3))
-    half = generator.uniform(-0.03, 0.03, 5)
-    quaternion = np.stack([0 * half, np.cos(half), np.sin(half), 0 * half], 1)
-    poses = np.concatenate([position, quaternion], 1)
-    once = follow_pose(joints, poses)
-    np.testing.assert_allclose(tcp_pose(once)[0], position, atol=1e-4)
-    missing = np.abs(2 * half - 2 * np.arctan2(*tcp_pose(once)[1][:, [2, 1]].T))
-    assert (missing < 0.4 * np.abs(2 * half) + 1e-3).all()
-    reached = tcp_pose(follow_pose(joints, poses, substeps=300))
-    np.testing.assert_allclose(reached[0], position, atol=1e-6)
-    assert (np.abs((reached[1] * quaternion).sum(1)) > 1 - 1e-9).all()

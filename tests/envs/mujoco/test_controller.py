@@ -92,14 +92,3 @@ def test_inverse_kinematics_equal_the_numpy_version(generator):
         np.testing.assert_allclose(
             compiled_inverse_kinematics(target, q), numpy_inverse_kinematics(target, q), rtol=0, atol=1e-10
         )
-
-
-def test_inverse_kinematics_converge_and_respect_the_bound_of_joint_3():
-    q = np.array(AvoidingEnv.START_JOINTS)
-    target = np.concatenate([pose_of(q)[2] + [0.05, 0.1, 0.02], [0, 1, 0, 0]])
-    for _ in range(1000):
-        q = compiled_inverse_kinematics(target, q)
-    _, _, tcp, quat = pose_of(q)
-    np.testing.assert_allclose(tcp, target[:3], atol=1e-6)
-    assert abs(quat[1]) > 1 - 1e-10
-    assert compiled_inverse_kinematics(target, np.array([0, 0.5, 2.8, -2, 0, 2, 0.0]))[2] == 2.0

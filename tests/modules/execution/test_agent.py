@@ -8,8 +8,7 @@ from small_samplers import chunk_policy, small_planner
 from torchrl.collectors import Collector
 from toy_gym import reach
 
-from torchrl_koap.modules import Agent, Execution, PlanningPolicy, PolicyEnv, make_koopman_inverse_dynamics, make_policy
-from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
+from torchrl_koap.modules import Agent, Execution, PolicyEnv, make_koopman_inverse_dynamics, make_policy
 
 STEPS = 13
 
@@ -129,17 +128,6 @@ def test_what_is_no_observation(given, says):
 def test_what_is_no_seed(seed):
     with pytest.raises(ValueError, match=f"seed must be a whole number, got {seed!r}"):
         ready(seed=seed)
-
-
-def test_keys_of_the_policy_are_those_that_are_written_and_read():
-    def acted(noise_key, **keys):
-        planner = small_planner(noise_key=noise_key)
-        follower = InverseDynamicsFollower(make_koopman_inverse_dynamics(2, 2))
-        agent = ready(PlanningPolicy(planner, follower, state_of=(2, 3), **keys).eval(), seed=7)
-        return np.stack([agent.act(np.full(4, float(step))) for step in range(3)])
-
-    usual = acted("noise")
-    np.testing.assert_array_equal(acted("z", history_key="frames", action_key=("robot", "u")), usual)
 
 
 def test_a_planner_that_draws_by_itself_is_handed_no_noise():
