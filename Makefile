@@ -34,7 +34,7 @@ test: setup
 slow: setup
 	$(BIN)/python -m pytest -q -m slow
 
-# every fault of the ledger, and the state machines at length
+# every fault of the ledger
 faults: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m "faults or not faults" tests/faults
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m faults tests/commands tests/studies

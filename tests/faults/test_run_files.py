@@ -120,24 +120,15 @@ def files() -> Iterator[Fault]:
 TYPES = {"null": None, "text": "n0nsense", "a fraction": 8.5, "a list": [[]], "an object": {"a": 1}, "true": True}
 # entries of config.json that build the networks, and the kinds of values that would do
 ENTRIES = {
-    "task": (),
     "method": (),
     "planner": (),
-    "controller": (),
     "labels": (),
-    "run": (),
-    "execution": (),
     "planner.network": (),
-    "planner.width": (),
     "planner.frames": (),
-    "controller.preset": (),
     "controller.columns": (),
-    "labels.unit": (),
     "labels.fraction": ("null",),
     "labels.episodes": (),
-    "planner.steps": ("null",),
     "planner.learning_rate": ("null", "a fraction"),
-    "run.seed": (),
     "run.plugins": (),
     "execution.strategy": ("null",),
 }

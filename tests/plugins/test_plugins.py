@@ -5,7 +5,6 @@ import sys
 import types
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -18,7 +17,6 @@ from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.envs import make_env, mode_index_of
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.envs.registry import ManipulationGymEnv
 from torchrl_koap.evaluation.diagnosis import contexts_of
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.keys import validate
@@ -101,15 +99,6 @@ def test_it_is_drawn():
     (look,) = bodies_of(run.task, 1)
     assert look.label == "puck" and to_rgb(look.color) == to_rgb(BLUE)
     assert "Squares are the objects" in all_pictures()["rollouts.gif"].caption_for(run)
-
-
-def test_gymnasium_knows_it():
-    gymnasium.register("puck/Puck-v0", ManipulationGymEnv, kwargs={"task": NAME})
-    env = gymnasium.make("puck/Puck-v0", disable_env_checker=True)
-    observation, info = env.reset(seed=0)
-    assert observation.shape == (4,) and info["mode_index"] == -1 and info["context"].shape == (1, 3)
-    assert env.step(env.action_space.sample())[0].shape == (4,)
-    assert env.unwrapped.metadata["render_fps"] == 20
 
 
 def test_a_robot_without_simulator():

@@ -12,7 +12,6 @@ from safetensors.numpy import save_file
 
 from torchrl_koap.evaluation.statistics import expected_entropy
 from torchrl_koap.reports import pictures
-from torchrl_koap.reports.html import templates
 from torchrl_koap.reports.pictures import all_pictures, draw_pictures
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
@@ -222,15 +221,3 @@ def test_no_such_directory(tmp_path):
     for function in (write_report, draw_pictures):
         with pytest.raises(FileNotFoundError, match="no run directory"):
             function(tmp_path / "none")
-
-
-def test_interval_bar_is_to_scale():
-    pieces = templates().get_template("pieces.html").module
-    bar = pieces.interval_bar(90.0, 75.0, 96.0)
-    assert 'x="75.0" y="2" width="21.0"' in bar and 'x="89.8"' in bar
-    assert 'width="0.4"' in pieces.interval_bar(100.0, 100.0, 100.0)
-
-
-def test_long_lists_are_cut_and_counted():
-    pieces = templates().get_template("pieces.html").module
-    assert str(pieces.definition("a", list(range(100)))).endswith("39 … (100 in all)")

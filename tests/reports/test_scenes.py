@@ -8,7 +8,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from torchrl_koap.data.d3il.conversion import CONVERTERS
-from torchrl_koap.envs.contexts import draw_contexts, yaw_quaternions
+from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.reports import scenes
 from torchrl_koap.tasks import TASKS, get_task
@@ -82,17 +82,6 @@ def test_every_start_lies_inside_the_picture(task):
         assert ((contexts[..., :2] > low + 0.04) & (contexts[..., :2] < high - 0.04)).all()
 
 
-def test_outlines_turn_with_the_body():
-    poses, half = np.array([[0.4, -0.2, 0.7], [0.5, 0.1, -1.2]]), (0.03, 0.05)
-    for pose, outline in zip(poses, scenes.outlines(poses, half), strict=True):
-        np.testing.assert_allclose(outline[0], outline[4])
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, yaw_quaternions(pose[2]))
-        corners = np.array([[-0.03, -0.05, 0], [0.03, -0.05, 0], [0.03, 0.05, 0], [-0.03, 0.05, 0]])
-        wanted = corners @ matrix.reshape(3, 3).T + [*pose[:2], 0]
-        np.testing.assert_allclose(outline[:4], wanted[:, :2])
-
-
 @pytest.mark.parametrize("number", [3, 21])
 def test_orientation_is_drawn(number):
     """Outlines with a thick far side, of many the centre and a line to the far side."""
@@ -118,12 +107,3 @@ def test_objects_of_an_unknown_task_are_grey():
 def test_bad_contexts():
     with pytest.raises(ValueError, match=r"'context' must have shape \[any, 2, 3\], got \[4, 2\]"):
         scenes.draw_starts(Figure().add_subplot(), np.zeros((4, 2)), scenes.bodies_of(get_task("aligning"), 2))
-
-
-def test_executed_paths_end_where_the_episode_does():
-    data = {"position": np.zeros((2, 9, 2)), "length": np.array([4, 9]), "object_position": np.zeros((2, 9, 1, 2))}
-    paths, mode, outcome = scenes.read_episodes(data | {"mode": [3.0, -1.0], "outcome": [1, 0]})
-    assert [len(path) for path in paths] == [4, 9]
-    assert mode.tolist() == [3, -1] and outcome.tolist() == [1, 0]
-    assert [len(path) for path in scenes.body_paths(data)] == [5, 9]  # with the state after the last step
-    assert scenes.body_paths({"position": data["position"]}) == []

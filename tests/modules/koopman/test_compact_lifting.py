@@ -160,22 +160,6 @@ def explained(coordinates, wanted):
     return 1 - (left.var(0) / wanted.var(0)).max().item()
 
 
-def roll(count=2000):
-    """A sheet rolled up one and a half times, and where on the sheet the points lie."""
-    place = uniform(count, 2) * torch.tensor([9.4, 20.0])
-    angle = (place[:, 0] + 4.7).double()
-    # arc length is about linear in the square of the angle: points are placed by the angle and judged along the arc
-    arc = (angle * (1 + angle**2).sqrt() + torch.asinh(angle)) / 2
-    points = torch.stack([angle * angle.cos(), place[:, 1].double(), angle * angle.sin()], -1)
-    return points, torch.stack([arc, place[:, 1].double()], -1)
-
-
-def test_a_rolled_sheet_is_laid_flat():
-    points, place = roll()
-    assert explained(points, place) < 0.5  # no linear map does
-    assert explained(isomap(points, 2), place) > 0.98
-
-
 def test_coordinates_have_unit_spread_the_widest_first_and_what_is_not_there_is_zero():
     points = torch.cat([3 * uniform(400, 1), uniform(400, 1, seed=1), torch.zeros(400, 3)], 1)
     coordinates = isomap(points, 2)

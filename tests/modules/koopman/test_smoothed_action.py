@@ -133,15 +133,6 @@ def make_motion(noise, num=1500, frames=12):
     return clean, clean + noise * torch.randn(clean.shape, generator=generator)
 
 
-@pytest.mark.parametrize("noise", [0.1, 0.5])
-def test_the_noise_of_every_column_is_found(noise):
-    _, noisy = make_motion(torch.tensor([noise, 2 * noise]))
-    found = noise_covariance(noisy)
-    assert found.dtype == torch.float64
-    assert found.diagonal().tolist() == pytest.approx([noise**2, 4 * noise**2], rel=0.1)
-    assert abs(found[0, 1]) < 0.1 * noise**2
-
-
 def test_smoothing_takes_noise_out_and_leaves_clean_windows():
     index = [4 + frame for frame in FRAMES]
     clean, noisy = make_motion(0.3)
