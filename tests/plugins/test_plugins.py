@@ -4,6 +4,7 @@
 import sys
 import types
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -32,15 +33,12 @@ NAME = "push_past_a_post"
 @pytest.fixture(scope="module", autouse=True)
 def plugin():
     """The task, registered by import, for the tests of this file alone."""
-    known = dict(TASKS)
-    with pytest.MonkeyPatch.context() as patch:
-        own = types.ModuleType("own_task")
-        patch.setitem(sys.modules, "own_task", own)
+    own = types.ModuleType("own_task")
+    with patch.dict(TASKS), pytest.MonkeyPatch.context() as context:
+        context.setitem(sys.modules, "own_task", own)
         definitions = TUTORIAL.read_text().partition("# Everything else is there")[0]
         exec(compile(definitions, TUTORIAL, "exec"), vars(own))
         yield
-    TASKS.clear()
-    TASKS.update(known)
 
 
 @pytest.fixture(scope="module")

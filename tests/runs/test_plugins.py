@@ -5,6 +5,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from command_calls import fails
@@ -29,12 +30,10 @@ def forget():
 def search_path(monkeypatch):
     """Search path and methods without the plugin, put back afterwards."""
     forget()
-    known = dict(METHODS)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    yield sys.path
-    forget()
-    METHODS.clear()
-    METHODS.update(known)
+    with patch.dict(METHODS):
+        yield sys.path
+    sys.modules.pop(NAME, None)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +41,8 @@ def run(tmp_path_factory, demonstrations):
     """A run of the plugin's method; not to be written to."""
     out = tmp_path_factory.mktemp("plugin") / "run"
     words = ("--plugin", NAME, "--method", NAME, "--out", out, "--dataset", demonstrations, *TINY)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "path", [*sys.path, str(PLUGINS)])
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(sys, "path", [*sys.path, str(PLUGINS)])
         assert koap("train", *words) == 0
     return out
 

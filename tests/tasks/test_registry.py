@@ -2,6 +2,7 @@
 """Tasks are found by name: registered ones, and those of installed packages."""
 
 import importlib.metadata
+from unittest.mock import patch
 
 import pytest
 from toy_task import TOY
@@ -23,10 +24,8 @@ def test_unknown_names_suggest_the_nearest():
 @pytest.fixture
 def tasks(monkeypatch):
     """The registry, as it was after the test."""
-    known = dict(TASKS)
-    yield TASKS
-    TASKS.clear()
-    TASKS.update(known)
+    with patch.dict(TASKS):
+        yield TASKS
 
 
 def test_a_task_may_be_registered_again_but_no_other_of_its_name(tasks):
