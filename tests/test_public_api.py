@@ -4,7 +4,6 @@
 import json
 
 import pytest
-import torch
 from tiny_runs import koap
 
 import torchrl_koap
@@ -15,11 +14,8 @@ from torchrl_koap import (
     PlannerConfig,
     TrainConfig,
     evaluate,
-    load_policy,
     train,
 )
-from torchrl_koap.envs import AvoidingEnv
-from torchrl_koap.evaluation.rollouts import roll_out
 
 PLAIN = {
     "labels": LabelConfig(count=2),
@@ -52,16 +48,6 @@ def test_python_trains_and_evaluates_what_the_shell_does(trained_run, demonstrat
     mine.rename(its)
     assert koap("eval", its, "--episodes", 1, "--threads", 1, "--no-report") == 0
     assert json.loads((its / "eval.json").read_text())["episode"] == result["episode"]
-
-
-def test_a_policy_acts_as_its_evaluation_did(trained_run, tmp_path):
-    policy = load_policy(trained_run, replan_interval=2)
-    assert policy.execution.replan_interval == 2
-    episodes = roll_out(policy, AvoidingEnv, [100, 101], max_steps=5)
-    again = roll_out(load_policy(str(trained_run), replan_interval=2), AvoidingEnv, [101], max_steps=5)
-    assert torch.allclose(episodes[1]["action"], again[0]["action"], atol=1e-6)
-    with pytest.raises(ValueError, match="unknown strategy 'opne_loop'; did you mean 'open_loop'"):
-        load_policy(trained_run, strategy="opne_loop")
 
 
 def test_a_training_without_a_command_keeps_none(demonstrations, tmp_path):

@@ -69,13 +69,3 @@ class TestRegimeSensor:
         assert not torch.allclose(sensor.show(data["state"][:5], sensor.distractors[5:10]), shown)
         with pytest.raises(ValueError, match="'distractors' shows 2 distractors beside the state"):
             sensor.show(data["state"][:5])
-
-    def test_pictures_of_other_states_have_the_components_of_the_recorded_ones(self):
-        data = make_data()
-        sensor = RegimeSensor(data, "pictures")
-        torch.testing.assert_close(sensor.show(data["state"][7:9]), sensor.recorded[7:9])
-        between = sensor.show(data["state"][7:8] + 1e-3 * data["state"].std(0))
-        assert 0 < (between - sensor.recorded[7]).norm() < 0.02 * sensor.recorded.norm(dim=1).mean()
-        far = sensor.show(data["state"].mean(0, keepdim=True) + 20 * data["state"].std(0))
-        empty = sensor.show(data["state"].mean(0, keepdim=True) - 20 * data["state"].std(0))
-        torch.testing.assert_close(far, empty)  # outside the picture nothing is seen

@@ -80,13 +80,6 @@ def test_commands_are_listed_in_groups_each_with_an_example_that_parses(capsys):
         assert type(parse(Subcommand, words)).__name__.lower() == words[0]
 
 
-@pytest.mark.parametrize("command", ["curve", "bench"])
-def test_a_foreign_environment_is_named_as_for_eval(capsys, command):
-    shown = help_of(capsys, command, "--help")
-    for name in ("env", "env-kwargs", "num-envs"):
-        assert f"--{name} " in shown and f"--evaluation.{name} " in shown
-
-
 def test_twelve_options_of_a_training_come_first_and_all_on_request(capsys):
     first, every = help_of(capsys, "train", "--help"), help_of(capsys, "train", "--help-all")
     assert len(re.findall(r"^.? ?--\w", first, re.MULTILINE)) == 12 and "--help-all" in first

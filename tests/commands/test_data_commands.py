@@ -51,11 +51,6 @@ def test_validation_says_how_many_labels_there_are(arm, tmp_path, capsys):
     assert re.search(r"warning 1 +no recording has actions: a planner can be trained, a policy cannot", said)
 
 
-def test_nothing_is_overwritten(arrays, arm, capsys):
-    assert koap("convert", arrays, "--out", arm) == 1
-    assert "exists already; choose another --out" in capsys.readouterr().err
-
-
 def test_validate_names_the_files(tmp_path, capsys):
     folder = write_demonstrations(tmp_path / "data")
     assert koap("validate", folder) == 0

@@ -62,11 +62,3 @@ def test_a_film_that_cannot_be_made_is_left_out(copied_run, monkeypatch):
     assert "film.gif was not made" in (copied_run / "index.html").read_text()
     made = {file.name for file in (copied_run / "plots").iterdir()}
     assert {"rollouts.gif", "rollouts.png"} <= made and "film.gif" not in made
-
-
-def test_options_of_an_evaluation(copied_run, no_report):
-    wanted = {"strategy": "open_loop", "blend": 0.0, "temperature": 0.5, "replan_interval": 2, "limits": "inf"}
-    options = (word for name, value in wanted.items() for word in (f"--{name.replace('_', '-')}", value))
-    assert koap("eval", copied_run, "--episodes", 1, "--threads", 1, *options) == 0
-    result = json.loads((copied_run / "eval.json").read_text())
-    assert {key: result["execution"][key] for key in wanted} == wanted and result["episodes"] == 1

@@ -27,16 +27,6 @@ def test_an_evaluation_ends_with_its_report(run, capsys):
     assert capsys.readouterr().out.splitlines()[-1].split() == ["report", str(run / "index.html")]
 
 
-def test_a_policy_acts_on_the_users_observations(run):
-    agent = Agent(load_policy(run))
-    agent.reset()
-    action = agent.act(np.zeros(4))
-    assert action.shape == (2,) and np.isfinite(action).all()
-    with pytest.raises(ValueError, match="task 'arm' has 4 columns, got 5"):
-        agent.reset()
-        agent.act(np.zeros(5))
-
-
 def test_absolute_targets(arrays, tmp_path, capsys):
     (tmp_path / "arrays").mkdir()
     for file in arrays.iterdir():

@@ -213,15 +213,6 @@ def test_what_is_unlikely_is_warned_of():
         make_demonstrations(STATES, ACTIONS, control_hz=20)
 
 
-def test_a_data_set_at_another_rate(tmp_path):
-    folder = save_demonstrations(tmp_path / "arm", STATES, ACTIONS, control_hz=20)
-    slow = read_recordings(folder, resample=10, action_kind="change")
-    assert slow.control_hz == 10 and [len(frames) for frames in slow.states] == [15] * 3
-    np.testing.assert_allclose(slow.actions[0], np.diff(STATES[0][::2, :2], axis=0), atol=1e-5)
-    with pytest.raises(DataError, match="pass action_kind"):
-        read_recordings(folder, resample=10)
-
-
 def test_an_action_column_that_is_mostly_empty_is_named():
     sparse = ACTIONS[0].copy()
     sparse[np.arange(29) % 9 != 0, 1] = np.nan

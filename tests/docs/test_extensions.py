@@ -17,7 +17,6 @@ import method_pages  # noqa: E402
 import pages  # noqa: E402
 import run_tutorials  # noqa: E402
 import task_pages  # noqa: E402
-import time_picture  # noqa: E402
 import tutorial_pages  # noqa: E402
 
 
@@ -101,12 +100,6 @@ def test_a_tutorial_that_prints_something_else_is_an_error(tmp_path, monkeypatch
     assert not (tmp_path / "story.png").exists()  # nothing is kept
 
 
-def test_the_time_picture_has_the_numbers_of_the_code():
-    drawing = time_picture.drawing()
-    assert re.findall(r">([+-]\d+|now)<", drawing) == ["-4", "-3", "-2", "-1", "now", *(f"+{k}" for k in range(1, 15))]
-    assert drawing.count('class="done"') == 4 and drawing.count('class="now"') == 3
-
-
 def test_every_public_name_is_in_the_reference(generated):
     api_pages.write_api_pages()
     listed = "".join(path.read_text() for path in (generated / "api").glob("*.rst"))
@@ -133,9 +126,3 @@ def test_success_never_stands_without_its_interval():
         ]
         assert cells and all(re.search(r"\d % \(\d+-\d+\) of 1[28]0", cell) for cell in cells)
     assert "mpc" in "".join(task_pages.measured_blocks(task_pages.TASKS["avoiding"]))
-
-
-def test_defaults_of_every_task_are_a_page(generated):
-    task_pages.write_defaults()
-    page = (generated / "defaults.rst").read_text()
-    assert all(f"``{name}``" in page for name in task_pages.TASKS) and "your own data" in page and "3,000 x" in page

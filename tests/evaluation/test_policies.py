@@ -52,12 +52,6 @@ def test_the_tool_goes_where_the_plan_says():
     assert (planned[-1] - planned[0]).norm() > 0.15
 
 
-def test_episodes_do_not_depend_on_the_batch():
-    _, both = follow([(0.0, 0.005), (0.003, 0.004)])
-    _, (one,) = follow([(0.003, 0.004)])
-    assert torch.allclose(both[1]["action"], one["action"], atol=1e-7)
-
-
 @torch.no_grad()
 def test_wrong_uses():
     observed, plan = torch.zeros(1, 2, 4), torch.zeros(1, 14, 2)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.colors import rgb_to_hsv
 from run_files import drawn_lines, make_object_rollouts, make_rollouts, run_of, titles
 from safetensors.numpy import save_file
 
@@ -67,18 +66,6 @@ def test_modes_of_recorded_paths_are_those_of_the_rule(tmp_path):
     assert recorded_modes(file, get_task("avoiding").modes).tolist() == [0, 23]  # the last one passes no row
     assert recorded_modes(file, get_task("aligning").modes).tolist() == []
     assert recorded_modes(tmp_path / "none", get_task("avoiding").modes).tolist() == []
-
-
-def test_colors_have_a_hue_by_the_last_row_and_a_lightness_by_the_others():
-    colors = mode_colors(get_task("avoiding").modes)
-    assert colors.min() >= 0 and colors.max() <= 1
-    hue = rgb_to_hsv(colors)[:, 0].reshape(6, 4)
-    spread = np.abs(np.angle(np.exp(2j * np.pi * (hue - hue[2:3])))) / (2 * np.pi)
-    assert spread.max() < 0.06  # a column keeps its hue
-    between = np.abs(np.angle(np.exp(2j * np.pi * (hue[:, :, None] - hue[:, None])))) / (2 * np.pi)
-    assert between[:, ~np.eye(4, dtype=bool)].min() > 0.08
-    luminance = (colors @ [0.2126, 0.7152, 0.0722]).reshape(6, 4)
-    assert (np.diff(luminance, axis=0) > 0).all()
 
 
 @pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.modes.choices])

@@ -44,20 +44,10 @@ def test_single_cells(task, method, level, share, text):
     assert (cell.label_share, cell.text) == (share, text)
 
 
-def test_koap_of_both_tables_is_the_same():
-    second = {(cell.task, cell.level): cell.text for cell in paper_cells(2) if cell.method == "koap"}
-    assert second and all(paper_cell(task, "koap", level).text == text for (task, level), text in second.items())
-
-
 def test_levels_are_those_of_the_tasks():
     for task in {cell.task for cell in paper_cells(1)}:
         assert tuple(share for share, _ in paper_points(task)["koap"]) == get_task(task).label_levels
     assert paper_points("avoiding")["koap"][:2] == [(0.02, 0.7803), (0.05, 0.9805)]
-
-
-def test_what_the_paper_does_not_have_is_none():
-    assert paper_cell("aligning", "koap_untrained", 2) is None and paper_cell("sorting_2", "koap", 1) is None
-    assert paper_points("sorting_6") == {}
 
 
 def cell(task, method, labels, successes=None, seed=0):

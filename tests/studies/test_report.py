@@ -158,15 +158,6 @@ def test_methods_differ_without_colour():
     assert len({(style["color"], str(style["linestyle"])) for style in styles[:12]}) == 12
 
 
-def test_pictures_of_few_points(tmp_path):
-    both = ("labels", "labelled_transitions")
-    single = summarise(make_cells(labels=(0.05,), seeds=1))
-    assert plot_measure(single, tmp_path / "single.png", by=both).exists()
-    many = summarise(make_cells(methods={f"method {number}": 0.5 for number in range(12)}))
-    assert plot_measure(many, tmp_path / "many.png", "action_error", unit="mm").exists()
-    assert plot_measure(many, tmp_path / "entropy.png", "mode_entropy").stat().st_size > 5000
-
-
 def test_pictures_of_nothing_are_refused(tmp_path):
     rows = make_cells(seeds=1)
     for row in rows:

@@ -295,13 +295,6 @@ def test_a_single_batch_does_not_undo_a_training(monkeypatch):
     assert error(trained(batches(poison_at=150), 160)) > 2 * error(untouched)
 
 
-def test_ordinary_batches_leave_the_same_bits(monkeypatch):
-    weights = trained(batches()).state_dict()
-    monkeypatch.setattr(loop_file, "limit_outlier", lambda optimizer: None)
-    for name, value in trained(batches()).state_dict().items():
-        assert torch.equal(value, weights[name])
-
-
 def test_it_waits_until_there_is_something_to_compare_with():
     x = nn.Parameter(torch.zeros(1))
     optimizer = torch.optim.AdamW([x], lr=1e-3)

@@ -184,21 +184,6 @@ def test_an_interrupted_recording_goes_on(whole, tmp_path, monkeypatch):
     assert contents(folder) == contents(whole[0])
 
 
-def test_an_interruption_at_the_very_end_is_made_good(whole, tmp_path, monkeypatch):
-    folder = tmp_path / "demos"
-
-    def fail(*arguments, **options):
-        raise Stop
-
-    with monkeypatch.context() as patch:
-        patch.setattr(demonstrations, "save_ted", fail)
-        with pytest.raises(Stop):
-            record_to_folder(folder, TASK, COUNT, seed=3, num_threads=1)
-    assert not (folder / "ted").exists()
-    record_to_folder(folder, TASK, COUNT, seed=3, num_threads=1)
-    assert contents(folder) == contents(whole[0])
-
-
 def test_other_demonstrations_are_left_alone(whole, tmp_path, monkeypatch):
     before = contents(whole[0])
     with pytest.raises(FileExistsError, match="ted exists already; choose another --out"):

@@ -46,18 +46,6 @@ def test_inner_products_approach_the_kernel_as_the_features_grow():
         assert 2.5 < errors[number] / errors[16 * number] < 6.5, errors
 
 
-def test_frequencies_are_drawn_anew_and_trained():
-    torch.manual_seed(0)
-    network = LatentActionFourier(2, 4000, num_past=1, look_ahead=8)
-    before = network.frequency.detach().clone()
-    assert abs(before.mean().item()) < 0.05 and abs(before.std().item() - 1) < 0.05
-    assert 0 <= network.phase.min() and 6.2 < network.phase.max() <= 2 * math.pi
-    network.reset_parameters()
-    assert not torch.equal(before, network.frequency)
-    network.infer(network.gather(windows(3))).square().sum().backward()
-    assert network.frequency.grad.abs().max() > 0 and network.phase.grad.abs().max() > 0
-
-
 def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():
     network = LatentActionFourier(3, 8, num_past=2, look_ahead=(2, 5))
     state = torch.randn(40, 16, 3, generator=torch.Generator().manual_seed(0)).cumsum(1)
