@@ -33,7 +33,6 @@ def copied_processes(job_server):
 
 @pytest.fixture(scope="session")
 def demonstrations(tmp_path_factory):
-    """A folder of eight short demonstrations in D3IL's raw layout."""
     return write_demonstrations(tmp_path_factory.mktemp("demonstrations"))
 
 

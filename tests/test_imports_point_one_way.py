@@ -71,7 +71,6 @@ def test_imports_point_one_way(room):
 
 
 def test_nobody_names_the_commands():
-    """Not in a string either, which no import shows."""
     files = [file for file in PACKAGE.rglob("*.py") if file.parent.name != "commands"]
     assert len(files) > 50 and not [file for file in files if "torchrl_koap.commands" in file.read_text()]
 

@@ -36,7 +36,6 @@ CALLS = [words[1:] for words in (*SHELL, *RECIPES) if words and words[0] == "koa
 
 
 def parsed(arguments):
-    """The command that a call asks for."""
     return parse(Subcommand, arguments)
 
 

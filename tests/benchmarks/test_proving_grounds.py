@@ -20,7 +20,6 @@ GROUNDS = run.grounds()
 
 
 def needed(name):
-    """A ground whose packages and data are here."""
     if lacks := GROUNDS[name].missing():
         pytest.skip(f"{name}: {lacks}")
     return GROUNDS[name]
@@ -108,8 +107,6 @@ def test_unknown_names_end_with_a_sentence(asked, tmp_path):
 
 
 class Ran:
-    """A run that was not trained."""
-
     folder, task, cameras, results = "run", None, None, {"planner": {"best_held_out_score": 0.25, "kept_update": 700}}
 
 

@@ -13,7 +13,6 @@ from regimes import REGIMES, Regime, RegimeSensor  # noqa: E402
 
 
 def apply_regime(data, regime, seed=0):
-    """The data as they are observed in a regime."""
     sensor = RegimeSensor(data, regime, seed=seed)
     return data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
 

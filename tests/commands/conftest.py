@@ -9,7 +9,6 @@ from tiny_runs import koap
 
 @pytest.fixture
 def no_report(monkeypatch):
-    """Rollouts without pictures, which have tests of their own."""
     monkeypatch.setattr("torchrl_koap.commands.run_commands.write_report", lambda *arguments, **options: None)
 
 
@@ -27,7 +26,6 @@ def arrays(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def arm(arrays, tmp_path_factory):
-    """The data set that they are converted to."""
     folder = tmp_path_factory.mktemp("own") / "arm"
     assert koap("convert", arrays, "--out", folder, "--robot", "q1", "q2", "--action-units", "rad") == 0
     return folder

@@ -59,7 +59,6 @@ def test_a_robot_gives_numbers_and_frames_to_run_and_file(run, tmp_path):
 
 
 def test_an_environment_gives_its_pictures(run, tmp_path):
-    """Its frames are smaller than those recorded."""
     options = ("--env", "toy_gym:ToySeen-v0", "--episodes", "2", "--no-report", "--out", tmp_path / "eval", "--quiet")
     with pytest.warns(UserWarning, match="frames are 8 x 8, recorded were 16 x 24: they are resized"):
         assert koap("eval", run, *options) == 0

@@ -94,7 +94,6 @@ def test_options_that_can_mean_nothing():
 
 
 def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0):
-    """Exit status and stderr of a process of its own."""
     process = subprocess.Popen(
         [*COMMAND, *words], stdout=output, stderr=subprocess.PIPE, text=True, env={**os.environ, **(settings or {})}
     )

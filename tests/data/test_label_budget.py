@@ -34,12 +34,10 @@ def budget_of(amount, **options):
 
 
 def spent(data, seed=0, **options):
-    """Which steps a budget labels, bool ``[N]``."""
     return LabelBudget(seed=seed, **options).apply(data)[0]["has_action"].squeeze(-1)
 
 
 def same_bits(left, right):
-    """Of tensors, or of all that two containers hold."""
     if isinstance(left, torch.Tensor):
         assert left.dtype == right.dtype and left.shape == right.shape
         assert left.numpy().tobytes() == right.numpy().tobytes()
@@ -224,7 +222,6 @@ def test_given_episodes_are_labelled_and_no_others():
 
 
 def partly(lengths, shown, seed=0):
-    """Demonstrations of which only some trajectories have actions."""
     data = demonstrations(lengths, seed)
     kept = torch.isin(data["episode"], torch.tensor(shown)).unsqueeze(-1)
     return data.set("has_action", kept).set("action", torch.where(kept, data["action"], math.nan))

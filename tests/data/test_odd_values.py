@@ -18,7 +18,6 @@ TIME = np.linspace(0, 2, 60)[:, None]
 
 
 def seen(*trajectories):
-    """Warnings about leaps beside a smooth column."""
     frames = [np.hstack([np.sin(TIME + index), columns]) for index, columns in enumerate(trajectories)]
     names = ["sine", *(f"q{index}" for index in range(trajectories[0].shape[1]))]
     return leap_warnings(frames, [f"trajectory {index}" for index in range(len(frames))], names)

@@ -22,7 +22,6 @@ import tutorial_pages  # noqa: E402
 
 @pytest.fixture(autouse=True)
 def generated(tmp_path, monkeypatch):
-    """Nothing is written into the repository."""
     for module in (pages, tutorial_pages):
         monkeypatch.setattr(module, "GENERATED", tmp_path)
     return tmp_path

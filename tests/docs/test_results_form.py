@@ -22,7 +22,6 @@ FORM = re.compile(
 
 
 def plain(text: str) -> str:
-    """Text without links and markup."""
     return re.sub(r"[*`_]", "", re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text))
 
 

@@ -23,7 +23,6 @@ def test_po_sorting_is_sorting_plus_transforms():
 
 
 def test_what_remains_is_what_the_task_shows_its_planner():
-    """KOAP's ten columns: measured xy and the boxes' xy."""
     observation, hide = torch.randn(7, 16), PartialObservation("po_sorting")
     partial = hide(TensorDict({"observation": observation.clone()}, [7]))["observation"]
     assert torch.equal(partial, observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]])

@@ -60,7 +60,6 @@ def knowing(normalizer=None):
 
 
 def blown(lengths=(12, 15, 11, 20), drifts=None):
-    """Flat data whose actions are the wind."""
     generator = torch.Generator().manual_seed(0)
     frames, winds = [], []
     for index, length in enumerate(lengths):

@@ -134,8 +134,6 @@ def filmed(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
 
 
 def seen(damage: Callable[[Path], Any]) -> Callable[[Place], None]:
-    """Damage after the frames were converted."""
-
     def do(place: Place) -> None:
         from torchrl_koap.data import read_recordings, save_demonstrations
 

@@ -21,15 +21,12 @@ VALIDATE = ("validate", "{data}")
 
 
 def episode(rows: int = 30) -> dict[str, Any]:
-    """One demonstration with every entry that D3IL logs."""
     generator = np.random.default_rng(0)
     robot = {name: generator.normal(size=(rows, *shape)) for name, shape in ROBOT_COLUMNS.items()}
     return {"context": None, "robot": robot}
 
 
 def written(change: Callable[[dict[str, Any]], Any]) -> Callable[[Place], None]:
-    """Writes a demonstration after a change."""
-
     def do(place: Place) -> None:
         content = episode()
         other = change(content)
@@ -68,8 +65,6 @@ NEEDED = ("des_c_pos", "c_pos")
 
 
 class Hostile:
-    """Runs a command when it is unpickled."""
-
     def __init__(self, function, *arguments):
         self.call = function, arguments
 

@@ -41,8 +41,6 @@ def damaged(name: str, damage: Callable[[Path], object], *, finished: bool = Tru
 
 
 def entry(path: str, value: object) -> Callable[[Place], None]:
-    """Sets an entry of ``config.json``."""
-
     def do(place: Place) -> None:
         def change(content):
             *above, last = path.split(".")

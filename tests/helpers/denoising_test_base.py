@@ -14,8 +14,6 @@ def noised(network, clean, noise, time):
 
 
 class DenoisingLossTestBase(LossTestBase):
-    """Tests of a denoising loss."""
-
     def weights(self, loss):
         return loss.network_params.flatten_keys(".")
 

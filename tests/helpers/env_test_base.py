@@ -64,7 +64,6 @@ def start_recorded(env, recorded):
 
 
 def assert_starts_as_recorded(env, recorded):
-    """The physics after a reset."""
     for episode, data in enumerate(env.sims.data):
         np.testing.assert_allclose(data.qpos, recorded[f"ep{episode}_init_qpos"], rtol=0, atol=1e-14)
         np.testing.assert_allclose(data.qvel, recorded[f"ep{episode}_init_qvel"], rtol=0, atol=1e-12)
@@ -192,8 +191,6 @@ class EnvTestBase:
 
 
 class ContextTestBase(EnvTestBase):
-    """The same for a task with objects."""
-
     def test_random_contexts_come_from_the_seed(self):
         first = self.make(3, seed=4).reset()["context"]
         torch.testing.assert_close(first, self.make(3, seed=4).reset()["context"], rtol=0, atol=0)

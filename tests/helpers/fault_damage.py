@@ -7,7 +7,6 @@ from pathlib import Path
 
 
 def flip(path: Path) -> None:
-    """One bit near the end, where the numbers are."""
     content = bytearray(path.read_bytes())
     content[-9] ^= 4
     path.write_bytes(content)

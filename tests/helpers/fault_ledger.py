@@ -78,7 +78,6 @@ class Fault:
 
     @property
     def id(self) -> str:
-        """Name of the test."""
         return re.sub(r"[^\w.=+-]+", "_", f"{self.words[0]} {self.name}")[:100]
 
 
@@ -111,7 +110,6 @@ def meet(fault: Fault, place: Place) -> Outcome:
 
 
 def check(fault: Fault, outcome: Outcome) -> None:
-    """Asserts that the fault was met as it should be."""
     told = f"{fault.id}: status {outcome.status}, said {outcome.said[-500:]!r}"
     if fault.accepted:
         assert outcome.status in (0, "accepted"), told
@@ -224,7 +222,6 @@ def _filled(word: str, place: Place) -> str:
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Changes a JSON file in place."""
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))

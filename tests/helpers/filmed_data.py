@@ -7,7 +7,6 @@ import numpy as np
 
 
 def write_filmed(folder: Path, cameras=("top", "wrist"), trajectories=12, size=(16, 24), length=20) -> Path:
-    """Writes arrays with the frames of every camera beside them."""
     generator = np.random.default_rng(0)
     for number in range(trajectories):
         path = np.clip(generator.normal(size=(length, 2)).cumsum(0) / 4 + 6, 0, 11)

@@ -17,7 +17,6 @@ KEYS = {"state": "state", "action": "action", "has_action": "has_action", "padde
 
 
 def normalizers():
-    """Those of states with three columns and of actions with two."""
     return {"state_normalizer": Normalizer(3, **STATE), "action_normalizer": Normalizer(2, **ACTION)}
 
 
@@ -33,13 +32,11 @@ def partly_labelled(*batch, share=0.5, spread=1.0):
 
 
 def recorded(batch, span):
-    """Which frames of a span start a recorded transition."""
     padded = batch["padded"]
     return ~(padded[..., span.start : span.stop] | padded[..., span.start + 1 : span.stop + 1])
 
 
 def reached(network, loss):
-    """Names of the parts that a loss has gradients for."""
     network.zero_grad()
     loss.backward(retain_graph=True)
     named = [(name, value.grad) for name, value in network.named_parameters() if value.grad is not None]

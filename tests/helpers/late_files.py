@@ -15,7 +15,6 @@ def wait_for(text, folder, seconds=30):
 
 
 def wait_until(condition, seconds=120.0):
-    """Waits for something that another process does."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"

@@ -46,7 +46,6 @@ def save_arm(
     joints: int = 7,
     units: str | list[str] = "rad",
 ) -> Path:
-    """A data set of which the first trajectories have labels."""
     states, actions = record(count, joints=joints)
     data, task = make_demonstrations(
         states,

@@ -24,7 +24,6 @@ def pose(positions, quat):
 
 
 def made_up(task, rows=5, seed=0):
-    """Any episode of a task, with everything that is logged."""
     rng = np.random.default_rng(seed)
     robot = {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
     objects = {}

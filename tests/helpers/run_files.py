@@ -48,7 +48,6 @@ EVALUATION = {
 
 
 def run_of(task: str | None, folder: Path = Path("run"), **numbers) -> RunFacts:
-    """What is known about a run of a task."""
     return RunFacts(folder, None if task is None else get_task(task), **numbers)
 
 
@@ -100,7 +99,6 @@ def make_demonstrations() -> dict[str, np.ndarray]:
 
 
 def write_run(folder: Path) -> Path:
-    """Every file that training and evaluation leave."""
     config = {"task": "avoiding", "method": "koap", "preset": "default", "seed": 0, "sizes": {"planner": [32, 64]}}
     config |= {"command": "koap train --out 'a folder'", "versions": {"torch": "2.13.0"}}
     summary = {"labels": LABELS, "planner_parameters": 812345, "train_seconds": {"planner": 65.0, "controller": 20.0}}
@@ -123,5 +121,4 @@ def titles(figure) -> list[str]:
 
 
 def drawn_lines(axes) -> list[np.ndarray]:
-    """Every line of the collections of a panel."""
     return [line for item in axes.collections if isinstance(item, LineCollection) for line in item.get_segments()]

@@ -14,7 +14,6 @@ def small_planner(columns=2, **options):
 
 
 def chunk_policy(state_of=(0, 1), actions=2):
-    """A policy that samples actions."""
     torch.manual_seed(0)
     columns = len(state_of)
     unet = TemporalUnet(actions, 2 * columns, channels=(8, 16))

@@ -13,5 +13,4 @@ def random_layer(seed: int = 0) -> nn.Module:
 
 
 def another_layer() -> nn.Module:
-    """The same with other weights."""
     return random_layer(1)

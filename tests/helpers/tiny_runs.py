@@ -22,7 +22,6 @@ def koap(*arguments) -> int:
 
 
 def grid(values: np.ndarray) -> np.ndarray:
-    """Rounded so that sums and differences of positions are exact."""
     return np.round(values * 2**20) / 2**20
 
 
@@ -50,6 +49,5 @@ def write_demonstrations(folder: Path, *, episodes: int = 8, rows: int = 30, cha
 
 
 def read_csv(file: Path) -> list[dict[str, str]]:
-    """The rows of a table as text."""
     with Path(file).open(newline="", encoding="utf-8") as lines:
         return list(csv.DictReader(lines))

@@ -41,8 +41,6 @@ class Reach(gymnasium.Env):
 
 
 class Breaks(Reach):
-    """Raises an error in a step, or at every reset with an odd seed."""
-
     def __init__(self, at=None):
         super().__init__(key="is_success")
         self.at = at
@@ -59,8 +57,6 @@ class Breaks(Reach):
 
 
 class Drawn(Reach):
-    """Draws its first joint as a shade of red."""
-
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
 
     def __init__(self, shade=0, render_mode=None):
@@ -94,8 +90,6 @@ def reach(robots: int | None = None, **options) -> EnvBase:
 
 
 class Seen(gymnasium.Env):
-    """Gives numbers of two kinds and pictures by their names."""
-
     def __init__(self, cameras=("top",)):
         box, picture = gymnasium.spaces.Box(-9, 9, (2,)), gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
         pixels = dict.fromkeys(cameras, picture) if len(cameras) > 1 else picture

@@ -37,7 +37,6 @@ NAMES = ("x", "y", *(f"environment_state_{index}" for index in range(16)))
 
 
 def write_data(folder):
-    """Recordings with the columns of LeRobot's Push-T."""
     folder.mkdir()
     random = np.random.default_rng(0)
     for number in range(4):
@@ -64,7 +63,6 @@ def exported(run, tmp_path):
 
 
 def loaded(folder, *overrides, **where):
-    """What lerobot-eval and lerobot-record do with --policy.path."""
     config = PreTrainedConfig.from_pretrained(folder, cli_overrides=list(overrides))
     config.pretrained_path = folder
     policy = make_policy(config, **(where or {"env_cfg": ENV}))

@@ -51,7 +51,6 @@ def test_actions_tell_the_error_and_what_they_are_read_for():
 
 
 def test_actions_in_two_units():
-    """Stacking: seven joints in mrad per step, and a width in mm."""
     predicted = np.tile([0.002] * 7 + [0.08], (50, 1))
     figure = draw_actions({"predicted": predicted, "true": np.zeros((50, 8))}, run_of("stacking"))
     said, panels = titles(figure), figure.axes

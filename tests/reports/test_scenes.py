@@ -17,7 +17,6 @@ from torchrl_koap.tasks.avoiding import OBSTACLES
 
 @pytest.fixture(scope="module")
 def models():
-    """Compiled scenes of the environments."""
     return {name: make_env(name).sims.model for name in TASKS if TASKS[name].source in CONVERTERS}
 
 

@@ -19,8 +19,6 @@ from torchrl_koap.runs.progress import (
 
 
 class Full(io.StringIO):
-    """A device without room, which takes ``room`` writes."""
-
     def __init__(self, room=0):
         super().__init__()
         self.room = room

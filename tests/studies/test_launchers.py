@@ -62,7 +62,6 @@ DEATHS = {
 
 
 def act(folder):
-    """Does what the name of the folder says."""
     name = Path(folder).name
     if name in DEATHS:
         DEATHS[name][0]()
@@ -184,7 +183,6 @@ def test_closing_the_iterator_stops_what_is_running(tmp_path):
 
 
 def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
-    """Neither the job nor the server that it is a copy of."""
     script = tmp_path / "parent.py"
     script.write_text(
         f"import sys; sys.path[:0] = {IMPORTED_FROM}\n"

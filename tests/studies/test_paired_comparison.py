@@ -10,7 +10,6 @@ from torchrl_koap.studies.paired_comparison import compare, holm, sign_flip_p
 
 
 def outcomes(rates, seed, *, seeds=3, contexts=60):
-    """Random successes, independent of everything else."""
     generator = np.random.default_rng(seed)
     return {
         number: {(context, context): bool(generator.random() < rates) for context in range(contexts)}

@@ -17,7 +17,6 @@ _METHODS = {"koap": 0.9, "ridge": 0.6, "vae": 0.4}
 
 
 def make_cells(outcomes: dict | None = None, *, methods=_METHODS, labels=(0.01, 0.1), seeds=2, episodes=20, **more):
-    """Rows, and their outcomes where these are wanted."""
     rows = []
     for method, rate in methods.items():
         for share in labels:

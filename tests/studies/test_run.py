@@ -236,7 +236,6 @@ def test_a_damaged_study_json_is_named(curve, demonstrations, capsys):
 
 
 def living(session):
-    """Processes of a session that still do something."""
     found = []
     for file in Path("/proc").glob("[0-9]*/stat"):
         try:

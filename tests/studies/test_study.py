@@ -19,8 +19,6 @@ from torchrl_koap.training.methods import METHODS
 
 @pytest.fixture
 def asked(demonstrations, tmp_path):
-    """Completes a study of the demonstrations."""
-
     def make(**options):
         options = {"labels": (0.5,), "seeds": 2, "datasets": (str(demonstrations),)} | options
         study = complete(Study(out=tmp_path / "study", **options))
@@ -122,7 +120,6 @@ def test_what_is_asked_for_wins_over_the_preset(tmp_path):
 
 
 def test_a_data_set_alone_brings_its_task(tmp_path):
-    """One that nobody has registered."""
     study = complete(Study(out=tmp_path / "s", datasets=(str(save_arm(tmp_path / "arm", joints=2)),)))
     assert study.tasks == ("arm",) and study.task("arm").action_dim == 2
     assert study.train_config(study.cells()[0]).dataset == str(tmp_path / "arm")

@@ -23,7 +23,6 @@ def test_unknown_names_suggest_the_nearest():
 
 @pytest.fixture
 def tasks(monkeypatch):
-    """The registry, as it was after the test."""
     with patch.dict(TASKS):
         yield TASKS
 

@@ -15,7 +15,6 @@ CONTROLLERS = [("koap", "default"), ("koap", "paper"), ("koap", "absolute"), ("l
 
 @pytest.fixture
 def fits(monkeypatch):
-    """Inputs, targets, groups and result of every ridge regression."""
     made = []
 
     def noted(inputs, targets, **options):
@@ -28,7 +27,6 @@ def fits(monkeypatch):
 
 
 def numbered(lengths=LENGTHS):
-    """Actions count the steps of all trajectories; states wander."""
     generator = torch.Generator().manual_seed(0)
     frames = [torch.randn(n + 1, 4, generator=generator).cumsum(0) * 0.01 for n in lengths]
     counts = torch.arange(1.0, sum(lengths) + 1).split(list(lengths))

@@ -29,7 +29,6 @@ def record(number=6, **options):
 
 
 def fit_controller(data, task=None, *, steps=500, preset=None, columns=None, **options):
-    """What was trained of a controller alone."""
     section = {"steps": steps, "preset": preset, "columns": columns}
     return fit(data, task, planner=False, controller=section, progress=False, **options)
 

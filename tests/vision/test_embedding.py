@@ -20,7 +20,6 @@ OWN = "tiny_network:random_layer"
 
 
 def write_own(folder, **options):
-    """A data set of `koap convert`, with frames."""
     return save_demonstrations(folder / "own", read_recordings(write_filmed(folder / "raw", **options)))
 
 

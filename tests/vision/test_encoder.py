@@ -110,8 +110,6 @@ def test_frames_of_another_dtype_or_without_colours_are_refused():
 
 
 class Tokens(torch.nn.Module):
-    """Returns tokens [B, N, C], as some transformers do."""
-
     def forward(self, pictures):
         return pictures.flatten(2)
 

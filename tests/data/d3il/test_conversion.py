@@ -25,7 +25,6 @@ def same(array, wanted):
 
 
 def placed(box, size=2):
-    """Position and tangent of the yaw of a box."""
     return box["pos"][:, :size], np.tan(2 * np.arctan2(box["quat"][:, 3], box["quat"][:, 0]))
 
 
@@ -146,7 +145,6 @@ def test_faults_of_all_files_come_together(tmp_path):
 
 
 def broken(**arrays):
-    """A change of arrays of the robot."""
     return lambda content: content["robot"].update({name: make(content["robot"]) for name, make in arrays.items()})
 
 

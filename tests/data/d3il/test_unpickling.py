@@ -21,8 +21,6 @@ PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 
 
 class Call:
-    """Pickles as a call of ``function(*args)``."""
-
     def __init__(self, function, *args):
         self.value = (function, args)
 

@@ -117,8 +117,6 @@ def test_a_silent_description_of_missing_actions(tmp_path):
 
 
 def edited(name, edit):
-    """A change of one column, given as a list of its rows."""
-
     def change(table):
         rows, position = table[name].to_pylist(), table.column_names.index(name)
         return table.set_column(position, name, pa.array(edit(rows)))

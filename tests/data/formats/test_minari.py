@@ -13,7 +13,6 @@ PLACES = [np.full(1, 0.5 * step, np.float32) for step in range(7)]
 
 
 def write(root, space, observations):
-    """Two episodes of a point on a line."""
     episode = observations, [np.full(1, 0.5, np.float32)] * 6
     return store_minari(root, "slider/test-v0", space, Box(-1, 1, (1,)), [episode] * 2)
 

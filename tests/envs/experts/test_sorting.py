@@ -29,7 +29,6 @@ def observation(rod, boxes):
 
 
 def steady(expert, seen, steps=12):
-    """What the player ends up doing if nothing that it sees changes."""
     for _ in range(steps):
         action = expert.act(seen)
     return action[0]

@@ -163,7 +163,6 @@ class TestVariationalLoss(LossTestBase):
 
 
 def autoencoder_terms(network, batch):
-    """Terms of every frame that counts, from the definition."""
     reconstruction, divergence = [], []
     for window in range(len(batch)):
         x = (batch["state"][window] - STATE["offset"]) / STATE["scale"]

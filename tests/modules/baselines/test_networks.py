@@ -29,7 +29,6 @@ class TestNonlinearInverseDynamics(InverseDynamicsTestBase):
 
 
 def in_plain_loops(network, batch):
-    """The three terms from the definition."""
     scales = network.reader.scales
     terms = {"loss_reconstruction": [], "loss_koopman": [], "loss_action": []}
     for window in range(len(batch)):

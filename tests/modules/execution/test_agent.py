@@ -19,7 +19,6 @@ def policy_of(strategy="feedback", columns=(0, 1), **options):
 
 
 def ready(policy=None, **options):
-    """An agent at the beginning of an episode."""
     agent = Agent(policy_of() if policy is None else policy, **options)
     agent.reset()
     return agent

@@ -53,7 +53,6 @@ def test_the_stateless_policy_is_the_open_loop_one():
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """What is exported, its file, and what that holds."""
     what, path = exportable(policy(), columns=COLUMNS), tmp_path_factory.mktemp("exported") / "policy.pt2"
     return what, path, export_policy(what, path)
 

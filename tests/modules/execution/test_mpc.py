@@ -18,7 +18,6 @@ def coupled_system() -> ResponseModel:
 
 
 def steps_of(system: ResponseModel, count: int = 2000) -> tuple[torch.Tensor, torch.Tensor]:
-    """Coordinates, and the steps that the system answers with."""
     torch.manual_seed(0)
     read = torch.randn(count, AXES, 5, dtype=torch.float64)
     return read, torch.einsum("jkf,nkf->nj", system.weight, read)

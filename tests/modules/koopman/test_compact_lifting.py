@@ -17,7 +17,6 @@ def turning(count=400, length=17, bodies=1):
 
 
 def embedded(motion, columns=24, noise=0.02):
-    """A random network of the motion's coordinates, with noise."""
     torch.manual_seed(1)
     weight, bias = torch.randn(motion.shape[-1], columns), torch.randn(columns)
     seen = torch.tanh(motion @ weight + bias)
@@ -25,7 +24,6 @@ def embedded(motion, columns=24, noise=0.02):
 
 
 def train(lifting, windows, steps=250):
-    """A short training on the reconstruction alone."""
     lifting.prepare(windows)
     optimiser = torch.optim.Adam(lifting.parameters(), 5e-3)
     for step in range(steps):
