@@ -25,11 +25,6 @@ def needed(name):
     return GROUNDS[name]
 
 
-def test_the_angle_of_the_block_becomes_cosine_and_sine():
-    columns = pusht.six_columns(np.array([[1.0, 2.0, 3.0, 4.0, np.pi / 2]]))
-    np.testing.assert_allclose(columns, [[1, 2, 3, 4, 0, 1]], atol=1e-6)
-
-
 # data set: recordings, steps, columns of the state, of the robot, targets
 WRITTEN = {
     "pusht": (206, 25_650 - 206, 6, (0, 1), (0, 1)),

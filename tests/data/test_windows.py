@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.data import TensorDictReplayBuffer
 
-from torchrl_koap.data import D3ILExperienceReplay, LabelBudget, WindowTable, cut_windows, make_window_buffer, save_ted
+from torchrl_koap.data import LabelBudget, WindowTable, cut_windows, make_window_buffer
 from torchrl_koap.data.windows import spread_evenly
-from torchrl_koap.tasks import get_task
 
 GPU = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))
 
@@ -121,15 +120,6 @@ def test_steps_of_one_trajectory_must_be_consecutive():
     keep = torch.cat([torch.arange(0, 20), torch.arange(22, 40)])
     table = WindowTable.build(data[keep], 16)
     assert table.starts.tolist() == [0, 1, 2, 3, 4, 20, 21, 22]
-
-
-def test_from_a_data_set(tmp_path):
-    folder = save_ted(demonstrations(), tmp_path / "ted", get_task("avoiding"))
-    dataset = D3ILExperienceReplay("avoiding", folder, label_budget=LabelBudget(count=2))
-    buffer = make_window_buffer(dataset, 16, 8, select=["state", "action"], labelled_share=0.5)
-    batch = buffer.sample()
-    assert set(batch.keys()) == {"state", "action"}
-    assert batch["action"][:4, 1:15].isfinite().all() and batch["action"][4:].isnan().all()
 
 
 def test_rows_are_taken_evenly_from_the_first_to_the_last():

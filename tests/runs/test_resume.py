@@ -38,6 +38,9 @@ def test_what_is_left_out_is_as_it_was(run):
 
 def test_other_places_and_threads_will_do(run):
     check_resume(run, replace(SAVED, dataset="/moved", run=replace(SAVED.run, resume=True, threads=1)))
+    built_on = replace(SAVED, planner=PlannerConfig(source="/no/longer/there"))  # as where a curve's folder was moved
+    run.write_json("config.json", to_json(built_on))
+    check_resume(run, replace(built_on, planner=PlannerConfig(source="/moved"), run=replace(SAVED.run, resume=True)))
 
 
 def test_rests_without_options_are_refused(tmp_path):

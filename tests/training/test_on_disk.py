@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_runs import TINY as TINY_CALL
-from tiny_runs import koap, write_demonstrations
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, Trained, train
 from torchrl_koap.data import LabelBudget, open_dataset, save_demonstrations
@@ -193,21 +191,6 @@ def test_a_method_killed_in_a_phase_or_behind_it_ends_bit_for_bit_like_one_that_
 
 def steps_of(run, phase):
     return load_tensors(run / "checkpoints" / f"{phase}.safetensors")[1]["step"]
-
-
-def test_a_run_goes_on_after_it_was_moved_together_with_what_it_builds_on(tmp_path):
-    """As when the folder of a curve moves to another machine with cells half done."""
-    here, there = tmp_path / "here", tmp_path / "there"
-    data = write_demonstrations(here / "raw")
-    assert koap("train", "--dataset", data, "--out", here / "planner", *TINY_CALL) == 0
-    call = ("--method", "linear", *TINY_CALL)
-    assert koap("train", "--dataset", data, "--out", here / "run", "--planner.source", here / "planner", *call) == 0
-    weights = (here / "run" / "controller.safetensors").read_bytes()
-    (here / "run" / "controller.safetensors").unlink()
-    here.rename(there)
-    again = ("--dataset", there / "raw", "--out", there / "run", "--planner.source", there / "planner")
-    assert koap("train", *again, *call, "--resume") == 0
-    assert (there / "run" / "controller.safetensors").read_bytes() == weights
 
 
 def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):

@@ -14,12 +14,8 @@ from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Action, Task, get_task
 from torchrl_koap.training import response as response_fit
 from torchrl_koap.training.response import (
-    Stretches,
-    fit_predictions,
     fit_response,
     labelled_steps,
-    prediction_errors,
-    take,
     tracked_columns,
 )
 
@@ -47,6 +43,7 @@ def test_the_system_is_found_from_one_labelled_trajectory():
     data["has_action"] = (data["episode"] == 2).unsqueeze(-1)
     found = fit_response(response, data)
     assert found["labels_used"] < 60 and found["held_out_error"] < 1e-4
+    assert not found["coupled"] and not response.weight[0, 1].any() and not response.weight[1, 0].any()
     # the coordinates are nearly dependent: what counts is the answer to a command
     torch.testing.assert_close(response.double().impulse_matrix(8), a_system().impulse_matrix(8), atol=5e-3, rtol=0)
 
@@ -120,41 +117,6 @@ def test_a_task_without_commands_is_refused_before_any_work():
 
 
 # ---- the fit of predictions over many steps
-
-
-def stretches(count: int = 40, steps: int = 12, *, offset: float = 0.0, known: bool = True) -> Stretches:
-    """Answers of the system to random commands; the commands that are told are off by a constant per stretch."""
-    torch.manual_seed(0)
-    position = torch.randn(count, 3, 2, dtype=torch.float64).cumsum(1) * 0.01
-    command = position[:, -1] + 0.02 * torch.randn(count, 2, dtype=torch.float64)
-    changes, future = 0.01 * torch.randn(count, 2, 2, dtype=torch.float64), torch.randn(count, steps, 2).double() * 0.01
-    measured = a_system().predict(position, command, changes, future)
-    told = command + offset * torch.randn(count, 2, dtype=torch.float64)
-    return Stretches(position, told, changes, future, measured, torch.full((count,), known))
-
-
-def test_a_constant_is_forgiven_where_the_command_is_unknown_and_nowhere_else():
-    unknown, known = stretches(offset=0.1, known=False), stretches(offset=0.1)
-    assert prediction_errors(a_system(), unknown).abs().max() < 1e-12
-    assert prediction_errors(a_system(), known).abs().max() > 1e-2
-    mixed = unknown._replace(known=torch.arange(40) % 2 == 0)
-    error = prediction_errors(a_system(), mixed).abs().amax((1, 2))
-    assert error[1::2].max() < 1e-12 and error[::2].min() > 1e-4
-
-
-def test_axes_that_are_not_coupled_stay_so():
-    response = columns().double()
-    response.weight.copy_(a_system().weight * 0.8)
-    fit_predictions(response, stretches(), coupled=False)
-    assert response.weight[0, 1].abs().max() == 0 and response.weight[1, 0].abs().max() == 0
-    assert not torch.equal(response.weight, a_system().weight * 0.8)
-
-
-def test_without_a_stretch_nothing_changes():
-    response = columns().double()
-    response.weight.copy_(a_system().weight)
-    fit_predictions(response, take(stretches(), torch.zeros(0, dtype=torch.long)), coupled=True)
-    assert torch.equal(response.weight, a_system().weight)
 
 
 def test_a_model_that_single_steps_get_wrong_is_put_right(monkeypatch):
