@@ -105,8 +105,6 @@ def test_the_linear_model_learns_from_its_half_alone():
 
 
 def test_a_horizon_out_of_range_is_an_error():
-    with pytest.raises(ValueError, match="horizon must be >= 1"):
-        prediction_errors(knowing(), blown(), torch.tensor([0]), PARTS, horizon=0)
     with pytest.raises(ValueError, match="shorter than a window"):
         prediction_errors(knowing(), blown(), torch.tensor([0]), PARTS, horizon=11)
     with pytest.raises(ValueError, match="leave some out"):
@@ -154,8 +152,6 @@ def test_a_probe_finds_what_lies_linearly_in_the_latent_and_nothing_else():
     # what holds in one half and is the other way round in the other explains -3: 1 - (2 a)^2 / a^2
     sign = torch.where(groups < 20, 1.0, -1.0)[:, None]
     assert probe(latent, sign * (linear - 4), groups, groups < 20) == pytest.approx([-3, -3], abs=0.02)
-    with pytest.raises(ValueError, match="tested on others, got 1200 of 1200"):
-        probe(latent, linear, groups, groups < 40)
 
 
 def test_explained_variance_by_hand():

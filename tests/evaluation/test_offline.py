@@ -158,7 +158,7 @@ def test_a_data_set_that_has_moved_or_changed(tmp_path):
 def test_a_controller_worse_than_the_mean_is_a_fault():
     task = Task(name="arm", observation_parts={"q": 2}, actions={"a": Action("rad"), "b": Action("rad")}, position="q")
     true = torch.tensor([[1.0, 1.0], [-1.0, -1.0]])
-    models = {"controller": true * torch.tensor([0.5, -1.0]), "mean_action": torch.zeros(2, 2)}
+    models = {"controller": true * torch.tensor([0.5, -1.0]), "ridge": true, "mean_action": torch.zeros(2, 2)}
     found = summarise_errors(models, true, torch.tensor([4, 5]), task)
     assert found["relative"] == pytest.approx(math.sqrt((0.25 + 4) / 2))
     assert [row["episode"] for row in found["trajectory"]] == [4, 5]

@@ -87,12 +87,6 @@ def test_one_episode_per_environment_even_if_some_end_early():
     assert not episodes[3]["next", "done"].any()
 
 
-@pytest.mark.parametrize(("seeds", "size"), [([], None), ([1], 0), ([1], -2)])
-def test_nothing_to_roll_out_is_refused(seeds, size):
-    with pytest.raises(ValueError, match="at least one seed and a batch size >= 1"):
-        toy_rollouts(seeds, batch_size=size)
-
-
 def test_pictures_get_padded_paths_and_the_plans_that_were_made():
     episodes = [episode_of(6, success=True, mode=1), episode_of(3, collision=True, mode=-1, start=50.0)]
     tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=number, interval=4)

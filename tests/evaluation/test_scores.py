@@ -6,7 +6,7 @@ import torch
 from toy_episodes import episode_of, number
 
 from torchrl_koap.evaluation.scores import outcome_of, score, task_scores
-from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, wilson_interval
+from torchrl_koap.evaluation.statistics import bootstrap_interval, wilson_interval
 from torchrl_koap.tasks import get_task
 
 
@@ -98,11 +98,6 @@ def test_an_episode_in_which_the_environment_failed_is_no_success():
     failed["next", "failed"] = failed["next", "success"].clone()
     assert outcome_of(failed) == "error"
     assert score([failed], [0], num_modes=1, mode_index=number)["rates"]["success"]["rate"] == 0
-
-
-def test_what_unsolved_contexts_count_must_be_known():
-    with pytest.raises(ValueError, match="unsolved must be"):
-        conditional_entropy([[0]], 2, unsolved="Zero")
 
 
 def test_bootstrap_interval_covers_the_mean():

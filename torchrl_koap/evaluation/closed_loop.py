@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchrl_koap.evaluation.config import EvalConfig, RolloutConfig, check_options, environment_arguments
+from torchrl_koap.evaluation.config import EvalConfig, check_options, environment_arguments
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.loop_on_labels import limited_commands
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
@@ -76,8 +76,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    chosen = config.rollouts_per_context, config.contexts_file
-    where = find_environment(task, config, Observer.of(task, trained.cameras), *chosen)
+    where = find_environment(task, config, Observer.of(task, trained.cameras))
     errors, actions = evaluate_actions(trained, config.dataset)
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -130,7 +129,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
 
 def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
-    choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
+    choose_contexts(trained.task, config)  # refuses what has no meaning
     policy = trained_policy(trained, config.execution)
     result, actions = evaluate_offline(trained, config)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
@@ -141,34 +140,26 @@ def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     return result
 
 
-def choose_contexts(
-    task: Task, episodes: int, rollouts_per_context: int = 1, contexts_file: Path | None = None
-) -> tuple[list[int] | None, np.ndarray | None]:
-    """Returns number and pose of the context of every rollout; None for a task in which all episodes start alike.
+def choose_contexts(task: Task, config: EvalConfig) -> tuple[list[int] | None, np.ndarray | None]:
+    """Returns number and pose of the context of every rollout; None where all episodes start alike.
 
-    Too few contexts, and those asked for where the task has none, are refused.
+    Too few contexts, and those asked for where there are none, are refused.
     """
-    if not task.objects:
-        _refuse_contexts(rollouts_per_context, contexts_file, f"task {task.name!r}")
+    each, file = config.rollouts_per_context, config.contexts_file
+    if not task.objects or config.env is not None:
+        where = f"task {task.name!r}" if config.env is None else "an environment of Gymnasium"
+        for name, given in {"contexts_file": file is not None, "rollouts_per_context": each != 1}.items():
+            if given:
+                raise ValueError(f"{name} was given, but {where} has no contexts")
         return None, None
     from torchrl_koap.envs.contexts import evaluation_contexts, load_contexts  # takes seconds
 
-    table = evaluation_contexts(task) if contexts_file is None else load_contexts(contexts_file, task)
-    needed = (episodes - 1) // rollouts_per_context + 1
-    if needed > len(table):
-        raise ValueError(
-            f"{episodes} episodes with {rollouts_per_context} per context need {needed} contexts,"
-            f" there are {len(table)}"
-        )
-    numbers = [episode // rollouts_per_context for episode in range(episodes)]
+    table = evaluation_contexts(task) if file is None else load_contexts(file, task)
+    numbers = [episode // each for episode in range(config.episodes)]
+    if numbers[-1] >= len(table):
+        wanted = f"{config.episodes} episodes with {each} per context need {numbers[-1] + 1} contexts"
+        raise ValueError(f"{wanted}, there are {len(table)}")
     return numbers, table[numbers]
-
-
-def _refuse_contexts(rollouts_per_context: int, contexts_file: Path | None, where: str) -> None:
-    given = {"contexts_file": contexts_file is not None, "rollouts_per_context": rollouts_per_context != 1}
-    for name, unfit in given.items():
-        if unfit:
-            raise ValueError(f"{name} was given, but {where} has no contexts")
 
 
 @dataclass(frozen=True)
@@ -185,25 +176,18 @@ class RolloutEnvironment:
     facts: Mapping[str, Any] = field(default_factory=dict)  # and what it is, for ``eval.json``
 
 
-def find_environment(
-    task: Task,
-    config: RolloutConfig,
-    observe: Observer | None = None,
-    rollouts_per_context: int = 1,
-    contexts_file: Path | None = None,
-) -> RolloutEnvironment:
+def find_environment(task: Task, config: EvalConfig, observe: Observer | None = None) -> RolloutEnvironment:
     """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures ``observe`` embeds.
 
     One that does not exist, has other widths than the task, or does not report success by the key that was asked for is
     refused, like contexts that do not suffice.
     """
+    numbers, contexts = choose_contexts(task, config)
     if config.env is None:
-        numbers, contexts = choose_contexts(task, config.episodes, rollouts_per_context, contexts_file)
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
         make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
         return RolloutEnvironment(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
-    _refuse_contexts(rollouts_per_context, contexts_file, "an environment of Gymnasium")
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 
     record = EpisodeRecord()

@@ -19,8 +19,8 @@ MOST_EPISODES = 100_000  # kept in memory
 
 
 @dataclass
-class RolloutConfig:
-    """Options of the rollouts of a trained run.
+class EvalConfig:
+    """Rollouts of a trained run in closed loop; without an environment plans and actions on recorded data.
 
     Attributes:
         episodes: number of rollouts.
@@ -36,6 +36,14 @@ class RolloutConfig:
         threads: torch and simulator threads (default: as many as torch has).
         device: "cpu" or "cuda".
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
+        rollouts_per_context: rollouts in each context, which tasks that have them take from the evaluation table in
+            turn; from 2 on the entropy of the modes per context is known.
+        batch_size: episodes at a time; results do not depend on it.
+        contexts_file: a context file of D3IL to take instead of the table.
+
+    Examples:
+        >>> from torchrl_koap.evaluation import EvalConfig, evaluate
+        >>> evaluate("runs/koap", EvalConfig(episodes=20))["rates"]["success"]  # doctest: +SKIP
     """
 
     episodes: int = 60
@@ -50,23 +58,6 @@ class RolloutConfig:
     threads: int | None = None
     device: str = "cpu"
     plugins: Plugins = ()
-
-
-@dataclass
-class EvalConfig(RolloutConfig):
-    """Rollouts of a trained run in closed loop; without an environment plans and actions on recorded data.
-
-    Attributes:
-        rollouts_per_context: rollouts in each context, which tasks that have them take from the evaluation table in
-            turn; from 2 on the entropy of the modes per context is known.
-        batch_size: episodes at a time; results do not depend on it.
-        contexts_file: a context file of D3IL to take instead of the table.
-
-    Examples:
-        >>> from torchrl_koap.evaluation import EvalConfig, evaluate
-        >>> evaluate("runs/koap", EvalConfig(episodes=20))["rates"]["success"]  # doctest: +SKIP
-    """
-
     rollouts_per_context: int = 1
     batch_size: int | None = None
     contexts_file: Path | None = None
@@ -80,19 +71,16 @@ def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
         if not equals or not name.isidentifier():
             raise ValueError(f"env_kwargs must be key=value, such as obs_type=state, got {word!r}")
         try:
-            found[name] = json.loads(_IN_JSON.get(value, value))
+            found[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))
         except ValueError:
             found[name] = value
     return found
 
 
-_IN_JSON = {"True": "true", "False": "false", "None": "null"}
-
-
-def check_rollouts(config: RolloutConfig) -> None:
+def check_options(config: EvalConfig) -> None:
     """Refuses options that fit no run, before a run is loaded; the message names the option."""
-    for name in ("episodes", "num_envs"):
-        value = getattr(config, name)
+    for name in ("episodes", "num_envs", "batch_size", "rollouts_per_context"):
+        value = vars(config)[name]
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
     if config.episodes > MOST_EPISODES:
@@ -107,14 +95,5 @@ def check_rollouts(config: RolloutConfig) -> None:
     given = [name for name, value in about_env.items() if value]
     if given and config.env is None:
         raise ValueError(f"{given[0]} was given, but no env: name an environment of Gymnasium with --env")
-
-
-def check_options(config: EvalConfig) -> None:
-    """Refuses evaluation options that fit no run, before a run is loaded; the message names the option."""
-    check_rollouts(config)
-    for name in ("batch_size", "rollouts_per_context"):
-        value = getattr(config, name)
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be >= 1, got {value}")
     if config.num_envs is not None and config.batch_size is not None:
         raise ValueError("num_envs and batch_size both say how many episodes run at a time: give one of them")

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
 from torchrl_koap.data.windows import spread_evenly
+from torchrl_koap.evaluation.rollouts import device_of
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics, StatePlanner
 from torchrl_koap.modules.planning.energy_score import energy_score, relative_score, sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
@@ -62,8 +63,7 @@ def plan_errors(planner: StatePlanner, data: TensorDictBase, task: Task, *, seed
     states = windows["state"].float().cpu()
     past, future = planner.split_window(states[:, history - planner.history :])
     episode = windows["episode"][:, -1].cpu()
-    device = next(iter(planner.state_dict().values())).device
-    models = {"planner": sample_sequences(planner, past.to(device), samples=SAMPLES, seed=seed).cpu()}
+    models = {"planner": sample_sequences(planner, past.to(device_of(planner)), samples=SAMPLES, seed=seed).cpu()}
     models |= {name: plan[None] for name, plan in baseline_plans(states[:, :history], horizon).items()}
     groups = unit_groups(task.state_units)
 
@@ -93,12 +93,10 @@ def _score(sampled: Tensor, true: Tensor) -> dict[str, dict[str, Any]]:
     """Rates plans ``[S, N, H, d]`` by energy score and best sample, over all and per step."""
     score = energy_score(sampled, true)  # [N, H]
     distance = (sampled - true).norm(dim=-1)  # [S, N, H]
+    best, per_step = distance.mean(-1).amin(0).mean(), distance.amin(0).mean(0)
     return {
         "energy_score": {"overall": score.mean().item(), "per_step": score.mean(0).tolist()},
-        "best_of": {
-            "overall": distance.mean(-1).amin(0).mean().item(),
-            "per_step": distance.amin(0).mean(0).tolist(),
-        },
+        "best_of": {"overall": best.item(), "per_step": per_step.tolist()},
     }
 
 
@@ -115,7 +113,6 @@ def first_actions(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Decodes actions on the labelled steps of some trajectories: the same steps for every controller.
 
-    The windows have ``BEFORE`` frames of history, of which a trajectory's first is repeated, and ``AFTER`` of future.
     Returned are predicted and true actions ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
     """
     wanted = torch.isin(data["episode"], torch.as_tensor(episodes, device=data["episode"].device))
@@ -125,9 +122,8 @@ def first_actions(
         return data["action"][:0].cpu(), data["action"][:0].cpu(), data["episode"][:0].cpu()
     windows = cut_windows(part, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
     windows = windows[windows["action"][:, BEFORE].isfinite().all(-1)]  # the data may lack labels themselves
-    device = next(iter(controller.state_dict().values())).device
     past = min(controller.num_past, BEFORE)
-    states = windows["state"][:, BEFORE - past :].to(device)
+    states = windows["state"][:, BEFORE - past :].to(device_of(controller))
     predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
     return predicted[:, past].cpu(), windows["action"][:, BEFORE], windows["episode"][:, -1]
 
@@ -137,9 +133,9 @@ def errors_outside_budget(
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Measures errors on the trajectories that have labels of which none was in the budget.
 
-    The flat data are as the controller sees them, with all labels that there are, and after the budget was applied
-    (``labelled``). Returned is what :func:`summarise_errors` finds, or a ``note`` why there is none; and the actions
-    ``predicted`` and ``true`` ``[N, act]``.
+    The flat data are as the controller sees them, with all labels, and with those of the budget (``labelled``).
+    Returned is what :func:`summarise_errors` finds, or a ``note`` why there is none; and the actions ``predicted`` and
+    ``true`` ``[N, act]``.
     """
     outside = episodes_outside(data, labelled)
     predicted, true, episode = first_actions(controller, data, outside)
@@ -158,12 +154,12 @@ def _beside(
     task: Task,
 ) -> dict[str, Tensor]:
     """Actions ``[N, act]`` on some trajectories: a controller's, a ridge's on raw frames, the mean of those known."""
-    ridge = LinearInverseDynamics(known["state"].shape[-1], task.action_dim).to(known["state"].dtype)
-    fit_closed_form(ridge, known)
+    linear = LinearInverseDynamics(known["state"].shape[-1], task.action_dim).to(known["state"].dtype)
+    fit_closed_form(linear, known)
     fixed = torch.tensor([action.constant is not None for action in task.actions.values()])
     return {
         "controller": torch.where(fixed, true, predicted),  # as a policy commands: what never changes is what it was
-        "ridge": first_actions(ridge, data, episodes)[0],
+        "ridge": first_actions(linear, data, episodes)[0],
         "mean_action": known["action"][known["has_action"].squeeze(-1)].mean(0).expand_as(true),
     }
 
@@ -225,9 +221,8 @@ def errors_of_chunks(
         """Absolute actions as distances from where their columns are in the present frame."""
         return action - states[:, now, targets] if targets else action
 
-    past = windows["state"][:, :history].float()
+    past, device = windows["state"][:, :history].float(), device_of(policy)
     true, seen = (moved(part["action"][:, now], part["state"]) for part in (windows, known))
-    device = next(iter(policy.state_dict().values())).device
     sampled = sample_sequences(policy, past.to(device), samples=SAMPLES, seed=seed)[:, :, 0].mean(0).cpu()
     condition, asked = (
         policy.encode_history(frames.float().to(device)).cpu() for frames in (known["state"][:, :history], past)
@@ -242,16 +237,13 @@ def errors_of_chunks(
 
 
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:
-    """Takes root mean squared errors by column and by unit, and as shares of those of the mean action.
-
-    Of predicted actions ``[N, act]``, recorded ones ``[N, act]`` and the trajectory of every step ``[N]``;
-    ``"mean_action"`` is what the model ``"controller"`` has to beat.
+    """Takes root mean squared errors of predicted and recorded actions ``[N, act]`` in trajectories ``episode [N]``.
 
     Returns:
         dict: ``labels``, ``trajectories``; ``relative``: the controller's error as a share of that of the mean action,
         root mean square over columns (1: no better than always giving the mean action); ``ridge_relative``: the
-        ridge's likewise; ``unit`` and ``column``: rows
-        with the errors of every model in the unit of the data; ``trajectory``: the relative error of each.
+        ridge's likewise; ``unit`` and ``column``: rows with the errors of every model in the unit of the data;
+        ``trajectory``: the relative error of each.
     """
     square = {name: (predicted - true).square() for name, predicted in models.items()}
     units, names = list(task.action_units), task.action_names
@@ -263,7 +255,7 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
         "labels": len(true),
         "trajectories": len(episode.unique()),
         "relative": _relative(square),
-        "ridge_relative": _relative(square, "ridge") if "ridge" in square else None,
+        "ridge_relative": _relative(square, "ridge"),
         "unit": [
             {"unit": unit, "columns": [names[column] for column in columns], **root(columns)}
             for unit, columns in unit_groups(units).items()

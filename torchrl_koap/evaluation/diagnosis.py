@@ -24,7 +24,7 @@ from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 
-_STATES, _MOST_STATES = ("visited", "demonstrated"), 4000  # of each at most, whose distances are measured
+_MOST_STATES = 4000  # whose distances are measured
 RECORDED_FUTURE = "recorded_future"
 RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end
 
@@ -169,10 +169,8 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -
         return {}
     scale = known.std(0).clamp_min(1e-6) * task.state_dim**0.5
     visited = torch.cat([task.state_of(episode[OBSERVATION]) for episode in episodes])
-    known = known[:: max(1, len(known) // 20000)]
-    sample = [states[:: max(1, len(states) // _MOST_STATES)] for states in (visited, held_out)]
-    figures = [
-        torch.cat([torch.cdist(part / scale, known / scale).amin(1) for part in states.split(2048)])
-        for states in sample
-    ]
-    return {f"{name}_95": figure.quantile(0.95).item() for name, figure in zip(_STATES, figures, strict=True)}
+    known, found = known[:: max(1, len(known) // 20000)] / scale, {}
+    for name, states in {"visited_95": visited, "demonstrated_95": held_out}.items():
+        parts = (states[:: max(1, len(states) // _MOST_STATES)] / scale).split(2048)
+        found[name] = torch.cat([torch.cdist(part, known).amin(1) for part in parts]).quantile(0.95).item()
+    return found

@@ -77,10 +77,8 @@ def _describe_experiments(result: Mapping[str, Any]) -> str:
 def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
     """Says what is wrong with the latent dynamics as a model of the motion; an empty list if nothing is.
 
-    The errors of :func:`~torchrl_koap.evaluation.latent_space.prediction_errors` after the last step are compared, by
-    the first part of the state. A latent model is faulted for an error above twice that of a linear model on raw states
-    (fitted on the same inputs), for one above standing still, and for losing more by mapping states back than the
-    linear model errs in all.
+    Compared are the errors of :func:`~torchrl_koap.evaluation.latent_space.prediction_errors` after the last step, in
+    the first part of the state.
     """
     part = next(iter(multi_step["koopman"]))
     koopman, back, linear, still = (float(multi_step[model][part][-1]) for model in MODELS)

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.closed_loop import find_environment
-from torchrl_koap.evaluation.config import RolloutConfig, check_rollouts
+from torchrl_koap.evaluation.config import EvalConfig, check_options
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
     follow_recordings,
@@ -37,7 +37,7 @@ from torchrl_koap.vision import Observer
 
 
 @dataclass
-class InspectConfig(RolloutConfig):
+class InspectConfig(EvalConfig):
     """Which part of a trained run fails, and what its latent actions hold.
 
     In an environment of Gymnasium, which cannot start where a recording did, the closed loop is looked at alone.
@@ -75,7 +75,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
     """
     config = InspectConfig() if config is None else config
-    check_rollouts(config)
+    check_options(config)
     set_up_torch(config.threads, config.device)
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task
@@ -84,12 +84,10 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
             f"task {task.name!r} has no environment to make experiments in: name one with --env, or --latent-only looks"
             " into the latent space alone; `koap eval` judges plans and actions on recorded data"
         )
-    folder = writable_folder(run) if config.out is None else None  # refused before anything is read
+    directory = RunDirectory(writable_folder(run, config.out))
     data = trained.data(config.dataset)
-    directory = RunDirectory(folder or writable_folder(run, config.out))
     if config.latent_only:  # what earlier experiments found stays
-        earlier = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
-        result = {name: value for name, value in earlier.items() if name != "findings"}
+        result = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
     elif trained.planner is None:
         method = trained.config.method
         raise ValueError(f"method {method!r} samples actions: it has no planner and controller to compare")
@@ -109,11 +107,10 @@ def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) 
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = find_environment(task, config, Observer.of(task, trained.cameras))
     found: dict[str, Any] = {} if config.env is None else {"env": config.env}
+    at_once = config.num_envs or config.batch_size
+    options = {"max_steps": where.max_steps, "contexts": where.contexts, "batch_size": at_once}
     with progress_bar(3, "experiments", unit="experiment") as bar:
-        at_once = config.num_envs
-        closed = roll_out(
-            policy, where.make_env, seeds, max_steps=where.max_steps, contexts=where.contexts, batch_size=at_once
-        )
+        closed = roll_out(policy, where.make_env, seeds, **options)
         bar.update()
         found |= {
             "both": rate([outcome_of(episode) == "success" for episode in closed]),
@@ -158,10 +155,9 @@ def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) ->
     labelled = torch.zeros(len(data), dtype=torch.bool)
     if config.dataset is None:
         labelled = trained.config.labels.budget(trained.config.run.seed).apply(data)[0]["has_action"].squeeze(-1)
-    columns = trained.columns
     parts = {
-        name: [place for place, column in enumerate(columns) if part.start <= column < part.stop]
+        name: places
         for name, part in task.state_slices.items()
+        if (places := [place for place, column in enumerate(trained.columns) if part.start <= column < part.stop])
     }
-    parts = {name: places for name, places in parts.items() if places}
     return analyse_latent(controller, trained.seen(data), labelled, parts)

@@ -74,14 +74,11 @@ def prediction_errors(
     Beside them ``reconstruction``: :math:`g_\psi(g_\theta(x_{t+h}))`, what the first one cannot do better than.
 
     Both ``u`` and ``v`` read recorded states *ahead* of every step, so this tests the models; it is no forecast. The
-    linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others. The Koopman model was
-    trained on the states of all of them.
+    linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others.
 
     By model and part the root mean square distance after ``1 .. horizon`` steps is returned, in raw units. A horizon
-    below 1, or above what a trajectory holds, is an error.
+    above what a trajectory holds is an error.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon must be >= 1 step, got {horizon}")
     now, length = controller.num_past, controller.num_window_frames + horizon - 1
     windows = cut_windows(data, length, select=[STATE, EPISODE], pad_before=now)
     fitted = torch.isin(windows[EPISODE][:, -1], fit_on)
@@ -151,8 +148,6 @@ def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[f
     It is fitted on the steps ``fit`` (bool ``[N]``) and tested on the others; ``groups`` are the trajectories ``[N]``
     by which the ridge is chosen.
     """
-    if fit.all() or not fit.any():
-        raise ValueError(f"a probe is fitted on some steps and tested on others, got {int(fit.sum())} of {len(fit)}")
     return explained(ridge(latent[fit], action[fit], groups=groups[fit]).predict(latent[~fit]), action[~fit])
 
 
@@ -164,15 +159,13 @@ def analyse_latent(
 ) -> dict[str, Any]:
     """Measures eigenvalues, multi-step errors (of fewer steps where trajectories are short) and what a probe explains.
 
-    The controller is in evaluation mode, on the device of the flat data ``[N]``, which have all labels that there are,
-    as the controller sees them; ``labelled`` are those in the budget, bool ``[N]``, ``parts`` columns of the state by
-    name.
+    The flat data ``[N]`` have all labels, as the controller sees them; ``labelled`` are those in the budget, bool
+    ``[N]``, ``parts`` columns of the state by name.
 
     Returns:
-        dict: ``eigenvalues``, ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`
-        the probe, the number of labels it read and the ``R^2`` of the model's own decoder on the same steps; or a
-        ``note`` where fewer than two trajectories have labels. Of data that lack labels the probe takes half of the
-        labelled trajectories.
+        dict: ``eigenvalues``, ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET` the probe, the number of labels it
+        read and the ``R^2`` of the model's own decoder on the same steps; or a ``note`` where fewer than two
+        trajectories have labels.
     """
     eigenvalues = controller.operator.eigenvalues().detach()
     result: dict[str, Any] = {"eigenvalues": {"real": eigenvalues.real.tolist(), "imag": eigenvalues.imag.tolist()}}

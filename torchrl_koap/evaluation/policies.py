@@ -82,10 +82,8 @@ def trained_policy(trained: Trained, asked: ExecutionConfig) -> PlanningPolicy:
 class OracleFollower(Follower):
     """Executes the commands that take the simulated robot where plans say.
 
-    It reads the simulation, not the observation: nothing that a robot could have. How exactly the tool follows its plan
-    is beyond any learned controller; whether the task succeeds is not, where the tool pushes something. The environment
-    of the task must be a :class:`~torchrl_koap.envs.ManipulationEnv`, and the task must say which state columns its
-    actions move.
+    It reads the simulation, not the observation: nothing that a robot could have. The environment of the task must be a
+    :class:`~torchrl_koap.envs.ManipulationEnv`, and the task must say which state columns its actions move.
     """
 
     knows_command = True

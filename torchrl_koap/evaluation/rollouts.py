@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_koap.evaluation.scores import outcome_of
@@ -36,23 +38,18 @@ def roll_out(
 ) -> list[TensorDict]:
     """Runs one episode per seed, on which alone the planner's noise depends; returns each ``[steps]``, cut at its end.
 
-    ``make_env`` makes an environment of a given number of parallel episodes. There are ``batch_size`` episodes at a
-    time (by default :data:`AT_ONCE`), on which outcomes do not depend, of ``max_steps`` control steps at most.
-    ``contexts`` are those ``[objects, 3]`` of every episode, for a task that has them. ``given(episodes)`` writes what
-    the planner reads in those episodes in place of start noise. ``progress`` is called with the number of episodes
-    finished.
+    ``make_env`` makes an environment of a given number of parallel episodes, of which there are ``batch_size`` (by
+    default :data:`AT_ONCE`); outcomes do not depend on it. ``contexts`` are those ``[objects, 3]`` of every episode.
+    ``given(episodes)`` writes what the planner reads in those episodes in place of start noise. ``progress`` is called
+    with the number of episodes finished.
     """
-    if not len(seeds) or (batch_size is not None and batch_size < 1):
-        raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
-    if contexts is not None and len(contexts) != len(seeds):
-        raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
     noise_key, episodes = policy.planner.noise_key or NOISE, []
     size = batch_size or min(len(seeds), AT_ONCE)
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
         _seed_episodes(env, part)
-        transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
+        transforms = policy_transforms(policy.history)
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
         if given is not None:
             noise = given(slice(begin, begin + len(part)))
@@ -81,9 +78,9 @@ def roll_out(
     return episodes
 
 
-def device_of(policy: PlanningPolicy) -> torch.device:
-    """Returns the device of the parameters of a policy, the processor for one without any."""
-    return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
+def device_of(module: nn.Module) -> torch.device:
+    """Returns the device of a module's parameters and buffers, the processor for one without any."""
+    return next(itertools.chain(module.parameters(), module.buffers()), torch.empty(0)).device
 
 
 @runtime_checkable
@@ -128,36 +125,29 @@ def rollouts_to_tensors(
         ``context`` ``[E, objects, 3]``; with ``state_of`` ``column`` ``[k]``, ``state`` ``[E, T, k]`` and
         ``state_plan`` ``[E, P, H, k]``, NaN behind the end.
     """
-    longest, last = max(len(episode) for episode in episodes), [episode[-1]["next"] for episode in episodes]
+    pad, last = partial(pad_sequence, batch_first=True), [episode[-1]["next"] for episode in episodes]
+    frames = [torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]) for episode in episodes]
     columns = [slice(part.start, part.start + 2) for part in (position, *objects)]
-    paths = torch.full((len(episodes), longest + 1, len(columns), 2), torch.nan)
-    plans, plan_steps, actions = [], [], []
-    for index, episode in enumerate(episodes):
-        frames = torch.cat([episode[OBSERVATION], last[index][OBSERVATION][None]])
-        paths[index, : len(frames)] = torch.stack([frames[:, part] for part in columns], 1).float()
-        chunks = episode.get(PLAN, None)
-        plans.append(torch.zeros(0, 1, 2) if chunks is None or not plans_position else chunks[::interval, :, :2])
-        plan_steps.append(torch.arange(len(plans[-1])) * interval)
-        actions.append(episode[ACTION])
-    pad = torch.nn.utils.rnn.pad_sequence
+    paths = [torch.stack([seen[:, part] for part in columns], 1).float() for seen in frames]
+    path = pad(paths, padding_value=torch.nan)
+    none = torch.zeros(0, 1, 1 + max(shown, default=1))
+    made = [episode.get(PLAN, none)[::interval] for episode in episodes]
+    plans = [plan[..., :2] if plans_position else none[..., :2] for plan in made]
     tensors = {
-        "position": paths[:, :, 0].contiguous(),
+        "position": path[:, :, 0].contiguous(),
         "length": torch.tensor([len(episode) for episode in episodes]),
         "mode": torch.stack([mode_index(end[MODE]).reshape(()) for end in last]).long(),
         "outcome": torch.tensor([OUTCOMES.index(outcome_of(episode)) for episode in episodes]),
-        "plan": pad(plans, batch_first=True, padding_value=torch.nan),
-        "plan_step": pad(plan_steps, batch_first=True, padding_value=-1),
-        "action": pad(actions, batch_first=True, padding_value=torch.nan),
+        "plan": pad(plans, padding_value=torch.nan),
+        "action": pad([episode[ACTION] for episode in episodes], padding_value=torch.nan),
     }
     if state_of is not None:
-        chosen = list(shown)
-        frames = [torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]) for episode in episodes]
-        made = [episode.get(PLAN, torch.zeros(0, 1, 1 + max(chosen)))[::interval][..., chosen] for episode in episodes]
+        chosen, plans = list(shown), made
         tensors["column"] = torch.tensor(chosen)
-        for name, parts in {"state": [state_of(seen)[:, chosen] for seen in frames], "state_plan": made}.items():
-            tensors[name] = pad(parts, batch_first=True, padding_value=torch.nan)
-        tensors["plan_step"] = pad([torch.arange(len(part)) * interval for part in made], True, -1)
+        tensors["state"] = pad([state_of(seen)[:, chosen] for seen in frames], padding_value=torch.nan)
+        tensors["state_plan"] = pad([plan[..., chosen] for plan in made], padding_value=torch.nan)
+    tensors["plan_step"] = pad([torch.arange(len(plan)) * interval for plan in plans], padding_value=-1)
     if objects:
-        tensors["object_position"] = paths[:, :, 1:].contiguous()
+        tensors["object_position"] = path[:, :, 1:].contiguous()
         tensors["context"] = torch.stack([end[CONTEXT] for end in last])
     return tensors

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from tensordict import TensorDict
@@ -46,9 +47,10 @@ def score(
     below two rollouts per context, and ``pooled_mode_entropy`` that of all successful episodes together. ``unsolved``
     is as of :func:`~torchrl_koap.evaluation.statistics.conditional_entropy`.
     """
-    rows: list[dict[str, Any]] = []
-    for seed, episode in zip(seeds, episodes, strict=True):
-        rows.append({"seed": seed, "outcome": outcome_of(episode), "steps": len(episode)})
+    rows: list[dict[str, Any]] = [
+        {"seed": seed, "outcome": outcome_of(episode), "steps": len(episode)}
+        for seed, episode in zip(seeds, episodes, strict=True)
+    ]
     success = rate([row["outcome"] == "success" for row in rows])
     result: dict[str, Any] = {"episodes": len(rows), "rates": {"success": success}}
     if contexts is not None:
@@ -71,18 +73,13 @@ def _mode_scores(
     won = [row for row in rows if row["outcome"] == "success" and row["mode"] >= 0]
     modes = [row["mode"] for row in won]
     found: dict[str, float | None] = {"mode_entropy": None}
-
-    def pooled(sample: Sequence[int]) -> float:
-        return mode_entropy(sample, num_modes)
-
-    def conditional(sample: Sequence[Sequence[int]]) -> float | None:
-        return conditional_entropy(sample, num_modes, unsolved=unsolved)
-
     if contexts is not None and len(rows) >= 2 * contexts:
         groups: dict[int, list[int]] = {row["context"]: [] for row in rows}
         for row in won:
             groups[row["context"]].append(row["mode"])
+        conditional = partial(conditional_entropy, num_modes=num_modes, unsolved=unsolved)
         found |= _entropy("mode_entropy", list(groups.values()), conditional)
+    pooled = partial(mode_entropy, num_modes=num_modes)
     found |= _entropy("mode_entropy" if contexts is None else "pooled_mode_entropy", modes, pooled)
     return found | {"distinct_modes": len(set(modes))}
 

@@ -17,8 +17,6 @@ _RESAMPLES, _TAIL = 500, (1 - 0.95) / 2  # of a bootstrap; share outside its int
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Returns both ends, in 0..1, of the Wilson score interval (95 %) of a success rate of at least one trial."""
-    if trials < 1 or not 0 <= successes <= trials:
-        raise ValueError(f"expected 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
     interval = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 
@@ -62,8 +60,6 @@ def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsol
     without success count: ``"skip"`` leaves them out (Sorting, Stacking), ``"zero"`` counts them as 0 (Aligning). None
     if there is nothing to average.
     """
-    if unsolved not in ("skip", "zero"):
-        raise ValueError(f"unsolved must be 'skip' or 'zero', got {unsolved!r}")
     values = [mode_entropy(seen, num_modes) for seen in modes if len(seen) or unsolved == "zero"]
     return sum(values) / len(values) if values else None
 

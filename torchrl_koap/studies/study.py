@@ -298,9 +298,7 @@ def check_study(study: Study) -> list[Cell]:
     if study.evaluation.env is not None:
         for task in study.tasks:
             observe = Observer.of(study.task(task), cameras_of(study.given_dataset(task)))
-            find_environment(
-                study.task(task), study.evaluation, observe, study.evaluation.rollouts_per_context, contexts
-            )
+            find_environment(study.task(task), study.evaluation, observe)
     cells = study.cells()
     sampling = [name for name in study.methods if not get_method(name).plans]
     if study.execution.strategy == "open_loop" and sampling:
