@@ -138,7 +138,6 @@ def test_every_part_names_the_entry_that_it_lacks(part, entry):
     ("kind", "sizes"),
     [
         (KoopmanLifting, (2, 4)),
-        (CompactLifting, (24, 2)),
         *((kind, (2, 6)) for kind in (LatentActionMLP, LatentActionLSTM, LatentActionFourier)),
         (LinearActionDecoder, (6, 2)),
     ],

@@ -212,14 +212,8 @@ class LatentInverseDynamics(InverseDynamics):
     """Base class of the controllers with a latent: states to latents to actions.
 
     A subclass says how a latent is inferred (:meth:`infer`). ``forward`` writes the latent under ``"latent_action"``
-    and then the raw action of every frame.
-
-    Args:
-        reader (WindowReader, optional): reads what a latent is inferred from.
-        action_decoder (nn.Module): maps latents to actions in normalised units.
-
-    Keyword Args:
-        **kwargs: columns and normalisers, see :class:`InverseDynamics`.
+    and then the raw action of every frame. The decoder maps latents to actions in normalised units; the other arguments
+    are those of :class:`InverseDynamics`.
     """
 
     samples_latents = False  # whether sample() draws from a distribution

@@ -31,13 +31,6 @@ class RidgeFit:
         penalty (float): the ridge, in units of the mean square norm of the inputs.
         errors (dict): root of the mean squared held-out error of every candidate, in the units of the targets.
         num_labels (int): rows used.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.ridge import ridge
-        >>> inputs = torch.arange(12.0).reshape(6, 2).sin()
-        >>> ridge(inputs, inputs @ torch.tensor([[2.0], [3.0]]), penalties=(1e-9,)).weight.round().tolist()
-        [[2.0, 3.0]]
     """
 
     weight: Tensor

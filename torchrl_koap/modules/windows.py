@@ -22,18 +22,9 @@ from torch import Tensor, nn
 
 
 class StateReader(nn.Module):
-    """Reads some columns of states ``[*B, T, d]``, and features of every state beside them.
+    """Reads some columns of states ``[*B, T, d]``, and beside them features ``[*B, T, num_features]`` of every state.
 
-    Args:
-        columns (sequence of int): columns to read.
-        features (Module, optional): from ``[*B, T, 1, d]`` to ``[*B, T, num_features]``, such as relative positions.
-            Default: none.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.windows import StateReader
-        >>> StateReader((0, 2))(torch.tensor([[1.0, 2.0, 3.0]]))
-        tensor([[1., 3.]])
+    The module ``features`` computes them from ``[*B, T, 1, d]``, such as relative positions. Default: none.
     """
 
     def __init__(self, columns: Sequence[int], features: nn.Module | None = None):

@@ -83,5 +83,5 @@ def test_wrong_actions_and_hidden_labels_are_explained():
     with pytest.raises(ValueError, match="1 of 80 rows are NaN"):
         policy.fit_normalizers(walks(4), hidden)
     assert torch.equal(policy.condition_normalizer.scale, before)  # a failed call changes nothing
-    with pytest.raises(ValueError, match="action_dim must be at least 1"):
+    with pytest.raises(ValueError, match="width must be at least 1"):
         DiffusionPolicy(nn.Identity(), state_dim=2, action_dim=0)

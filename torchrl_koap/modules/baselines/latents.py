@@ -27,9 +27,8 @@ class FiniteScalarQuantizer(nn.Module):
         \qquad o_i = \tfrac12 [L_i \text{ even}], \quad \tfrac{L_i - 1}{2} \tanh(s_i) = o_i
 
     after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle one: they lie half a level
-    lower, and the shift ``s`` keeps 0 at the code 0. There is no codebook to train and no term for it in a loss; a
-    codebook is the 1000 codes there are of four entries with 8, 5, 5 and 5 levels; a code has two of them. A linear map
-    takes the ``features`` ``[*B, m]`` to the entries of a code, and a second one takes codes back.
+    lower, and the shift ``s`` keeps 0 at the code 0. A linear map takes the ``features`` ``[*B, m]`` to the entries of
+    a code, and a second one takes codes back.
     """
 
     def __init__(self, features: int):

@@ -20,6 +20,12 @@ from torchrl_koap.modules.execution.policy_env import NoiseStreams
 KEPT = 10_000  # latencies of the last steps
 
 
+def percentiles(seconds: Sequence[float]) -> dict[str, float]:
+    """Returns ``p50``, ``p99`` and ``max`` of times of single ``steps`` in ms, and their number."""
+    p50, p99, longest = (1e3 * np.percentile(seconds, (50, 99, 100))).tolist()
+    return {"p50": p50, "p99": p99, "max": longest, "steps": len(seconds)}
+
+
 class Agent:
     """Acts with a policy, one robot or several at a time, without gradients.
 
@@ -94,9 +100,7 @@ class Agent:
         """Time per action of the last 10,000 steps in ms: ``p50``, ``p99``, ``max``, and the number of ``steps``."""
         if not self.latencies:
             raise RuntimeError("the agent has not acted yet: there is no latency to tell")
-        times = np.array(self.latencies) * 1e3
-        p50, p99 = np.percentile(times, (50, 99))
-        return {"p50": float(p50), "p99": float(p99), "max": float(times.max()), "steps": len(times)}
+        return percentiles(self.latencies)
 
     def _forget(self) -> None:
         self._carried: TensorDict | None = None  # what the policy wrote in the last step

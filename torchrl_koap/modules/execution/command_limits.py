@@ -27,10 +27,8 @@ class CommandLimits(nn.Module):
         a' = \operatorname{clip}(c + g a - x,\; -l,\; l) - (c - x)
 
     with the last command ``c``, the measured position ``x``, an action ``a`` that changes the command, the gain ``g``
-    and the lead ``l``, 0 for none, in the units of the actions. Where a robot is blocked, at the end of its reach or by
-    what it pushes against, every plan that leads on adds to the command, which nothing takes back (integrator windup):
-    the command ends metres away, and what is decided from then on hardly moves the robot. With a limit it answers as
-    soon as plans turn back.
+    and the lead ``l``, 0 for none, in the units of the actions. Where a robot is blocked, every plan that leads on adds
+    to the command (integrator windup); with a lead it answers as soon as plans turn back.
 
     Args:
         actions (sequence of int): action columns that change the command; needed for a gain or lead.
@@ -44,8 +42,7 @@ class CommandLimits(nn.Module):
             same.
 
     Raises:
-        ValueError: for a gain or lead where no action is a change of a command, one out of range, or columns that
-            differ in number.
+        ValueError: for a gain or lead where no action is a change of a command.
     """
 
     def __init__(
@@ -62,15 +59,8 @@ class CommandLimits(nn.Module):
         super().__init__()
         if not len(actions) and (ranges is None or gain != 1 or lead):
             raise ValueError(f"gain {gain:g} and lead {lead:g} were given, but no action is a change of a command")
-        if not 0 < gain < math.inf or not 0 <= lead < math.inf:
-            raise ValueError(f"gain must be a number above 0 and lead one of at least 0, got {gain} and {lead}")
         if lead and not (commands or positions):
             raise ValueError(f"lead {lead:g} was given, but the observation repeats no command that actions change")
-        if lead and not len(commands) == len(positions) == len(actions):
-            raise ValueError(
-                "as many commands, positions and actions are needed, got"
-                f" {len(commands)}, {len(positions)} and {len(actions)} columns"
-            )
         self.gain, self.lead, self.state_of = gain, lead, state_of
         self.register_buffer("ends", None if ranges is None else ends_of(ranges), persistent=False)
         for name, columns in {"actions": actions, "commands": commands, "positions": positions}.items():

@@ -25,6 +25,7 @@ from torchrl_koap.modules.execution.policy import PlanningPolicy
 SUFFIXES = {"torch": ".pt2", "onnx": ".onnx", "aoti": ".aoti.pt2"}
 FACTS = "facts.json"  # inside of a file of torch.export
 _BATCHES = (1, 3)  # that what is read back is tried with
+_OUTPUTS = ("actions", "limited")
 _MEANINGS = {
     "observations": "raw units, oldest frame first, the present one last; at the start the first one is repeated",
     "noise": "standard normal numbers, drawn anew for every call",
@@ -58,20 +59,11 @@ class _Stateless(nn.Module):
 
 @dataclass(frozen=True)
 class Exportable:
-    """A policy as a plain module on tensors, of any batch size.
+    """A policy as a plain module on tensors, of any batch size."""
 
-    Args:
-        module (nn.Module): from the inputs, in their order, to a tuple of tensors.
-        inputs (dict): an example of every input by name, batch 1.
-        outputs (tuple of str): names of what comes out.
-        facts (dict): what a caller has to know, as JSON: shapes, names and units of the columns, order of frames,
-            meaning of the noise, rate and steps per plan.
-    """
-
-    module: nn.Module
-    inputs: dict[str, Tensor]
-    outputs: tuple[str, ...]
-    facts: dict[str, Any]
+    module: nn.Module  # from the inputs, in their order, to a tuple of tensors
+    inputs: dict[str, Tensor]  # an example of every input by name, batch 1
+    facts: dict[str, Any]  # what a caller has to know: shapes, columns, order of frames, noise, rate, steps per plan
 
     def batch(self, size: int) -> tuple[Tensor, ...]:
         """Inputs of several robots, no two alike."""
@@ -86,9 +78,9 @@ def exportable(policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str
     seen = 0.1 * seen
     if policy.origins is not None:
         seen = seen.double() + policy.origins[0].to(seen.device)
-    module, inputs, outputs = _Stateless(policy).eval(), {"observations": seen, "noise": noise}, ("actions", "limited")
+    module, inputs = _Stateless(policy).eval(), {"observations": seen, "noise": noise}
     with torch.no_grad():
-        found = dict(zip(outputs, module(*inputs.values()), strict=True))
+        found = dict(zip(_OUTPUTS, module(*inputs.values()), strict=True))
     facts = {
         "inputs": _tensors(inputs, columns),
         "outputs": _tensors(found, columns),
@@ -96,7 +88,7 @@ def exportable(policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str
         "steps_per_plan": policy.execution.replan_interval,
         "note": _OPEN_LOOP,
     }
-    return Exportable(module, inputs, outputs, facts)
+    return Exportable(module, inputs, facts)
 
 
 def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
@@ -165,7 +157,7 @@ def _write_onnx(what: Exportable, file: Path) -> None:
     program = torch.onnx.export(
         _program(what),
         input_names=list(what.inputs),
-        output_names=list(what.outputs),
+        output_names=list(_OUTPUTS),
         dynamic_shapes=_shapes(what, "batch"),
         dynamo=True,
         verbose=False,

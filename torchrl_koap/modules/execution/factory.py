@@ -26,13 +26,9 @@ def make_policy(
     action_rule: ActionRule | None = None,
     changes: Sequence[int] = (),
     commanded: Mapping[str, Sequence[int]] | None = None,
-    decoded: Mapping[str, Sequence[int]] | None = None,
     ranges: Ranges | None = None,
-    max_steps: int = 400,
-    control_hz: float | None = None,
-    observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
-    origins: tuple[Sequence[float], Sequence[float]] | None = None,
     follower: Follower | None = None,
+    **options: Any,
 ) -> PlanningPolicy:
     """Makes a policy of planner and controller: observations in, an action per control step out.
 
@@ -46,16 +42,16 @@ def make_policy(
 
     Keyword Args:
         state_of (callable, or sequence of int): as for :class:`~torchrl_koap.modules.PlanningPolicy`, like
-            ``execution``, ``max_steps``, ``control_hz``, ``observe`` and ``origins``.
+            ``execution`` and the options.
         reads (callable, optional): what an inverse dynamics reads of states ``[*B, T, d]``. Default: all.
         action_rule (callable, optional): as for ``Follower``.
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
         commanded (mapping, optional): for each of these the observation column that repeats the command
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
-        decoded (mapping, optional): as for :class:`~torchrl_koap.modules.PlanningPolicy`.
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
         follower (Follower, optional): follows plans in place of the controller.
+        **options: ``decoded``, ``max_steps``, ``control_hz``, ``observe`` and ``origins``.
 
     Returns:
         PlanningPolicy: the policy.
@@ -88,19 +84,7 @@ def make_policy(
             positions=own.get("states", ()),
             state_of=state_of if callable(state_of) else lambda observed: observed[..., list(state_of)],
         )
-    policy = PlanningPolicy(
-        planner,
-        follower,
-        state_of=state_of,
-        execution=execution,
-        decoded=decoded,
-        limits=limits,
-        max_steps=max_steps,
-        control_hz=control_hz,
-        observe=observe,
-        origins=origins,
-    )
-    return policy.eval()
+    return PlanningPolicy(planner, follower, state_of=state_of, execution=execution, limits=limits, **options).eval()
 
 
 def _widened(ends: Sequence[float] | None, margin: float) -> tuple[float, float] | None:

@@ -133,20 +133,14 @@ class ResponseModel(nn.Module):
 
         Coordinates are ``[n, J, 2 memory + 1]`` (:meth:`coordinates`), the steps that followed ``[n, J]``; the penalty
         is relative to the coordinates' mean squares. Axes that are ``coupled`` may answer the commands of others, else
-        each one is fitted by itself. No step, and shapes that do not fit, are errors.
+        each one is fitted by itself.
         """
-        count, axes, size = len(steps), self.num_axes, 2 * self.memory + 1
-        if not count or coordinates.shape != (count, axes, size) or steps.shape != (count, axes):
-            raise ValueError(
-                f"wanted coordinates [n, {axes}, {size}] and steps [n, {axes}], n >= 1, got"
-                f" {list(coordinates.shape)} and {list(steps.shape)}"
-            )
+        axes, size = self.num_axes, 2 * self.memory + 1
         read, wanted = coordinates.double(), steps.double()
         scale = read.pow(2).mean(0).sqrt().clamp_min(1e-12)
         read = read / scale
         if coupled:
-            read = read.reshape(count, -1)
-            weight = _ridge(read, wanted, penalty).T.reshape(axes, axes, size)
+            weight = _ridge(read.flatten(1), wanted, penalty).T.reshape(axes, axes, size)
         else:
             weight = read.new_zeros(axes, axes, size)
             for axis in range(axes):

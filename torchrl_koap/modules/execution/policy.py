@@ -57,8 +57,9 @@ class PlanningPolicy(TensorDictModuleBase):
             ``[*B, obs]`` (:class:`~torchrl_koap.vision.Observer`). Default: the robot gives observations.
         origins (tuple, optional): what the data lack of the numbers that the robot reports ``[obs]`` and takes
             ``[act]``; an :class:`~torchrl_koap.modules.Agent` and exported files subtract and add it.
-        history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
-        action_key (NestedKey): action of the current step ``[*B, act]``.
+
+    It reads observations from ``"observation_history"`` (:func:`~torchrl_koap.modules.policy_transforms`) and writes
+    the action of the current step ``[*B, act]`` to ``"action"``.
 
     Raises:
         ValueError: for an interval longer than the horizon, or a follower that cannot be executed so. At the first call
@@ -90,27 +91,23 @@ class PlanningPolicy(TensorDictModuleBase):
         control_hz: float | None = None,
         observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
         origins: tuple[Sequence[float], Sequence[float]] | None = None,
-        history_key: NestedKey = OBSERVATION_HISTORY,
-        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         execution = Execution() if execution is None else execution
         if follower is None:  # what is sampled is executed
             execution = execution.replaced(strategy="open_loop")
-        elif execution.strategy == "open_loop":
-            if follower.knows_command:
-                raise ValueError(f"{type(follower).__name__} looks at every step: strategy must not be 'open_loop'")
-        if follower is not None and follower.knows_command and execution.gain != 1:
+        knows_command = follower is not None and follower.knows_command
+        if knows_command and execution.strategy == "open_loop":
+            raise ValueError(f"{type(follower).__name__} looks at every step: strategy must not be 'open_loop'")
+        if knows_command and execution.gain != 1:
             raise ValueError(f"{type(follower).__name__} knows how commands are answered: gain must be 1")
         if execution.replan_interval > planner.horizon:
             raise ValueError(
                 f"replan_interval must be in 1..{planner.horizon} (the horizon), got {execution.replan_interval}"
             )
         self.planner, self.follower, self.limits = planner, follower, limits
-        if decoded is None or (follower is not None and follower.knows_command):  # its actions are changes
-            self.decoded = None
-        else:
-            self.decoded = {name: list(columns) for name, columns in decoded.items()}
+        given = {} if decoded is None or knows_command else decoded  # what knows the command gives its changes
+        self.decoded = {name: list(columns) for name, columns in given.items()} or None
         self.execution, self.max_steps, self.control_hz = execution, max_steps, control_hz
         self.observe = observe
         self.register_buffer("limited", torch.zeros(2, dtype=torch.long), persistent=False)
@@ -119,12 +116,12 @@ class PlanningPolicy(TensorDictModuleBase):
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
         self._decodes = follower is not None and execution.strategy != "open_loop"  # at every step
         chunk_key = PLAN if self._decodes else ACTION_CHUNK
-        self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
+        self.in_keys, self.out_keys = [OBSERVATION_HISTORY, IS_INIT], [ACTION, chunk_key]
         self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
-            _Chunk(self.plan, history_key, planner.noise_key, chunk_key),
+            _Chunk(self.plan, planner.noise_key, chunk_key),
             replan_interval=execution.replan_interval,
-            action_keys=[PLANNED_STATE if self._decodes else action_key],
+            action_keys=[PLANNED_STATE if self._decodes else ACTION],
             chunk_keys=[chunk_key],
             init_key=IS_INIT,
         )
@@ -135,11 +132,7 @@ class PlanningPolicy(TensorDictModuleBase):
         return self.planner.noise_shape
 
     def check_rate(self, control_hz: float) -> None:
-        """Warns of a control rate (Hz) that differs by more than a fifth from that of the data.
-
-        Raises:
-            ValueError: if it is no positive number.
-        """
+        """Warns of a control rate (Hz) a fifth or more beside that of the data; refuses what is no positive number."""
         number = isinstance(control_hz, (int, float, np.number)) and not isinstance(control_hz, bool)
         if not (number and math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz!r}")
@@ -163,8 +156,7 @@ class PlanningPolicy(TensorDictModuleBase):
     def plan(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
         """Makes what is executed next: planned states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
 
-        Observations are ``[*B, history, obs]`` in raw units, noise ``[*B, *noise_shape]`` standard normal, random by
-        default.
+        Observations are ``[*B, history, obs]`` in raw units, noise ``[*B, *noise_shape]`` is drawn by default.
         """
         states = self.state_of(observations)
         chunk = self.sample(states, noise)
@@ -202,8 +194,8 @@ class PlanningPolicy(TensorDictModuleBase):
     def decode_ahead(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Plans and decodes the actions of the next steps at once.
 
-        This is what is exported, stateless and without branches on data: whoever calls it keeps the last observations
-        and counts steps. Actions are as if the robot moved as it is commanded. Arguments as for :meth:`plan`.
+        This is what is exported, stateless and without branches on data. Actions are as if the robot moved as it is
+        commanded. Arguments as for :meth:`plan`.
 
         Returns:
             tuple: the actions ``[*B, replan_interval, act]``, and which of them were held in their range, bool
@@ -275,10 +267,10 @@ class PlanningPolicy(TensorDictModuleBase):
 class _Chunk(TensorDictModuleBase):
     """The part that runs only when a plan is due."""
 
-    def __init__(self, plan: Callable, history_key: NestedKey, noise_key: NestedKey | None, chunk_key: NestedKey):
+    def __init__(self, plan: Callable, noise_key: NestedKey | None, chunk_key: str):
         super().__init__()
         self.plan, self.noise_key = plan, noise_key
-        self.in_keys, self.out_keys = [history_key], [chunk_key]
+        self.in_keys, self.out_keys = [OBSERVATION_HISTORY], [chunk_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
@@ -54,11 +54,9 @@ class NoiseAdjustedComponents(nn.Module):
     .. math::
         y = \Lambda^{-1/2} U^T W^T x, \qquad W^T R W = I, \quad W^T C W = U \Lambda U^T
 
-    with the covariance ``C`` of the states and ``R`` of the white noise in them
-    (:func:`noise_covariance`): the minimum noise fraction transform (Green et
-    al. 1988), at unit spread. Where columns differ in their noise, principal components follow the noisiest; these
-    follow the best measured. No column counts as measured to more than 1 % of its spread, and components that stand out
-    by less than a factor of two are 0, but for the first. There are at most as many as columns, 1 to ``d``.
+    with the covariance ``C`` of the states and ``R`` of the white noise in them (:func:`noise_covariance`): the minimum
+    noise fraction transform (Green et al. 1988), at unit spread. No column counts as measured to more than 1 % of its
+    spread, and components that stand out by less than a factor of two are 0, but for the first.
     """
 
     analysis: Tensor
@@ -67,8 +65,6 @@ class NoiseAdjustedComponents(nn.Module):
 
     def __init__(self, state_dim: int, num_components: int):
         super().__init__()
-        if not 1 <= num_components <= state_dim:
-            raise ValueError(f"num_components must be 1 to {state_dim}, the state's columns, got {num_components}")
         self.register_buffer("analysis", torch.eye(num_components, state_dim))
         self.register_buffer("synthesis", torch.eye(state_dim, num_components))
         self.register_buffer("weights", torch.ones(num_components))
@@ -168,30 +164,20 @@ class CompactLifting(TensorDictModuleBase):
         y = P x, \quad z = (g_1(y), g_2(y)), \quad
         L_{recon} = \tfrac12 \sum_{i=1}^{2} \overline{w\, |h_i(g_i(y)) - y|^2}
 
-    ``P`` are the :class:`NoiseAdjustedComponents` and ``w`` their variances in units of the noise, so that columns of
-    much noise or little motion do not fill the coordinates. ``g_1`` has ``m`` coordinates and ``g_2`` twice as many;
-    both are trained. :meth:`finish` keeps the smaller one unless the larger one leaves less than 70 % of its
-    reconstruction error, as it does where something moves by itself beside the robot. The coordinates of the other are
-    0.
+    ``P`` are the :class:`NoiseAdjustedComponents` and ``w`` their variances in units of the noise. ``g_1`` has ``m``
+    ``coordinates`` and ``g_2`` twice as many; both are trained. :meth:`finish` keeps the smaller one unless the larger
+    one leaves less than 70 % of its reconstruction error, as it does where something moves by itself beside the robot.
+    The coordinates of the other are 0.
 
-    States are ``[*B, T, d]``, lifted ones ``[*B, T, 3 m]`` with ``m`` the ``coordinates``; ``hidden_dims`` are the
-    widths of all networks.
+    States are ``[*B, T, d]``, lifted ones ``[*B, T, 3 m]``; ``hidden_dims`` are the widths of all networks.
     """
 
     kept: Tensor
     keeps_state = False  # the state is no part of the lifted state
 
-    def __init__(
-        self,
-        state_dim: int,
-        coordinates: int,
-        *,
-        hidden_dims: Sequence[int] = (128, 128),
-        in_key: NestedKey = STATE,
-        out_key: NestedKey = LIFTED_STATE,
-    ):
+    def __init__(self, state_dim: int, coordinates: int, *, hidden_dims: Sequence[int] = (128, 128)):
         super().__init__()
-        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.in_keys, self.out_keys = [STATE], [LIFTED_STATE]
         self.state_dim, self.coordinates, self.latent_dim = state_dim, coordinates, 3 * coordinates
         self.components = NoiseAdjustedComponents(state_dim, min(COMPONENTS, state_dim))
         count = len(self.components.weights)
@@ -237,10 +223,9 @@ class CompactLifting(TensorDictModuleBase):
     def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
         """Trains both networks to Isomap coordinates and back, before any loss does.
 
-        An encoder that starts at linear components leaves states of a folded surface together that are far apart, and
-        no gradient of the losses unfolds it. These start at :func:`isomap` of
-        means of a few successive frames, which have less noise. Windows have 5 frames or more; of each network more
-        than 1000 updates are not made.
+        No gradient of the losses unfolds a folded surface. The coordinates are :func:`isomap` of means of a few
+        successive frames, which have less noise. Windows have 5 frames or more; of each network at most 1000 updates
+        are made.
         """
         updates = min(updates, PRETRAINING_UPDATES)
         weights, components = self.components.weights, self.components(windows.flatten(0, -3)).detach()

@@ -30,12 +30,12 @@ class KoopmanLifting(TensorDictModuleBase):
         hidden_dims (sequence of int): widths of both networks.
         include_state (bool): the first ``d`` observables are the state itself, as in extended dynamic mode
             decomposition; the other ``m - d`` are learned.
-        linear_skip (bool): add a linear map in both directions, which :meth:`prepare` sets to the principal components,
-            so that a nearly linear lifting costs the networks nothing.
+        linear_skip (bool): add to a learned lifting a linear map in both directions, which :meth:`prepare` sets to the
+            principal components, so that a nearly linear lifting costs the networks nothing.
         in_key, out_key (NestedKey): states ``[*B, T, d]`` and lifted states ``[*B, T, m]``.
 
     Raises:
-        ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim`` or together with ``linear_skip``.
+        ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim``.
 
     Examples:
         >>> import torch
@@ -61,8 +61,6 @@ class KoopmanLifting(TensorDictModuleBase):
         super().__init__()
         if include_state and latent_dim < state_dim:
             raise ValueError(f"include_state needs latent_dim >= state_dim, got {latent_dim} < {state_dim}")
-        if linear_skip and include_state:
-            raise ValueError("linear_skip is for a learned lifting, not include_state")
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.state_dim, self.latent_dim, self.include_state = state_dim, latent_dim, include_state
         learned = latent_dim - state_dim if include_state else latent_dim

@@ -48,8 +48,6 @@ class WienerSmoother(nn.Module):
 
         The noise is that of ``consecutive`` frames one control step apart, ``[N, T, dim]`` with ``T >= 5``.
         """
-        if windows.shape[-2:] != (self.num_frames, self.dim):
-            raise ValueError(f"windows must be [N, {self.num_frames}, {self.dim}], got {list(windows.shape)}")
         centred = (windows - windows.mean(-2, keepdim=True)).flatten(-2).double()
         total = centred.mT @ centred / len(centred)
         frames = torch.eye(self.num_frames, dtype=torch.float64, device=windows.device) - 1 / self.num_frames

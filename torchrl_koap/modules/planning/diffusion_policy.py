@@ -37,9 +37,6 @@ class DiffusionPolicy(ConditionalSampler):
         relative (bool): the condition holds displacements from the present state. Defaults to False.
         out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]``. Defaults to ``["action_chunk"]``.
 
-    Raises:
-        ValueError: for an ``action_dim`` below 1.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -60,8 +57,6 @@ class DiffusionPolicy(ConditionalSampler):
         out_keys: Sequence[NestedKey] = (ACTION_CHUNK,),
         **options: Any,
     ):
-        if action_dim < 1:
-            raise ValueError(f"action_dim must be at least 1, got {action_dim}")
         options |= {"relative": relative, "out_keys": out_keys}
         super().__init__(denoiser, state_dim=state_dim, width=action_dim, **options)
         self.action_dim = action_dim
