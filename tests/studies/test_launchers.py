@@ -149,18 +149,6 @@ def test_machines_that_there_are_not_are_refused(options, message):
         Machines(**options)
 
 
-def test_jobs_that_cannot_be_ordered_are_refused_before_anything_runs(tmp_path):
-    twice = jobs_of(tmp_path, a=None) * 2
-    for jobs, message in (
-        (jobs_of(tmp_path, a="b"), "needs .*b, which is no job before it"),
-        (jobs_of(tmp_path, a="a"), "needs .*a, which is no job before it"),
-        (twice, "two jobs have the folder"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            launch(act, jobs, Machines())
-    assert not list(tmp_path.iterdir())
-
-
 def test_ray_that_is_not_installed_names_the_extra(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl_koap\[ray\]'"):

@@ -6,7 +6,6 @@ import pytest
 from torchrl_koap.studies.paper import (
     above_the_paper,
     average_over_tasks,
-    draw_average,
     layout_rows,
     paper_cell,
     paper_cells,
@@ -98,5 +97,3 @@ def test_what_is_written(tmp_path):
     assert write_paper_layout(tmp_path, one)["picture"] is None
     no_level = write_paper_layout(tmp_path / "none", [cell("sorting", "koap", 0.03, 30)])
     assert no_level["rows"] == [] and not (tmp_path / "none").exists()
-    with pytest.raises(ValueError, match="nothing to average"):
-        draw_average(paper_entries([cell("sorting", "koap", 0.01)]), tmp_path / "a.png")

@@ -9,7 +9,7 @@ from html_pages import Page
 from PIL import Image
 from tiny_runs import read_csv
 
-from torchrl_koap.studies.plots import method_styles, plot_measure
+from torchrl_koap.studies.plots import method_styles
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.table import summarise
 
@@ -155,14 +155,3 @@ def test_methods_differ_without_colour():
     styles = list(method_styles([f"method {number}" for number in range(27)]).values())
     assert len({str(style) for style in styles}) == 27 and len({style["marker"] for style in styles[:12]}) == 12
     assert len({(style["color"], str(style["linestyle"])) for style in styles[:12]}) == 12
-
-
-def test_pictures_of_nothing_are_refused(tmp_path):
-    rows = make_cells(seeds=1)
-    for row in rows:
-        spoil(row, "failed")
-        row["mode_entropy"] = None
-    for measure in ("success", "action_error", "mode_entropy"):
-        with pytest.raises(ValueError, match=f"there is no {measure} to draw: no cell is done"):
-            plot_measure(summarise(rows), tmp_path / "a.png", measure)
-    assert not list(tmp_path.iterdir())

@@ -25,7 +25,7 @@ from torchrl_koap.commands.shell import (
     ending_like_ctrl_c,
     one_line_warnings,
     open_closed_streams,
-    wide_enough,
+    widen_terminal,
     written_output,
 )
 
@@ -41,10 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     It is 1 for a job that could not be done, or not all of it, and 128 and the signal's number for one that was
     interrupted (130 after Ctrl-C), each with one line that says why. A wrong call leaves with 2. ``KOAP_TRACEBACK=1``
-    shows where an error is from.
-
-    Args:
-        arguments (sequence of str, optional): the words of the command line. Default: those of the process.
+    shows where an error is from. The words are those of the process by default.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     open_closed_streams()
@@ -72,7 +69,8 @@ def _run(arguments: Sequence[str]) -> int:
         return 0
     _check_words(arguments)
     options, subcommands, without_progress_bars = _commands()
-    with written_output(), wide_enough():
+    widen_terminal()
+    with written_output():
         if not arguments or arguments[0] in ("-h", "--help"):
             print(subcommands.overview(), file=sys.stdout if arguments else sys.stderr)
             return 0 if arguments else 2

@@ -77,12 +77,7 @@ def as_typed() -> str:
 
 
 def check_options(options: Any) -> None:
-    """Checks the options of a command, those of its configurations included.
-
-    Raises:
-        ValueError: for numbers that are NaN, infinite or beyond 2^53, and an ``out`` that lies below a file. Infinite
-            limits of commands are right.
-    """
+    """Refuses numbers that are NaN, infinite (but for limits) or beyond 2^53, and an ``out`` that lies below a file."""
     for field in fields(options):
         value, option = getattr(options, field.name), f"--{field.name.replace('_', '-')}"
         if is_dataclass(value):
@@ -107,14 +102,8 @@ def _check_folder(path: Path, option: str) -> None:
 def expand(words: Sequence[str]) -> list[str]:
     """Replaces ``--labels NUMBER`` by the option of its kind, and ``--config FILE`` by the options in the file.
 
-    Raises:
-        FileNotFoundError: if the file is not there.
-        ValueError: if it holds other things than options, or ``--labels`` is no number.
-
-    Examples:
-        >>> from torchrl_koap.commands.options import expand
-        >>> expand(["--steps", "20", "--labels", "0.02"])
-        ['--steps', '20', '--labels.fraction', '0.02']
+    ``--labels 0.02`` becomes ``--labels.fraction 0.02``. A file that is not there or holds other things than options,
+    and ``--labels`` without a number, are refused.
     """
     found: list[str] = []
     from_file: list[str] = []

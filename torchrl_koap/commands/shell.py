@@ -83,20 +83,10 @@ def written_output() -> Iterator[None]:
         raise OSError(f"the output could not be written: {error.strerror or error}") from error
 
 
-@contextlib.contextmanager
-def wide_enough() -> Iterator[None]:
-    """Gives a terminal a few columns at least inside the block."""
-    earlier = os.environ.get("COLUMNS")
-    if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
-        yield
-        return
-    os.environ["COLUMNS"] = str(_LEAST_COLUMNS)
-    try:
-        yield
-    finally:
-        os.environ.pop("COLUMNS")
-        if earlier is not None:
-            os.environ["COLUMNS"] = earlier
+def widen_terminal() -> None:
+    """Gives the terminal a few columns at least."""
+    if shutil.get_terminal_size().columns < _LEAST_COLUMNS:
+        os.environ["COLUMNS"] = str(_LEAST_COLUMNS)
 
 
 @contextlib.contextmanager

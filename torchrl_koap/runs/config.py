@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,10 @@ from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import HISTORY
 
 COLUMNS = ("robot", "all", "related")
+# what a number has to be, in words and as a test
+_POSITIVE, _COUNT, _FROM_0 = ("> 0", lambda v: v > 0), (">= 1", lambda v: v >= 1), (">= 0", lambda v: v >= 0)
+_FRAMES = (f">= 1 and <= {HISTORY}", lambda v: 1 <= v <= HISTORY)
+_SHARE, _PART = ("> 0 and <= 1", lambda v: 0 < v <= 1), (">= 0 and < 1", lambda v: 0 <= v < 1)
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class LabelConfig:
 
     def __post_init__(self):
         self.budget()
-        _check("labels", self, trajectories=(0, 1, False, True))
+        _check("labels", self, trajectories=_SHARE)
 
     def budget(self, seed: int = 0) -> LabelBudget:
         """Makes the budget that draws and hides."""
@@ -83,9 +88,8 @@ class PlannerConfig:
     source: Path | None = None
 
     def __post_init__(self):
-        _check("planner", self, steps=(1, None), width=(1, None), batch_size=(1, None), frames=(1, HISTORY))
-        _check("planner", self, learning_rate=(0, None, False), held_out=(0, 1, True, False))
-        _check("planner", self, octaves=(0, None))
+        _check("planner", self, steps=_COUNT, width=_COUNT, batch_size=_COUNT, frames=_FRAMES)
+        _check("planner", self, learning_rate=_POSITIVE, held_out=_PART, octaves=_FROM_0)
         if self.source is not None:
             object.__setattr__(self, "source", find_run(self.source))
 
@@ -109,7 +113,7 @@ class ControllerConfig:
     columns: str | None = None
 
     def __post_init__(self):
-        _check("controller", self, steps=(0, None))
+        _check("controller", self, steps=_FROM_0)
         if self.columns is not None:
             lookup(COLUMNS, self.columns, "controller.columns")
 
@@ -143,7 +147,7 @@ class RunConfig:
     plugins: Plugins = ()
 
     def __post_init__(self):
-        _check("run", self, seed=(0, None), threads=(1, None))
+        _check("run", self, seed=_FROM_0, threads=_COUNT)
         check_machine(self.threads, self.device)
         lookup(PRECISIONS, self.precision, "precision")
         lookup(LOGGERS, self.logger, "logger")
@@ -187,18 +191,9 @@ class TrainConfig:
         object.__setattr__(self, "out", Path(self.out))  # so that a string will do in Python
 
 
-def _check(section: str, config: object, **ranges: tuple) -> None:
-    """Refuses numbers out of range; a range is least, most (None: any), and whether each of them is allowed itself."""
-    for name, limits in ranges.items():
-        given: list[Any] = [*limits, *(None, True, True)[len(limits) - 1 :]]
-        least, most, from_least, to_most = given
+def _check(section: str, config: object, **wanted: tuple[str, Callable[[float], bool]]) -> None:
+    """Refuses numbers that are not what is wanted; None is left out."""
+    for name, (words, fits) in wanted.items():
         value = getattr(config, name)
-        if value is None:
-            continue
-        fits = (value >= least if from_least else value > least) and (
-            most is None or (value <= most if to_most else value < most)
-        )
-        if not fits or not math.isfinite(value):
-            below = "" if most is None else f" and {'<=' if to_most else '<'} {most}"
-            wanted = f"{'>=' if from_least else '>'} {least}{below}"
-            raise ValueError(f"{section}.{name} must be {wanted}, got {value}")
+        if value is not None and not (math.isfinite(value) and fits(value)):
+            raise ValueError(f"{section}.{name} must be {words}, got {value}")

@@ -23,11 +23,7 @@ _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
 
 
 def read_config(run: RunDirectory) -> TrainConfig:
-    """Reads the options of a run.
-
-    Raises:
-        RunDirectoryError: if ``config.json`` is not there or damaged; the message names file and entry.
-    """
+    """Reads the options of a run; a RunDirectoryError names file and entry that are not there or damaged."""
     content = run.read_json("config.json")
     for field in fields(TrainConfig):
         if field.name not in content:
@@ -44,9 +40,7 @@ def to_json(config: Any) -> dict[str, Any]:
 def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
     """Makes a dataclass, and those that are its sections, of a JSON object; what is left out keeps its default.
 
-    Raises:
-        RunDirectoryError: naming the file and an option that is unknown, in another section, of another type or out of
-            range.
+    A RunDirectoryError names the file and an option that is unknown, of another type or out of range.
     """
     try:
         return dataclass_from_json(kind, content)

@@ -20,11 +20,7 @@ _BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat1
 def find_precision(precision: str, device: str | torch.device = "cpu") -> str:
     """Says what "auto" means on a device: "bfloat16" where it has units for it, else "float32".
 
-    Raises:
-        ValueError: for another precision.
-
-    Warns:
-        UserWarning: if bfloat16 was asked for by name where it is emulated.
+    Another precision is refused; a warning says where bfloat16, asked for by name, is emulated.
     """
     lookup(PRECISIONS, precision, "precision")
     if precision == "float32":
@@ -54,11 +50,7 @@ def default_threads() -> int:
 
 
 def set_up_torch(threads: int | None, device: str) -> None:
-    """Sets the number of threads, None leaves it as it is, and checks that the device is there.
-
-    Raises:
-        ValueError: if the number is out of range, or this machine has no such device.
-    """
+    """Sets the number of threads, None leaves it as it is; refuses a device that this machine does not have."""
     check_machine(threads, device)
     kind, _, index = device.partition(":")
     if kind == "cuda" and not torch.cuda.is_available():

@@ -112,11 +112,7 @@ def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
 
 
 def check_logger(name: str) -> None:
-    """Refuses a logger that is unknown or whose package is not installed, before any work is done.
-
-    Raises:
-        ValueError: naming the nearest of ``LOGGERS``, or the extra to install.
-    """
+    """Refuses a logger that is unknown or not installed, and names the nearest or the extra to install."""
     lookup(LOGGERS, name, "logger")
     if name != "csv" and importlib.util.find_spec(name) is None:
         raise ValueError(f"--logger {name} needs an extra: pip install 'torchrl_koap[{name}]'")

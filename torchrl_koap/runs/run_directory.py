@@ -9,6 +9,7 @@ import json
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,7 @@ class RunDirectory:
 
     ``config.json`` (all options), ``metrics.csv`` (one row per logged step, columns as they come), ``summary.json``,
     ``eval.json``, weights and pictures. JSON is written aside and renamed, so that a full disk leaves the earlier file.
-
-    Args:
-        path (str or Path): the folder; it need not exist yet.
+    The folder need not exist yet.
     """
 
     def __init__(self, path: str | Path):
@@ -44,11 +43,7 @@ class RunDirectory:
             aside.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
     def read_json(self, name: str) -> dict[str, Any]:
-        """Reads a JSON file.
-
-        Raises:
-            RunDirectoryError: if it is not there or damaged; the message names it.
-        """
+        """Reads a JSON file; a RunDirectoryError names one that is not there or damaged."""
         path = self.path / name
         if not path.exists():
             raise RunDirectoryError(f"{path} is missing: is {self.path} the folder of a finished `koap train`?")
@@ -89,10 +84,8 @@ class RunDirectory:
     def read_metrics(self) -> list[dict[str, str]]:
         """All complete rows of ``metrics.csv``; none if there is no such file.
 
-        A row that was cut off when a process was killed or the disk was full is left out.
-
-        Raises:
-            RunDirectoryError: if a complete row is damaged; the message names the file and the row.
+        A row that was cut off when a process was killed or the disk was full is left out. A RunDirectoryError names a
+        complete row that is damaged.
         """
         path = self.path / "metrics.csv"
         if not path.exists():
@@ -117,29 +110,22 @@ class RunDirectory:
 
     def rewind_metrics(self, phase: str, step: int) -> None:
         """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there."""
-        if not (self.path / "metrics.csv").exists():
-            return
-        kept = []
-        for row in self.read_metrics():
-            if row["phase"] == phase and int(row["step"]) > step:
-                break
-            kept.append(row)
-        self._write_metrics(self._columns(), kept)
+        kept = takewhile(lambda row: row["phase"] != phase or int(row["step"]) <= step, self.read_metrics())
+        if (self.path / "metrics.csv").exists():
+            self._write_metrics(self._columns(), list(kept))
 
     @contextlib.contextmanager
     def locked(self, what: str, name: str = ".lock") -> Iterator[None]:
         """Keeps others out of the folder as long as the block lasts; ``what`` works there, such as ``"koap train"``.
 
-        What a process that was killed had half written of a checkpoint is taken away first.
-
-        Raises:
-            RunDirectoryError: if somebody works in the folder already.
+        What a process that was killed had half written of a checkpoint is taken away first. It is a RunDirectoryError
+        if somebody works in the folder already.
         """
         with contextlib.ExitStack() as held:
             try:
                 held.enter_context(one_at_a_time(self.path / name, busy=f"another `{what}` is working in {self.path}"))
             except LockedError as error:
-                raise RunDirectoryError(str(error)) from None
+                raise RunDirectoryError(error) from None
             for rest in (self.path / "checkpoints").glob(".*.tmp"):  # nobody but the holder of the lock writes there
                 rest.unlink(missing_ok=True)
             yield
@@ -193,11 +179,7 @@ def find_run(name: str | Path) -> Path:
 
 
 def copy_run(source: str | Path, target: str | Path) -> Path:
-    """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run.
-
-    Raises:
-        RunDirectoryError: if the source is no run, or the target holds another one.
-    """
+    """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run."""
     source, target = Path(source), Path(target)
     config = RunDirectory(source).read_json("config.json")
     if (target / "config.json").exists() and RunDirectory(target).read_json("config.json") != config:
@@ -214,9 +196,7 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
 def writable_folder(run: str | Path, out: str | Path | None = None) -> Path:
     """The folder that results about a run are written to: its own, or ``out``, to which what it is made of is copied.
 
-    Raises:
-        ValueError: if a pretrained run comes without another folder.
-        RunDirectoryError: as :func:`copy_run` and :func:`find_run`.
+    A pretrained run without another folder is refused.
     """
     source = find_run(run)
     if out is not None:

@@ -34,11 +34,8 @@ def save_weights(path: str | Path, module: nn.Module, about: Mapping[str, Any]) 
 def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any]) -> dict[str, Any]:
     """Loads weights into a module of the same architecture; returns the facts in the header.
 
-    ``expected`` are facts that it must hold: the task, and the options that build the module.
-
-    Raises:
-        CheckpointError: if the file is missing or damaged, belongs to another task or other options, lacks entries (a
-            normaliser's statistics, say) or has entries of other shapes.
+    ``expected`` are facts that it must hold: the task, and the options that build the module. A CheckpointError says
+    what is missing, damaged, or of another task, other options or other shapes.
     """
     tensors, about = load_tensors(path)
     for name, value in expected.items():
@@ -91,11 +88,7 @@ def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping
 
 
 def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Reads what :func:`save_tensors` wrote.
-
-    Raises:
-        CheckpointError: if the file is missing or damaged.
-    """
+    """Reads what :func:`save_tensors` wrote; a CheckpointError names a file that is missing or damaged."""
     if not Path(path).is_file():
         raise CheckpointError(f"{path} is missing")
     try:

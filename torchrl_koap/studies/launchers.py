@@ -46,18 +46,10 @@ if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # ho
 
 @dataclass(frozen=True)
 class Job:
-    """A folder that says what is to be done; what is printed is appended to its ``log.txt``.
-
-    ``needs`` is the folder of the job that must have succeeded before.
-    """
+    """A folder that says what is to be done; what is printed is appended to its ``log.txt``."""
 
     folder: Path
-    needs: Path | None = None
-
-    @property
-    def log(self) -> Path:
-        """Where what is printed goes."""
-        return self.folder / "log.txt"
+    needs: Path | None = None  # folder of the job that must have succeeded before
 
 
 @dataclass(frozen=True)
@@ -93,17 +85,9 @@ def launch(
 ) -> Generator[tuple[Job, str | None], None, None]:
     """Calls a function in every job's folder, each in a process of its own; yields jobs as they end, and why they fail.
 
-    The function is one of a module, of a folder. Jobs that come first are started first; one whose need failed is not
-    run and fails too. Two jobs of one folder, or a need that is no job before, are refused. Closing the iterator stops
-    what is running.
+    The function is one of a module, of a folder. Jobs that come first are started first; one whose need, a job before
+    it, failed is not run and fails too. Closing the iterator stops what is running.
     """
-    known: set[Path] = set()
-    for job in jobs:
-        if job.folder in known:
-            raise ValueError(f"two jobs have the folder {job.folder}")
-        if job.needs is not None and job.needs not in known:
-            raise ValueError(f"job {job.folder} needs {job.needs}, which is no job before it")
-        known.add(job.folder)
     # a job of a cluster may not use all cores of its machine
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if machines.launcher == "ray":
@@ -138,10 +122,10 @@ def _schedule(waiting: list[Job], pool: Any) -> Generator[tuple[Job, str | None]
         pool.stop()
 
 
-def run_logged(function: Callable[[str], None], folder: str, log: str) -> str | None:
-    """Calls a function of a folder with everything it prints going to a file; returns why it failed, if it did."""
+def run_logged(function: Callable[[str], None], folder: str) -> str | None:
+    """Calls a function of a folder with everything it prints going to its log; returns why it failed, if it did."""
     try:
-        with _open_log(log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+        with _open_log(folder) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
             try:
                 function(folder)
             except Exception:
@@ -152,9 +136,9 @@ def run_logged(function: Callable[[str], None], folder: str, log: str) -> str | 
     return None
 
 
-def _open_log(path: str) -> TextIO:
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    return Path(path).open("a", buffering=1)  # by lines: a job that is killed has said what it did until then
+def _open_log(folder: str) -> TextIO:
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    return Path(folder, "log.txt").open("a", buffering=1)  # by lines: a job that is killed has said what it did
 
 
 def _in_words(error: Exception) -> str:
@@ -190,8 +174,7 @@ class LocalPool:
     def start(self, job: Job) -> None:
         """Starts a job."""
         reader, writer = self.context.Pipe(duplex=False)
-        arguments = (writer, self.function, str(job.folder), str(job.log))
-        process = self.context.Process(target=_child, args=arguments)
+        process = self.context.Process(target=_child, args=(writer, self.function, str(job.folder)))
         process.start()
         writer.close()
         self.running[process.sentinel] = (job, process, reader)
@@ -212,9 +195,10 @@ class LocalPool:
 
     def stop(self) -> None:
         """Kills what is running."""
-        for _, process, _ in self.running.values():
+        processes = [process for _, process, _ in self.running.values()]
+        for process in processes:
             process.kill()
-        for _, process, _ in self.running.values():
+        for process in processes:
             process.join()
         self.running.clear()
 
@@ -226,14 +210,14 @@ def _death(exit_code: int) -> str:
     return f"its process ended without a word ({what})"
 
 
-def _child(writer: Any, function: Callable[[str], None], folder: str, log: str) -> None:
+def _child(writer: Any, function: Callable[[str], None], folder: str) -> None:
     # ends with a killed parent: else the next `koap curve` in the folder would find it still writing
     threading.Thread(target=_die_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    with contextlib.suppress(OSError), _open_log(log) as file:  # what is not Python prints past sys.stdout
+    with contextlib.suppress(OSError), _open_log(folder) as file:  # what is not Python prints past sys.stdout
         for descriptor in (1, 2):
             os.dup2(file.fileno(), descriptor)
-    writer.send(run_logged(function, folder, log))
+    writer.send(run_logged(function, folder))
     writer.close()
 
 
@@ -264,8 +248,7 @@ class RayPool:
 
     def start(self, job: Job) -> None:
         """Starts a job."""
-        folder, log = str(job.folder.absolute()), str(job.log.absolute())
-        self.running[self.task.remote(self.function, folder, log)] = job
+        self.running[self.task.remote(self.function, str(job.folder.absolute()))] = job
 
     def finished(self) -> list[tuple[Job, str | None]]:
         """Waits for a job to end; returns it with the reason if it failed."""

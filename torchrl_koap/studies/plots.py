@@ -80,14 +80,11 @@ def plot_measure(
     The measure is one of :data:`MEASURES`, in a ``unit``; the horizontal axes are of :data:`AXES`, labels counted in
     ``label_unit``. Along ``"demonstrations"`` there is a line per method and share of labels that was run with several
     of them. The ``paper`` has by method shares of the labels and successes: hollow and dashed, along ``"labels"``
-    alone. ``methods`` are all of them in the order that gives the colours. Nothing to draw is an error.
+    alone. ``methods`` are all of them in the order that gives the colours.
     """
     head, title, factor = MEASURES[measure]
     panels = {name: _lines(summaries, name, measure, factor, methods) for name in by}
     panels = {name: lines for name, lines in panels.items() if lines}
-    error = measure.endswith("error")
-    if not panels or (error and min(_ends([line for lines in panels.values() for line in lines])) <= 0):
-        raise ValueError(f"there is no {measure} to draw: no cell is done" + (" with one above 0" if error else ""))
     for line in panels.get("labels", ()) if paper else ():
         line.paper = [(share, 100 * success) for share, success in paper.get(line.name, ())]
     if paper:
@@ -102,7 +99,7 @@ def plot_measure(
         if place == 0:
             axes.set_ylabel(f"{head} ({unit})" if unit else head)
         set_title(axes, title if place == 0 else "")
-        if error:
+        if measure.endswith("error"):
             _scale_errors(axes, lines)
             if measure == "relative_action_error":  # of a controller that always gives the mean action
                 axes.axhline(1, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
@@ -122,10 +119,7 @@ def plot_average(
     """Draws success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
 
     By method ``averages`` has level, mean and the ends of its interval, the ``paper`` level and mean, all in 0..1.
-    Nothing to draw is an error.
     """
-    if not averages:
-        raise ValueError("there is nothing to average: no method is done at a level in every task")
     lines, styles = [], method_styles(list(averages))
     for method, points in averages.items():
         shown = [(level, *(100 * value for value in values)) for level, *values in points]
