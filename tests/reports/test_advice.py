@@ -21,7 +21,7 @@ def inspected(*shares):
 
 
 def found(**numbers):
-    return advice(RunFacts(Path("run"), **numbers))
+    return list(advice(RunFacts(Path("run"), **numbers)))
 
 
 def rates(success, **more):

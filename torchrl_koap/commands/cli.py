@@ -159,7 +159,6 @@ def _one_line(error: BaseException) -> str:
 
 
 def _complain(message: str) -> None:
-    """Writes one line to stderr, if that can be written to."""
     with contextlib.suppress(OSError, ValueError):  # a full device, a closed one
         sys.stderr.write(f"koap: {message}\n")
         sys.stderr.flush()

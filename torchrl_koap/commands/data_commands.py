@@ -172,7 +172,6 @@ class Convert(Command):
         return self._bring_in() if self.to is None else self._take_out(self.to)
 
     def _bring_in(self) -> dict[str, Any]:
-        """Recordings become a data set of this library."""
         if stored_folder(self.source) is not None:
             again = " (and convert that with the roles of its columns)" if self.resample is not None else ""
             raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
@@ -201,7 +200,6 @@ class Convert(Command):
         }
 
     def _take_out(self, kind: str) -> dict[str, Any]:
-        """Recordings become a folder in another format."""
         lookup([name for name, form in FORMATS.items() if form.write is not None], kind, "format")
         reading = self._reading()
         for name in self._given([name for name in _DESCRIBING if name not in reading]):
@@ -284,7 +282,6 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
 
 
 def _numbered(found: list[str], data: TensorDictBase) -> dict[str, str]:
-    """What is unlikely in data, numbered."""
     if len(data["episode"].unique()) == 1:
         said = "there is one trajectory alone: if it holds several episodes, say where they end"
         found = [f"{said} (a column 'episode_index' or 'timeouts')", *found]

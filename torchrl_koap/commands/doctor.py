@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import os
 import platform
@@ -61,31 +60,26 @@ def machine_facts() -> dict[str, str]:
 
 def check_run(folder: Path) -> dict[str, str]:
     """Reads every file of a run that a command would read, checksums included; returns what was found by file."""
-    run, problems, found = RunDirectory(folder), [], {}
-    for name in ("config.json", "summary.json", *_LATER):
-        if name in _LATER and not (folder / name).exists():
-            continue
-        problem = _problem(functools.partial(run.read_json, name))
-        found[name] = "readable"
-        problems += problem
+    run, problems = RunDirectory(folder), dict[str, None]()  # each is told once
+
+    def look(read: Callable, *what: Any) -> None:
+        try:
+            read(*what)
+        except (ValueError, OSError, RuntimeError) as error:
+            problems[str(error)] = None
+
+    files = ["config.json", "summary.json", *(name for name in _LATER if (folder / name).exists())]
+    for name in files:
+        look(run.read_json, name)
     if not problems:  # its networks are made of what config.json says
-        problems += _problem(lambda: Trained.load(folder))
-    problems += _problem(run.read_metrics)
+        look(Trained.load, folder)
+    look(run.read_metrics)
     for path in sorted([*folder.glob("*.safetensors"), *folder.glob("checkpoints/*.safetensors")]):
-        problems += _problem(functools.partial(load_tensors, path))
-        found[str(path.relative_to(folder))] = "readable"
+        look(load_tensors, path)
+        files.append(str(path.relative_to(folder)))
     if problems:
-        said = "; ".join(dict.fromkeys(problems))
-        raise RunDirectoryError(f"{folder}: {len(dict.fromkeys(problems))} problem(s): {said}")
-    return found | {"result": "no problem found"}
-
-
-def _problem(look: Callable[[], Any]) -> list[str]:
-    try:
-        look()
-    except (ValueError, OSError, RuntimeError) as error:
-        return [str(error)]
-    return []
+        raise RunDirectoryError(f"{folder}: {len(problems)} problem(s): {'; '.join(problems)}")
+    return dict.fromkeys(files, "readable") | {"result": "no problem found"}
 
 
 def _rendering() -> dict[str, str]:

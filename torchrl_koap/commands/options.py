@@ -132,7 +132,6 @@ def _kind_of(labels: str) -> str:
 
 
 def _words_of(path: Path, without: set[str]) -> list[str]:
-    """The options in a file as words of a command line."""
     options = {name: value for name, value in read_json(path).items() if name not in FACTS and name not in without}
     from_json(TrainConfig, {"out": ""} | options, path)
     return list(_flat(options))

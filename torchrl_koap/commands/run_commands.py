@@ -11,15 +11,7 @@ from typing import Any
 import tyro
 
 from torchrl_koap.commands.options import Command, Options, as_typed
-from torchrl_koap.evaluation import (
-    EvalConfig,
-    InspectConfig,
-    SuggestConfig,
-    evaluate,
-    inspect,
-    load_policy,
-    suggest,
-)
+from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, load_policy, suggest
 from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.export import SUFFIXES, export_policy, exportable

@@ -19,7 +19,6 @@ from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
-from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.progress import count_up_to, progress_bar
@@ -100,8 +99,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.env is None:
         result = task_scores(task, result, episodes, where.numbers)
     rows = result.pop("episode")
-    learned = config.execution if policy.execution.strategy != "oracle" else ExecutionConfig()
-    timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
+    timed = trained.policy().to(config.device) if policy.execution.strategy == "oracle" else policy
     result |= measure_latency(timed, task.observation_dim)
     result |= errors | limited_commands(policy) | {"execution": to_json(policy.execution), "episode": rows}
     result |= where.facts

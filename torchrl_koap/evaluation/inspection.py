@@ -148,7 +148,6 @@ def _follow(
 
 
 def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:
-    """What :func:`analyse_latent` finds, or a note for methods without latent actions."""
     controller, task = trained.controller.cpu(), trained.task
     if not isinstance(controller, KoopmanInverseDynamics):
         return {"note": f"method {trained.config.method!r} has no latent actions to look into"}

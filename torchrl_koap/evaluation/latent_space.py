@@ -152,10 +152,7 @@ def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[f
 
 
 def analyse_latent(
-    controller: KoopmanInverseDynamics,
-    data: TensorDictBase,
-    labelled: Tensor,
-    parts: Mapping[str, Sequence[int]],
+    controller: KoopmanInverseDynamics, data: TensorDictBase, labelled: Tensor, parts: Mapping[str, Sequence[int]]
 ) -> dict[str, Any]:
     """Measures eigenvalues, multi-step errors (of fewer steps where trajectories are short) and what a probe explains.
 

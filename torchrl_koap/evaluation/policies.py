@@ -128,10 +128,9 @@ class OracleFollower(Follower):
         action = rest[:, 0].double().cpu().numpy()
         action[:, self._changes] = 0.0
         rows = np.flatnonzero(~self._env.over)
-        if not len(rows):
-            return torch.as_tensor(action, dtype=plan.dtype, device=plan.device).unsqueeze(1)
-        wanted = bent[rows, 1 : LOOK_AHEAD + 1][..., self._moved].double().cpu().numpy()
-        action[np.ix_(rows, self._changes)] = self._last[rows] = self._solve(rows, action[rows], wanted)
+        if len(rows):
+            wanted = bent[rows, 1 : LOOK_AHEAD + 1][..., self._moved].double().cpu().numpy()
+            action[np.ix_(rows, self._changes)] = self._last[rows] = self._solve(rows, action[rows], wanted)
         return torch.as_tensor(action, dtype=plan.dtype, device=plan.device).unsqueeze(1)
 
     def _solve(self, rows: np.ndarray, held: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -69,7 +69,6 @@ def score(
 def _mode_scores(
     rows: Sequence[dict[str, Any]], num_modes: int, contexts: int | None, unsolved: str
 ) -> dict[str, float | None]:
-    """Entropies of the modes of successful episodes, over all of them and per context."""
     won = [row for row in rows if row["outcome"] == "success" and row["mode"] >= 0]
     modes = [row["mode"] for row in won]
     found: dict[str, float | None] = {"mode_entropy": None}

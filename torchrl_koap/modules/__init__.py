@@ -1,10 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
-from torchrl_koap.modules.baselines.latents import (
-    QuantizedInverseDynamics,
-    VariationalInverseDynamics,
-)
+from torchrl_koap.modules.baselines.latents import QuantizedInverseDynamics, VariationalInverseDynamics
 from torchrl_koap.modules.baselines.networks import NonlinearInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.baselines.regression import LinearInverseDynamics, PrincipalInverseDynamics
 from torchrl_koap.modules.execution.agent import Agent

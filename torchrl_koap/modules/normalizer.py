@@ -14,18 +14,6 @@ def _minmax(values: Tensor) -> tuple[Tensor, Tensor]:
     return (high + low) / 2, (high - low) / 2
 
 
-def _standard(values: Tensor) -> tuple[Tensor, Tensor]:
-    return values.mean(0), values.std(0, correction=0)
-
-
-def _shared(values: Tensor) -> tuple[Tensor, Tensor]:
-    return values.mean(0), values.std(0, correction=0).amax().expand(values.shape[-1]).clone()
-
-
-def _rms(values: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.zeros_like(values[0]), values.square().mean(0).sqrt()
-
-
 def _moving(values: Tensor) -> tuple[Tensor, Tensor]:
     rest = values[:: -(-len(values) // 10_000)].median(0).values  # the median of all takes seconds
     apart = (values - rest).abs()
@@ -33,7 +21,13 @@ def _moving(values: Tensor) -> tuple[Tensor, Tensor]:
     return rest, (apart.square() * moving).sum(0).div(moving.sum(0).clamp(min=1)).sqrt()
 
 
-MODES = {"minmax": _minmax, "standard": _standard, "shared": _shared, "rms": _rms, "moving": _moving}
+MODES = {
+    "minmax": _minmax,
+    "standard": lambda x: (x.mean(0), x.std(0, correction=0)),
+    "shared": lambda x: (x.mean(0), x.std(0, correction=0).amax().expand(x.shape[-1]).clone()),
+    "rms": lambda x: (torch.zeros_like(x[0]), x.square().mean(0).sqrt()),
+    "moving": _moving,
+}
 
 
 class Normalizer(nn.Module):

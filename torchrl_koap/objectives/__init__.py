@@ -3,12 +3,7 @@
 
 from torchrl_koap.objectives.baselines import ActionLoss, QuantizedDynamicsLoss, VariationalLoss
 from torchrl_koap.objectives.denoising import DiffusionPolicyLoss, PlannerLoss
-from torchrl_koap.objectives.koap import (
-    KOAPLoss,
-    KoopmanDynamicsLoss,
-    KoopmanReconstructionLoss,
-    LatentActionLoss,
-)
+from torchrl_koap.objectives.koap import KOAPLoss, KoopmanDynamicsLoss, KoopmanReconstructionLoss, LatentActionLoss
 
 __all__ = [
     "ActionLoss",

@@ -60,7 +60,6 @@ class NetworkLoss(LossModule):
         """There is no value estimator."""
 
     def _read(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        """Reads the entry of a name of ``set_keys``."""
         return read_entry(self, tensordict, getattr(self.tensor_keys, name), f"set_keys({name}=...)")
 
     def _read_mask(self, tensordict: TensorDictBase, name: str, state: Tensor) -> Tensor:

@@ -29,12 +29,8 @@ class Advice:
     command: str = ""
 
 
-def advice(run: RunFacts) -> list[Advice]:
-    """Returns everything that there is to say about a run, most telling first."""
-    return list(_found(run))
-
-
-def _found(run: RunFacts) -> Iterator[Advice]:
+def advice(run: RunFacts) -> Iterator[Advice]:
+    """Yields everything that there is to say about a run, most telling first."""
     success, policy = run.success(), number(run.summary.get("planner_parameters")) == 0  # a policy has no planner
     planner, controller, both = (run.experiment(name) for name in EXPERIMENTS)
     method, fails = run.config.get("method"), success is not None and success < GOOD

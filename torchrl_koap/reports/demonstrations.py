@@ -71,7 +71,6 @@ def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Fig
 
 
 def _draw_objects(axes: Axes, paths: list[np.ndarray], task: Task | None) -> None:
-    """The bodies that were moved, with a legend."""
     draw_bodies(draw_scene(axes, task), paths, task, [True] * len(paths))
     axes.label_outer()
     handles = body_handles([body for body in bodies_of(task, paths[0].shape[1]) if not body.still], [True])

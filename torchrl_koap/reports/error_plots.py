@@ -267,5 +267,4 @@ def _draw_bars(axes: Axes, rows: Sequence[Mapping[str, Any]], unit: str) -> None
 
 
 def _list_names(names: Sequence[str]) -> str:
-    """Names of columns in a title, the middle of many left out."""
     return ", ".join(names) if len(names) <= 3 else f"{names[0]} ... {names[-1]} ({len(names)} columns)"

@@ -105,7 +105,6 @@ def _seconds(run: RunFacts, part: str) -> str:
 
 
 def _plan_errors(run: RunFacts) -> list[Row]:
-    """Errors of plans on recordings that the planner has not seen, a row per unit."""
     plan, found = run.evaluation.get("plan_errors", {}), []
     for row in plan.get("unit", ()):
         shown, factor = thousandths(row["unit"])
@@ -117,7 +116,6 @@ def _plan_errors(run: RunFacts) -> list[Row]:
 
 
 def _action_errors(run: RunFacts) -> list[Row]:
-    """Errors of actions on labels that the decoder was not fitted on, a row per unit."""
     split, found = run.evaluation.get("action_errors_on"), []
     errors = run.action_errors[split] if split else {}
     for row in errors.get("unit", ()):
@@ -142,7 +140,6 @@ def _columns(row: Mapping[str, Any]) -> str:
 
 
 def _loop(run: RunFacts) -> Row | None:
-    """How a policy acts on a linear model of the robot."""
     found = mapping(run.evaluation.get("loop"))
     if not found:
         return None
@@ -159,7 +156,6 @@ def _loop(run: RunFacts) -> Row | None:
 
 
 def _rates(run: RunFacts) -> list[Row]:
-    """Shares of the rollouts: success, and those that the task's own score adds."""
     contexts, found = run.evaluated("contexts"), []
     for name, values in run.rates.items():
         rate, low, high, total = (number(values.get(key)) for key in ("rate", "low", "high", "episodes"))
@@ -177,7 +173,6 @@ def _rates(run: RunFacts) -> list[Row]:
 
 
 def _entropy(run: RunFacts) -> Row | None:
-    """Entropy of the modes, of tasks that can be done in several ways."""
     modes = run.modes.number
     name = next((name for name in _ENTROPIES if run.evaluated(name) is not None), None)
     if name is None or modes < 2:
@@ -195,7 +190,6 @@ def _entropy(run: RunFacts) -> Row | None:
 
 
 def _environment(run: RunFacts) -> Row | None:
-    """The environment of Gymnasium, its step limit, and what counted as success there."""
     made = run.evaluation
     if not made.get("env"):
         return None

@@ -61,7 +61,7 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
             if (shown := {key: value for key, value in source.items() if key not in elsewhere})
         ],
         episodes=evaluation.get("episode") or evaluation.get("trajectory"),
-        again=_again(run),
+        again=[run.config["command"]] * _given(run.config, "command") + [_eval_command(run)] * bool(evaluation),
         configured=bool(config),
         has_command=_given(config, "command"),
         versions=config.get("versions"),
@@ -96,12 +96,6 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
         elif item.empty:
             figures.append(figure | {"empty": item.empty})
     return figures, missing
-
-
-def _again(run: RunFacts) -> list[str]:
-    """Command lines that train and evaluate the run again."""
-    trained = [str(run.config["command"])] if _given(run.config, "command") else []
-    return trained + ([_eval_command(run)] if run.evaluation else [])
 
 
 def _eval_command(run: RunFacts) -> str:

@@ -147,7 +147,7 @@ class RunConfig:
     plugins: Plugins = ()
 
     def __post_init__(self):
-        _check("run", self, seed=_FROM_0, threads=_COUNT)
+        _check("run", self, seed=_FROM_0)
         check_machine(self.threads, self.device)
         lookup(PRECISIONS, self.precision, "precision")
         lookup(LOGGERS, self.logger, "logger")

@@ -29,10 +29,8 @@ def find_precision(precision: str, device: str | torch.device = "cpu") -> str:
     if precision == "auto":
         return "bfloat16" if quick else "float32"
     if not quick:
-        told = (
-            f"precision 'bfloat16': {torch.device(device).type} has no units for it and emulates it, many times slower"
-        )
-        warnings.warn(f"{told} than 'float32'; 'auto' takes what is quick on the machine", stacklevel=2)
+        told = f"precision 'bfloat16': {torch.device(device).type} has no units for it and emulates it"
+        warnings.warn(f"{told}, many times slower than 'float32'; 'auto' takes what is quick", stacklevel=2)
     return precision
 
 
@@ -63,14 +61,9 @@ def set_up_torch(threads: int | None, device: str) -> None:
 
 def check_machine(threads: int | None, device: str) -> None:
     """Refuses a number of threads and a name of a device that no machine has."""
-    if threads is not None and threads < 1:
-        raise ValueError(f"threads must be >= 1, got {threads}")
-    if threads is not None and threads > _MOST_THREADS:
-        raise ValueError(f"threads must be at most {_MOST_THREADS}, got {threads}")
+    if threads is not None and not 1 <= threads <= _MOST_THREADS:
+        raise ValueError(f"threads must be 1 to {_MOST_THREADS}, got {threads}")
     kind, colon, index = device.partition(":")
-    if kind not in ("cpu", "cuda") or (colon and not index.isdecimal()):
+    numbered = not colon or index.isdecimal()
+    if kind not in ("cpu", "cuda") or not numbered or (kind == "cpu" and int(index or 0) > 0):
         raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
-    if kind == "cpu" and int(index or 0) > 0:
-        raise ValueError(
-            f"device must be 'cpu' or 'cuda', got {device!r}: there is one processor, as far as torch knows"
-        )

@@ -132,7 +132,6 @@ class RunDirectory:
 
 
 def _check_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Refuses a row without phase and step, or with a value that is no number."""
     try:
         if not row["phase"] or int(row["step"]) < 0 or None in row:
             raise ValueError("wanted a phase, a step, and a value or nothing for every other column")

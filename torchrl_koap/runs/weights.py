@@ -16,7 +16,6 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from torchrl_koap.files import replacing_file
-from torchrl_koap.modules import Normalizer
 
 _SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors and of the other facts
 ROW_SCALE = ".row_scale"  # ending of the scales of a matrix that is stored as int8
@@ -65,14 +64,6 @@ def _load(path: str | Path, module: nn.Module, tensors: Mapping[str, Tensor]) ->
     for name, value in module.named_parameters():  # of a buffer that nobody has fitted NaN says just that
         if not value.isfinite().all():
             raise CheckpointError(f"{path} is damaged: {name} is NaN or infinite")
-    for name, part in module.named_modules():
-        if not isinstance(part, Normalizer):
-            continue
-        if not part.offset.isfinite().all() or not part.scale.isfinite().all() or not (part.scale > 0).all():
-            raise CheckpointError(
-                f"{path} is damaged: {name} needs a finite offset and a finite, positive scale,"
-                f" got {part.offset.tolist()} and {part.scale.tolist()}"
-            )
 
 
 def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:

@@ -140,7 +140,6 @@ def cell_row(
 
 
 def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of ``cells.csv`` that training and evaluation of a cell found."""
     labels = summary["labels"]
     common = {
         "labelled_units": labels["selected_units"],

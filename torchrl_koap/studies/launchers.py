@@ -147,19 +147,6 @@ def _in_words(error: Exception) -> str:
     return f"{type(error).__name__}: {lines[0][:_LONGEST]}".removesuffix(": ")
 
 
-@contextlib.contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """What is started inside never sees Ctrl-C, which is this process's to handle, not even while it starts."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
-
-
 class LocalPool:
     """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second."""
 
@@ -167,8 +154,11 @@ class LocalPool:
         self.function, self.workers = function, workers
         self.context = multiprocessing.get_context("forkserver")
         self.context.set_forkserver_preload(["torchrl_koap.studies.launchers", function.__module__])
-        with _without_ctrl_c():
+        earlier = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is this process's to handle
+        try:
             forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
         self.running: dict[Any, tuple[Job, Any, Any]] = {}
 
     def start(self, job: Job) -> None:

@@ -166,14 +166,11 @@ def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outc
                 result = compare(methods[REFERENCE], methods[method], errors=key in offline)
                 known = dict(zip(COMPARISON_COLUMNS, (*key, REFERENCE, method), strict=False))
                 known |= {"n": 0} if result is None else asdict(result)
-                compared.append({name: _unless_nan(known.get(name)) for name in COMPARISON_COLUMNS})
+                values = {name: known.get(name) for name in COMPARISON_COLUMNS}
+                compared.append({name: None if value != value else value for name, value in values.items()})  # NaN
     for row, adjusted in zip(compared, holm([row["p"] for row in compared]), strict=True):
         row["p_holm"] = adjusted
     order = list(dict.fromkeys(row["method"] for row in rows))
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     compared.sort(key=lambda row: (tasks.index(row["task"]), *list(row.values())[1:4], order.index(row["method"])))
     return compared
-
-
-def _unless_nan(value: Any) -> Any:
-    return None if value != value else value

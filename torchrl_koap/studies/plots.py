@@ -161,7 +161,6 @@ def _draw_lines(
 
 
 def _name_lines(figure: Figure, lines: Sequence[_Line]) -> None:
-    """Names every line once, to the right of all panels."""
     named = {line.name: Line2D([], [], **line.style, markersize=5, markeredgewidth=0) for line in lines}
     figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False, fontsize=8.5)
 
@@ -188,10 +187,6 @@ def _lines(
     return several_places if by == "demonstrations" and several_places else list(lines.values())
 
 
-def _ends(lines: Sequence[_Line]) -> list[float]:
-    return [end for line in lines for *_, low, high in line.points for end in (low, high)]
-
-
 def _scale_shares(axes: Axes, top: int) -> None:
     axes.set_ylim(-0.03 * top, 1.03 * top)
     axes.set_yticks([top * part / 5 for part in range(6)])
@@ -200,7 +195,8 @@ def _scale_shares(axes: Axes, top: int) -> None:
 
 def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
     axes.set_yscale("log")
-    low, high = min(_ends(lines)), max(_ends(lines))
+    ends = [end for line in lines for *_, low, high in line.points for end in (low, high)]
+    low, high = min(ends), max(ends)
     wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend
     axes.set_ylim(low / wide, high * wide)
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low * wide**2 < 100 else (1,)))

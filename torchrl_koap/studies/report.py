@@ -13,15 +13,7 @@ from torchrl_koap.reports.html import write_page
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, REFERENCE, Outcome, compare_cells
 from torchrl_koap.studies.paper import paper_points, write_paper_layout
 from torchrl_koap.studies.plots import plot_measure
-from torchrl_koap.studies.table import (
-    Summary,
-    markdown_table,
-    not_done,
-    percent,
-    summarise,
-    table_rows,
-    write_csv,
-)
+from torchrl_koap.studies.table import Summary, markdown_table, not_done, percent, summarise, table_rows, write_csv
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training.methods import METHODS

@@ -22,7 +22,7 @@ from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result
 from torchrl_koap.studies.launchers import Job, Machines, launch
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
-from torchrl_koap.studies.table import CELL_COLUMNS, write_csv
+from torchrl_koap.studies.table import CELL_COLUMNS, STATUSES, write_csv
 from torchrl_koap.tasks import Task, get_task
 
 _FILE = "study.json"
@@ -84,10 +84,10 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         table = _Table(study, [*cells, *earlier])
         _work(study, cells, table, machines or Machines())
         table.write()
-        report = _report(whole, table)
-    rows = list(table.rows.values())
-    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
-    return StudyResult(rows, counts, report)
+        rows, tasks = list(table.rows.values()), whole.tasks
+        title = f"Label efficiency on {tasks[0] if len(tasks) == 1 else f'{len(tasks)} tasks'}"
+        report = write_study_report(study.out, rows, table.outcomes, title=title, options=_given(to_json(whole)))
+    return StudyResult(rows, {status: sum(row["status"] == status for row in rows) for status in STATUSES}, report)
 
 
 def _read_study(folder: Path) -> Study | None:
@@ -132,12 +132,6 @@ def _check_folder(study: Study) -> None:
         raise RunDirectoryError(f"{path} holds a study with another {', '.join(told)}; choose another --out")
 
 
-def _report(study: Study, table: _Table) -> Path:
-    named = study.tasks[0] if len(study.tasks) == 1 else f"{len(study.tasks)} tasks"
-    rows, title = list(table.rows.values()), f"Label efficiency on {named}"
-    return write_study_report(study.out, rows, table.outcomes, title=title, options=_given(to_json(study)))
-
-
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of all sections that say something."""
     known = {name: _given(value) if isinstance(value, Mapping) else value for name, value in options.items()}
@@ -158,7 +152,6 @@ def _first_look(study: Study, task: Task) -> TensorDictBase | None:
 
 
 def _record(study: Study, cells: Sequence[Cell], name: str) -> None:
-    """Records the demonstrations of a task, once for all cells, where none are given."""
     folder, task = study.dataset_folder(name), study.task(name)
     if study.given_dataset(name) is not None or (folder / "ted").exists():
         return

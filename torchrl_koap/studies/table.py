@@ -177,7 +177,6 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
 
 
 def _success(item: Summary) -> dict[str, str]:
-    """Success with its interval, number of rollouts, worst and best seed."""
     if item.offline:
         return {"success (95 %)": "–", "n": "–", "range of seeds": "–"}
     text, spread = "no cell done", "–"

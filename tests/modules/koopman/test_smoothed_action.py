@@ -146,9 +146,6 @@ def test_smoothing_takes_noise_out_and_leaves_clean_windows():
     assert smoother(clean[:, index][None]).shape == (1, 1500, 8, 2)
 
 
-def test_wrong_shapes_are_refused():
-    smoother = WienerSmoother(12, 2)
-    with pytest.raises(ValueError, match=r"windows must be \[N, 12, 2\], got \[5, 11, 2\]"):
-        smoother.fit(torch.zeros(5, 11, 2), torch.zeros(5, 11, 2))
+def test_windows_that_tell_no_noise_are_refused():
     with pytest.raises(ValueError, match=r"T >= 5, d\], got \[5, 4, 2\]"):
         noise_covariance(torch.zeros(5, 4, 2))

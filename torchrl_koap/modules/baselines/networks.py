@@ -40,13 +40,7 @@ class SupervisedInverseDynamics(InverseDynamics):
     """
 
     def __init__(
-        self,
-        state_dim: int,
-        action_dim: int,
-        *,
-        num_past: int = 4,
-        look_ahead: int | Sequence[int] = 1,
-        **kwargs,
+        self, state_dim: int, action_dim: int, *, num_past: int = 4, look_ahead: int | Sequence[int] = 1, **kwargs
     ):
         super().__init__(WindowReader(state_dim, num_past=num_past, look_ahead=look_ahead, min_offset=1), **kwargs)
         self.network = MLP(self.reader.num_features, action_dim, **LAYERS)

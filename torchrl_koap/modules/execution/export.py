@@ -92,7 +92,6 @@ def exportable(policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str
 
 
 def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
-    """Shape, type, meaning, names and units of tensors by name."""
     found: dict[str, Any] = {}
     for name, value in tensors.items():
         shape, kind = ["batch", *value.shape[1:]], str(value.dtype).removeprefix("torch.")

@@ -155,13 +155,7 @@ class ConditionalSampler(TensorDictModuleBase):
             predicted = self.denoiser(noisy, time, condition)
         return (predicted - sequence).square()
 
-    def sample(
-        self,
-        history: Tensor,
-        noise: Tensor | None = None,
-        *,
-        prefix: Tensor | None = None,
-    ) -> Tensor:
+    def sample(self, history: Tensor, noise: Tensor | None = None, *, prefix: Tensor | None = None) -> Tensor:
         """Samples sequences ``[*B, H, width]`` for histories ``[*B, h, d]``, both in raw units.
 
         Args:
