@@ -56,7 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(message)
         return status
     except Exception as error:
-        if os.environ.get("KOAP_TRACEBACK") or not _is_expected(error):
+        # the simulator's own error for a machine that has too little memory or no graphics derives from nothing else
+        expected = isinstance(error, EXPECTED) or type(error).__module__.partition(".")[0] == "mujoco"
+        if os.environ.get("KOAP_TRACEBACK") or not expected:
             raise
         _complain(f"{_one_line(error)} ({HINT})")
         return 1
@@ -140,11 +142,6 @@ def _commands() -> tuple[Any, ...]:
                 raise ValueError(f"MPLBACKEND={backend} is no backend of matplotlib; unset it") from error
             raise
     return options, subcommands, without_progress_bars
-
-
-def _is_expected(error: Exception) -> bool:
-    # the simulator's own error for a machine that has too little memory or no graphics derives from nothing else
-    return isinstance(error, EXPECTED) or type(error).__module__.partition(".")[0] == "mujoco"
 
 
 def _one_line(error: BaseException) -> str:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,11 +26,10 @@ from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
-from torchrl_koap.modules import KoopmanInverseDynamics, PlanningPolicy
+from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
-from torchrl_koap.tasks import Task
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
 
@@ -117,8 +115,14 @@ def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) 
             "plan_to_execution": tracking_errors(task, closed, interval),
             "distance_to_demonstrations": coverage(task, closed, data),
         }
-        if config.env is None:
-            found |= _follow(config, policy, task, data, where.make_env)
+        if config.env is None:  # the controller alone follows recordings from where they started
+            followed = follow_recordings(policy, task, data, where.make_env, episodes=config.episodes)
+            tracked = tracking_errors(task, followed, interval)
+            if task.objects and task.position in tracked:
+                left = left_recordings(task, followed, interval, beyond=NEAR)
+                found["recordings_left"] = {"count": left, "episodes": len(followed)}
+            found["controller_alone"] = rate([outcome_of(episode) == "success" for episode in followed])
+            found["recording_to_execution"] = tracked
         bar.update()
         if task.goal is not None:
             start = torch.stack([task.state_of(episode["observation"][0]) for episode in closed]).to(config.device)
@@ -129,22 +133,6 @@ def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) 
     if where.record is not None and where.record.faults():
         found["faults"] = where.record.faults()
     return found
-
-
-def _follow(
-    config: InspectConfig, policy: PlanningPolicy, task: Task, data: TensorDictBase, make_env: Callable[[int], Any]
-) -> dict[str, Any]:
-    """The controller alone, which follows recordings from where they started."""
-    interval, found = policy.execution.replan_interval, dict[str, Any]()
-    followed = follow_recordings(policy, task, data, make_env, episodes=config.episodes)
-    tracked = tracking_errors(task, followed, interval)
-    if task.objects and task.position in tracked:
-        left = left_recordings(task, followed, interval, beyond=NEAR)
-        found["recordings_left"] = {"count": left, "episodes": len(followed)}
-    return found | {
-        "controller_alone": rate([outcome_of(episode) == "success" for episode in followed]),
-        "recording_to_execution": tracked,
-    }
 
 
 def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:

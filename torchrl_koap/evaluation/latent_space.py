@@ -92,8 +92,11 @@ def prediction_errors(
     for states in new.split(1024):
         true = states[:, now + 1 : now + 1 + horizon]
         lifted = controller.lift(states[:, : now + 1 + horizon])
-        rolled = controller.rollout_latent(lifted[:, now], controller.infer(states, frames))
-        decoded = [controller.lifting.decode(path) for path in (rolled, lifted[:, now + 1 :])]
+        rolled = [lifted[:, now]]
+        for latent_action in controller.infer(states, frames).unbind(1):
+            rolled.append(controller.predict_next(rolled[-1], latent_action))
+        paths = torch.stack(rolled[1:], 1), lifted[:, now + 1 :]
+        decoded = [controller.lifting.decode(path) for path in paths]
         predicted = {
             "koopman": _raw(controller, decoded[0]),
             "reconstruction": _raw(controller, decoded[1]),

@@ -83,7 +83,12 @@ class DenoisingLoss(NetworkLoss):
                 if counts is not None:  # before the network: masking afterwards would leave NaN in the gradient
                     clean = torch.where(counts, clean, 0.0)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
-            error = network.denoising_error(condition, clean, noise, time, dtype=self.dtype)  # [*B, H, width]
+                noise = torch.randn_like(clean) if noise is None else noise
+                time = network.schedule.sample_time(clean) if time is None else time.to(clean.dtype)
+                noisy = network.schedule.add_noise(clean, noise, time)
+            with torch.autocast(clean.device.type, self.dtype, enabled=self.dtype is not None):
+                predicted = network.denoiser(noisy, time, condition)
+            error = (predicted - clean).square()  # [*B, H, width]
             if self.weights is not None:
                 error = error * self.weights
 

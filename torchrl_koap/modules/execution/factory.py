@@ -69,8 +69,12 @@ def make_policy(
         (5, 'feedback')
     """
     execution = Execution() if execution is None else execution
-    if follower is None and controller is not None:
-        follower = _follow(planner, controller, execution, reads, action_rule)
+    followed: dict[str, Any] = {"blend": execution.blend, "action_rule": action_rule}
+    if follower is None and isinstance(controller, ResponseModel):
+        look_ahead = planner.horizon - execution.replan_interval + 1  # what every plan tells at its last step
+        follower = MPC(controller, look_ahead=look_ahead, **followed)
+    elif follower is None and controller is not None:
+        follower = InverseDynamicsFollower(controller, reads=reads, **followed)
     limits, margin = None, execution.limits
     ranges = None if ranges is None or margin == math.inf else [_widened(r, margin) for r in ranges]
     if execution.gain != 1 or execution.lead or ranges is not None:
@@ -92,17 +96,3 @@ def _widened(ends: Sequence[float] | None, margin: float) -> tuple[float, float]
         return None
     low, high = ends
     return low - margin * (high - low), high + margin * (high - low)
-
-
-def _follow(
-    planner: nn.Module,
-    controller: nn.Module,
-    execution: Execution,
-    reads: Callable[[Tensor], Tensor] | None,
-    action_rule: ActionRule | None,
-) -> Follower:
-    options: dict[str, Any] = {"blend": execution.blend, "action_rule": action_rule}
-    if isinstance(controller, ResponseModel):
-        look_ahead = planner.horizon - execution.replan_interval + 1  # what every plan tells at its last step
-        return MPC(controller, look_ahead=look_ahead, **options)
-    return InverseDynamicsFollower(controller, reads=reads, **options)

@@ -127,14 +127,6 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         """Predicts ``z_{t+1} = K z_t + u_t``, or with ``B u_t``."""
         return self.operator.step(lifted, latent_action)
 
-    def rollout_latent(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Rolls out from a lifted state ``[*B, m]``: those ``[*B, T, m]`` after each latent action ``[*B, T, p]``."""
-        states = []
-        for step in latent_action.unbind(-2):
-            lifted = self.predict_next(lifted, step)
-            states.append(lifted)
-        return torch.stack(states, -2)
-
     def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
         """Sets what is known of the inputs before training, and trains a lifting that starts from Isomap coordinates.
 

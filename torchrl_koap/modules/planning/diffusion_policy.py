@@ -32,7 +32,6 @@ class DiffusionPolicy(ConditionalSampler):
     sequence is a chunk, of ``act`` columns.
 
     Keyword Args:
-        state_dim (int): number ``d`` of state columns.
         action_dim (int): number ``act`` of action entries.
         relative (bool): the condition holds displacements from the present state. Defaults to False.
         out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]``. Defaults to ``["action_chunk"]``.

@@ -34,7 +34,6 @@ class StatePlanner(ConditionalSampler):
     sequence is a plan, of ``d`` columns.
 
     Keyword Args:
-        state_dim (int): number ``d`` of state columns.
         relative (bool): model displacements from the present state. Defaults to True.
         out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]``. Defaults to ``["plan"]``.
 

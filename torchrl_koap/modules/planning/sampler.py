@@ -130,31 +130,6 @@ class ConditionalSampler(TensorDictModuleBase):
             )
         return self.condition_normalizer(self.condition(history))
 
-    def denoising_error(
-        self,
-        condition: Tensor,
-        sequence: Tensor,
-        noise: Tensor | None = None,
-        time: Tensor | None = None,
-        *,
-        dtype: torch.dtype | None = None,
-    ) -> Tensor:
-        """Computes the squared error ``[*B, H, width]`` of the denoiser on noised sequences: what training minimises.
-
-        Args:
-            condition (Tensor): of :meth:`encode_history`, ``[*B, h * d + f]``.
-            sequence (Tensor): clean normalised sequences ``[*B, H, width]``.
-            noise, time (Tensor, optional): of the same shape, and ``[*B]`` in training steps. Default: random.
-            dtype (torch.dtype, optional): of the denoiser's matrix products. Default: that of its weights.
-        """
-        with torch.no_grad():
-            noise = torch.randn_like(sequence) if noise is None else noise
-            time = self.schedule.sample_time(sequence) if time is None else time.to(sequence.dtype)
-            noisy = self.schedule.add_noise(sequence, noise, time)
-        with torch.autocast(sequence.device.type, dtype, enabled=dtype is not None):
-            predicted = self.denoiser(noisy, time, condition)
-        return (predicted - sequence).square()
-
     def sample(self, history: Tensor, noise: Tensor | None = None, *, prefix: Tensor | None = None) -> Tensor:
         """Samples sequences ``[*B, H, width]`` for histories ``[*B, h, d]``, both in raw units.
 
