@@ -54,28 +54,22 @@ def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Fig
         state = entry(demonstrations, "state", [len(episode), run.task.state_dim])
         return _draw_over_time(state, borders, along, run.task, f"{head} in {touched} of them")
     position = entry(demonstrations, "position", [len(episode), 2])
-    if "objects" in demonstrations:
-        figure = Figure(figsize=(10.9, 6.2), layout="constrained")
-        axes, beside = figure.subplots(1, 2)
-        objects = entry(demonstrations, "objects", [len(episode), None, 2])
-        _draw_objects(beside, np.split(objects, borders), run.task)
-    else:
-        figure = Figure(figsize=(5.9, 6.4), layout="constrained")
-        axes = figure.add_subplot()
+    moved = "objects" in demonstrations
+    figure = Figure(figsize=(10.9, 6.2) if moved else (5.9, 6.4), layout="constrained")
+    axes, *beside = figure.subplots(1, 1 + moved, squeeze=False)[0]
+    for panel in beside:
+        objects = np.split(entry(demonstrations, "objects", [len(episode), None, 2]), borders)
+        draw_bodies(draw_scene(panel, run.task), objects, run.task, [True] * len(objects))
+        panel.label_outer()
+        handles = body_handles([body for body in bodies_of(run.task, objects[0].shape[1]) if not body.still], [True])
+        panel.legend(handles=handles, frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1, 1))
+        set_title(panel, "objects: paths and where they end\n")
     draw_scene(axes, run.task)
     _draw_lines(axes, position, borders, along, (0.7, 1.7))
     keep_inside(axes, [position])
     set_title(axes, f"{head}\nin {touched} of {number} demonstrations")
     axes.legend(handles=_HANDLES, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
     return figure
-
-
-def _draw_objects(axes: Axes, paths: list[np.ndarray], task: Task | None) -> None:
-    draw_bodies(draw_scene(axes, task), paths, task, [True] * len(paths))
-    axes.label_outer()
-    handles = body_handles([body for body in bodies_of(task, paths[0].shape[1]) if not body.still], [True])
-    axes.legend(handles=handles, frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1, 1))
-    set_title(axes, "objects: paths and where they end\n")
 
 
 def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, task: Task, head: str) -> Figure:

@@ -90,14 +90,12 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     left.set_ylim(0, 105)
     left.set_ylabel("success (%)")
     tidy(left, "Who reaches the goal (95 % intervals)")
-    for key, color, label in (
-        ("plan_to_execution", ORANGE, "from the plan"),
-        ("recording_to_execution", MUTED, "from the recording, when that is the plan"),
+    for key, color, offset, label in (
+        ("plan_to_execution", ORANGE, 0.18, "from the plan"),
+        ("recording_to_execution", MUTED, -0.18, "from the recording, when that is the plan"),
     ):
-        values = {name: errors[-1] for name, errors in result.get(key, {}).items()}
-        offset = 0.18 if key == "plan_to_execution" else -0.18
-        rows = [index + offset for index in range(len(values))]
-        right.barh(rows, list(values.values()), height=0.34, color=color, label=label)
+        values = [errors[-1] for errors in result.get(key, {}).values()]
+        right.barh(np.arange(len(values)) + offset, values, height=0.34, color=color, label=label)
     names = list(result["plan_to_execution"])
     right.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     right.invert_yaxis()

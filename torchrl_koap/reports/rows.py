@@ -40,16 +40,9 @@ def training_rows(run: RunFacts) -> list[Row]:
 
 def evaluation_rows(run: RunFacts) -> list[Row]:
     """Returns errors on recorded data, shares of rollouts with their intervals, and times."""
-    found = [
-        *_rates(run),
-        _entropy(run),
-        _environment(run),
-        *_plan_errors(run),
-        *_action_errors(run),
-        _loop(run),
-        _speed(run),
-    ]
-    return [row for row in found if row is not None]
+    rolled_out = *_rates(run), _entropy(run), _environment(run)
+    recorded = *_plan_errors(run), *_action_errors(run), _loop(run)
+    return [row for row in (*rolled_out, *recorded, _speed(run)) if row is not None]
 
 
 def _labels(run: RunFacts) -> Row | None:

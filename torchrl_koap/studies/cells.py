@@ -89,12 +89,9 @@ def run_cell(folder: str | Path) -> None:
         results = train(config, planner_only=True).results
         run.write_json(FOUND, {"row": {"train_seconds": time.perf_counter() - began}, "outcomes": [], **results})
         return
-    try:
-        summary = run.read_json("summary.json")
-    except RunDirectoryError:
+    if not (folder / "summary.json").exists():
         train(config)
-        summary = run.read_json("summary.json")
-    trained = time.perf_counter()
+    summary, trained = run.read_json("summary.json"), time.perf_counter()
     result = evaluate(folder, evaluation)
     seconds = {"train_seconds": trained - began, "eval_seconds": time.perf_counter() - trained}
     run.write_json(FOUND, {"row": _found_in(summary, result) | seconds, "outcomes": _outcomes_of(result)})

@@ -120,8 +120,7 @@ def _check_folder(study: Study) -> None:
             raise RunDirectoryError(f"{path} is not empty and no folder of `koap curve`; choose another --out")
         return
     changed = [name for name in changed_options(earlier, study) if name not in _MAY_CHANGE]
-    values = [attrgetter(name)(earlier) for name in changed]
-    told = [f"{name} ({value})" for name, value in zip(changed, values, strict=True)]
+    told = [f"{name} ({attrgetter(name)(earlier)})" for name in changed]
     for name, before, after in (
         ("datasets", earlier.given_dataset, study.given_dataset),
         ("planners", earlier.given_planner, study.given_planner),

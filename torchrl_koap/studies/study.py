@@ -238,13 +238,9 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
         tasks=study.tasks or _tasks_of(study.datasets),
         run=replace(study.run, plugins=plugins),
     )
-    datasets = {task: os.path.abspath(path) for task, path in _by_task("datasets", study.datasets, study.tasks)}
-    planners = {task: find_run(run).absolute() for task, run in _by_task("planners", study.planners, study.tasks)}
-    study = replace(
-        study,
-        datasets=tuple(f"{task}={path}" for task, path in datasets.items()),
-        planners=tuple(f"{task}={run}" for task, run in planners.items()),
-    )
+    datasets = [f"{task}={os.path.abspath(path)}" for task, path in _by_task("datasets", study.datasets, study.tasks)]
+    runs = [f"{task}={find_run(run).absolute()}" for task, run in _by_task("planners", study.planners, study.tasks)]
+    study = replace(study, datasets=tuple(datasets), planners=tuple(runs))
     for name in study.tasks:
         study.task(name)  # there must be one
     return study
