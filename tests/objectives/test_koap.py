@@ -220,7 +220,8 @@ def test_cuda_equals_cpu(kind):
     on_cpu = make_network(kind)
     expected = on_cpu.fit_labels(batch, batch["has_action"].squeeze(-1))
     batch = batch.cuda()
-    found = network.fit_labels(batch, batch["has_action"].squeeze(-1), groups=torch.arange(8, device="cuda") // 2)
+    grouped = batch.clone().set("episode", torch.arange(8, device="cuda") // 2)
+    found = network.fit_labels(grouped, batch["has_action"].squeeze(-1))
     assert network.action_decoder.linear.weight.is_cuda and found["labels_used"] == expected["labels_used"]
     found = network.fit_labels(batch, batch["has_action"].squeeze(-1))
     assert found["held_out_error"] == pytest.approx(expected["held_out_error"], rel=1e-2)

@@ -7,7 +7,6 @@ import contextlib
 import io
 import math
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
 from functools import partial
@@ -69,11 +68,6 @@ class Command:
     """
 
     quiet: bool = False
-
-
-def as_typed() -> str:
-    """The command line of this process, for ``config.json``."""
-    return "koap " + " ".join(sys.argv[1:])
 
 
 def check_options(options: Any) -> None:

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from torchrl_koap.commands.options import Command, Options, as_typed
+from torchrl_koap.commands.options import Command, Options
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, load_policy, suggest
 from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
 from torchrl_koap.lookup import lookup
@@ -24,7 +25,6 @@ from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies.table import result_rows
-from torchrl_koap.tasks import Task
 from torchrl_koap.training import TrainConfig, Trained, train
 from torchrl_koap.training.lerobot_folder import write_lerobot_folder
 
@@ -43,7 +43,7 @@ class Train(Command):
 
     def __call__(self) -> dict[str, str]:
         """Trains."""
-        train(self.config, command=as_typed())
+        train(self.config, command=" ".join(["koap", *sys.argv[1:]]))
         out = str(self.config.out)
         return {**as_text(training_rows(RunFacts.read(out))), "run": out, "next": f"koap eval {shlex.quote(out)}"}
 
@@ -190,22 +190,17 @@ class Export(Command):
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
         if suffix is None:
             return write_lerobot_folder(trained, out)
-        policy = load_policy(trained)
         out.mkdir(parents=True, exist_ok=True)
-        what, file = exportable(policy, columns=_columns(trained.task)), out / f"policy{suffix}"
+        columns = {
+            "observations": dict(zip(trained.task.observation_names, trained.task.known_units, strict=True)),
+            "actions": dict(zip(trained.task.action_names, trained.task.action_units, strict=True)),
+        }
+        what, file = exportable(load_policy(trained), columns=columns), out / f"policy{suffix}"
         export_policy(what, file, kind=self.format)
         result: dict[str, Any] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
         result |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}
         RunDirectory(out).write_json("policy.json", {"task": trained.task.name, "file": file.name, **what.facts})
         return result | {"note": what.facts["note"]}
-
-
-def _columns(task: Task) -> dict[str, dict[str, str]]:
-    """Name to unit of what an exported policy reads and writes."""
-    return {
-        "observations": dict(zip(task.observation_names, task.known_units, strict=True)),
-        "actions": dict(zip(task.action_names, task.action_units, strict=True)),
-    }
 
 
 @dataclass(kw_only=True)

@@ -2,9 +2,8 @@
 """Which part of a policy fails: planner, controller, or the data.
 
 Three success rates tell them apart. The planner alone continues its own plans: the executed part of each becomes the
-next history, nothing is simulated. The controller alone follows the recorded states of demonstrations in their own
-contexts, as if the planner were perfect. Both together are the closed loop. Beside them: how far the executed states
-leave the plans, and how far they leave the demonstrations.
+next history, nothing is simulated. The controller alone follows the recorded states of demonstrations, as if the
+planner were perfect. Both together are the closed loop.
 """
 
 from __future__ import annotations

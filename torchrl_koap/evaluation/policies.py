@@ -2,10 +2,9 @@
 """A finished training as a policy, also one that follows plans by the simulator's own inverse map.
 
 With that map in place of a learned controller, what fails is the planner's. Which command takes the tool where the
-plan says is found by trying, in the simulation of the episode itself: what
-happens if the command is held, and what if it is changed by a little in one direction. An arm under its tracking law
-answers nearly in proportion, so the commands of the next steps follow by least squares (dynamic matrix control: Cutler
-and Ramaker, 1980), of which the first one is executed::
+plan says is found by trying in the simulation: what happens if the command is held, and what if it is changed by a
+little in one direction. An arm under its tracking law answers nearly in proportion, so the commands of the next steps
+follow by least squares (dynamic matrix control: Cutler and Ramaker, 1980), of which the first one is executed::
 
     y_k = held_k + sum_{j < k} S_{k-j} a_j         state after k steps, S the response to a step of the command
     min_a  sum_k |y_k - plan_k|^2  +  smoothness sum_j |a_j - a_{j-1}|^2

@@ -141,25 +141,18 @@ class InverseDynamics(TensorDictModuleBase):
         """Fits after training, to raw states ``[*B, T, d]`` without labels, what is fitted then: here nothing."""
 
     def fit_labels(
-        self,
-        windows: TensorDictBase,
-        mask: Tensor,
-        *,
-        groups: Tensor | None = None,
-        axes: Sequence[int] = (),
-        guessed: bool = False,
+        self, windows: TensorDictBase, mask: Tensor, *, axes: Sequence[int] = (), guessed: bool = False
     ) -> dict[str, Any]:
         """Fits a decoder in closed form on the labelled frames of windows; a subclass that has one says how.
 
         Args:
-            windows (TensorDictBase): raw states ``[*B, T, d]`` and actions ``[*B, T, act]``.
+            windows (TensorDictBase): raw states ``[*B, T, d]`` and actions ``[*B, T, act]``. Frames of one trajectory,
+                ``episode`` int64 ``[*B]`` or ``[*B, T]``, are left out together; without this entry every frame is left
+                out alone, and windows that overlap hide that a decoder overfits.
             mask (Tensor): labelled frames to use, bool ``[*B, T]`` or ``[*B, T, 1]``; no action outside of it is read.
                 Frames that do not count in the losses (:meth:`valid_frames`) are left out.
 
         Keyword Args:
-            groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, left out together. Default: the
-                entry ``episode`` of the windows; without one, every frame is left out alone, and windows that overlap
-                hide that a decoder overfits.
             axes (sequence of int): the state column, of those read, that each action entry moves.
             guessed (bool): the axes are only likely.
 
@@ -172,24 +165,19 @@ class InverseDynamics(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} has no decoder in closed form")
 
     def labelled_frames(
-        self,
-        read: Callable[[Tensor, range], Tensor],
-        windows: TensorDictBase,
-        mask: Tensor,
-        groups: Tensor | None = None,
+        self, read: Callable[[Tensor, range], Tensor], windows: TensorDictBase, mask: Tensor
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Selects what :meth:`fit_labels`, whose other arguments these are, fits a decoder to.
 
         ``read`` maps raw states ``[N, T, d]`` and a range of frames to what the decoder reads of them, ``[N, frames,
-        m]``. Returned are inputs ``[n, m]``, normalised actions ``[n, act]``, and groups ``[n]`` if they were given.
+        m]``. Returned are inputs ``[n, m]``, normalised actions ``[n, act]``, and trajectories ``[n]`` if they are
+        known.
         """
         states = read_entry(self, windows, self.in_key, "set_keys(state=...)")
         action = check_actions(read_entry(self, windows, self.out_key, "set_keys(action=...)"), self.out_key, states)
-        mask, shape = frame_mask(mask, "mask", states), states.shape[:-1]
-        if groups is None and EPISODE in windows.keys():
-            groups = windows.get(EPISODE).reshape(*shape[:-1], -1)[..., -1]
-        if groups is not None and groups.shape != shape[:-1]:
-            raise ValueError(f"groups must be {list(shape[:-1])} ([*B]), got {list(groups.shape)}")
+        mask, groups = frame_mask(mask, "mask", states), windows.get(EPISODE, None)
+        if groups is not None:
+            groups = groups.reshape(*states.shape[:-2], -1)[..., -1]
         frames = self.valid_frames(mask.shape[-1])
         part = slice(frames.start, frames.stop)
         mask = mask[..., part]

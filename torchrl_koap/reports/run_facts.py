@@ -51,9 +51,11 @@ class RunFacts:
         files: dict[str, dict[str, Any]] = {}
         names = {"config": "config", "summary": "summary", "evaluation": "eval", "inspection": "inspect"}
         for key, name in names.items():
-            path = folder / f"{name}.json"
-            files[key], wrong = _read(path) if path.exists() else ({}, "")
-            damaged += [wrong] if wrong else []
+            path, files[key] = folder / f"{name}.json", {}
+            try:
+                files[key] = read_json(path) if path.exists() else {}
+            except (OSError, ValueError) as error:
+                damaged.append(str(error))
         try:
             task = task_from(files["config"]["task"], files["config"].get("task_definition"))
         except (ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
@@ -115,11 +117,3 @@ class RunFacts:
         if name == "controller_alone" and left is not None and episodes:
             return 1 - left / episodes
         return number(mapping(self.inspection.get(name)).get("rate"))
-
-
-def _read(path: Path) -> tuple[dict[str, Any], str]:
-    """Returns the content of a JSON file, empty if it is damaged, and what was wrong."""
-    try:
-        return read_json(path), ""
-    except (OSError, ValueError) as error:
-        return {}, str(error)

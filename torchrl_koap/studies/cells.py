@@ -38,11 +38,6 @@ class Cell:
         labels (float): share of the units that keep their labels.
         demonstrations (float): share of the demonstrations that is known at all.
         seed (int): of label choice, initialisation and batches.
-
-    Examples:
-        >>> from torchrl_koap.studies.cells import Cell
-        >>> Cell("avoiding", "koap", labels=0.02, demonstrations=1.0, seed=0).folder
-        'cells/avoiding/koap-0.02-1-seed0'
     """
 
     task: str
@@ -53,7 +48,7 @@ class Cell:
 
     @property
     def folder(self) -> str:
-        """Its run directory, relative to the study's."""
+        """Its run directory, relative to the study's: ``cells/avoiding/koap-0.02-1-seed0``."""
         return f"cells/{self.task}/{self.method}-{self.labels:.15g}-{self.demonstrations:.15g}-seed{self.seed}"
 
 

@@ -51,16 +51,13 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
     With :math:`d_{sc}` the difference of the successes for training seed s in context c, averaged over rollouts of that
     context, the estimate is the mean over contexts of :math:`\bar d_c`, itself the mean over training seeds.
 
-    The interval resamples contexts *and* training seeds. Contexts alone would say how sure the figure is for these very
-    networks; a reader wants to know what the next training would give, and three seeds say little about that. The
-    interval is then wider. Of S seeds S - 1 are drawn: a resample of all S would understate the variance of
-    their mean by a factor (S - 1) / S, two thirds for three of them. With one seed it holds for that one training only.
+    The interval resamples contexts *and* training seeds, since a reader wants to know what the next training would
+    give. Of S seeds S - 1 are drawn: a resample of all S would understate the variance of their mean by a factor
+    (S - 1) / S. With one seed it holds for that one training only. Where every difference is the same, the interval is
+    widened by the rule of three, 3 / contexts: what contexts that were not seen could hide.
 
     The p-value flips signs of :math:`\bar d_c`: for these trained networks, could the advantage be chance of the
     contexts? It says nothing about other training seeds, so it may be small while the interval holds 0.
-
-    Where every difference is the same, a resample shows no spread at all. The interval is then widened by the rule of
-    three, 3 / contexts: what contexts that were not seen could hide.
 
     Simulated with 60 contexts: where training seeds shift a method's logit of success by a standard deviation of 0.5,
     95 % intervals hold the truth in 94 to 97 % of cases for 2, 3 or 5 seeds (63 % for a single one), and where seeds do

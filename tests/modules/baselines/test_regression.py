@@ -45,7 +45,6 @@ def test_ridge_reads_no_action_outside_the_mask():
     models[0].fit_labels(windows, mask)
     poisoned = windows.clone()
     poisoned["action"][5:] = 1e9
-    models[1].fit_labels(poisoned, mask, groups=torch.arange(40))
     models[1].fit_labels(poisoned, mask)
     for name, value in models[0].state_dict().items():
         assert torch.equal(value, models[1].state_dict()[name]), name
@@ -82,13 +81,14 @@ def test_components_are_those_of_the_windows(num, monkeypatch):
 def test_the_number_of_components_is_chosen_by_labels_left_out(monkeypatch):
     monkeypatch.setattr(COUNTS, (2, 48))
     states = make_windows()
-    windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [80])
+    action = (states.roll(-2, 1) - states)[..., :2]
+    windows = TensorDict({"state": states, "action": action, "episode": torch.arange(80) // 10}, [80])
     model = PrincipalInverseDynamics(3, 2)
     model.prepare(states)
     model.finish(states)
     mask = torch.zeros(80, 17, dtype=torch.bool)
     mask[:, 8] = True
-    fit = model.fit_labels(windows, mask, groups=torch.arange(80) // 10)
+    fit = model.fit_labels(windows, mask)
     assert int(model.gate.sum()) == 48 and fit["labels_used"] == 80
     error = (model(windows.select("state"))["action"] - windows["action"])[:, 8].square().mean().sqrt()
     assert error < 0.1 * windows["action"].square().mean().sqrt()

@@ -83,8 +83,7 @@ def labelled(*batch, share=0.5):
 def test_decoder_is_fitted_on_the_labelled_frames_that_count():
     model = make_model()
     data, mask = labelled(30)
-    groups = torch.arange(30) // 3
-    result = model.fit_labels(data, mask, groups=groups)
+    result = model.fit_labels(data.set("episode", torch.arange(30) // 3), mask)
     rows = [(i, t) for i in range(30) for t in range(1, 6) if mask[i, t]]
     assert result["labels_used"] == len(rows)
     model.eval()
@@ -102,18 +101,15 @@ def test_decoder_is_fitted_on_the_labelled_frames_that_count():
 def test_fitting_takes_any_batch_and_leaves_the_mode_alone():
     flat, nested = make_model(), make_model()
     data, mask = labelled(4, 6)
-    flat.fit_labels(data.reshape(-1), mask.flatten(0, 1), groups=torch.arange(24) // 6)
-    nested.fit_labels(data, mask, groups=(torch.arange(24) // 6).reshape(4, 6))
+    data["episode"] = (torch.arange(24) // 6).reshape(4, 6)
+    flat.fit_labels(data.reshape(-1), mask.reshape(24, 9, 1))  # a mask may have a trailing 1
+    nested.fit_labels(data, mask)
     windowed = make_model()
-    windowed.fit_labels(TensorDict(dict(data.items()), [4, 6, 9]), mask, groups=(torch.arange(24) // 6).reshape(4, 6))
+    every = dict(data.items()) | {"episode": data["episode"].unsqueeze(-1).expand(4, 6, 9)}
+    windowed.fit_labels(TensorDict(every, [4, 6, 9]), mask)
     for name, value in flat.state_dict().items():
         assert torch.equal(value, nested.state_dict()[name]) and torch.equal(value, windowed.state_dict()[name])
     assert nested.training and nested.latent_action.training
-    named = make_model()  # trajectories are those of the entry episode, and a mask may have a trailing 1
-    named.fit_labels(
-        data.reshape(-1).set("episode", (torch.arange(24) // 6)[:, None].expand(24, 9)), mask.reshape(24, 9, 1)
-    )
-    assert torch.equal(named.action_decoder.linear.weight, flat.action_decoder.linear.weight)
     nested.eval().fit_labels(data, mask)
     assert not nested.latent_action.training
 
@@ -133,8 +129,6 @@ def test_bad_fits_are_explained():
         model.fit_labels(data.select("state"), mask)
     with pytest.raises(ValueError, match=r"'action' must have the batch and frames \[4, 9\] .*, got \[4, 8, 2\]"):
         model.fit_labels(data.clone().set("action", data["action"][:, 1:]), mask)
-    with pytest.raises(ValueError, match=r"groups must be \[4\] \(\[\*B\]\), got \[4, 9\]"):
-        model.fit_labels(data, mask, groups=torch.zeros(4, 9, dtype=torch.int64))
     with pytest.raises(ValueError, match="a window of 4 frames is too short"):
         model.fit_labels(data[:, :4] if data.batch_dims > 1 else data.apply(lambda x: x[:, :4]), mask[:, :4])
 
@@ -172,15 +166,15 @@ def test_an_axis_without_labels_worth_the_name_is_decoded_like_the_other():
 def test_guessed_axes_are_used_only_where_held_out_labels_agree():
     state = torch.randn(300, 16, 2, generator=torch.Generator().manual_seed(3)).cumsum(1) * 0.01
     ahead = torch.cat([state[:, 3:] - state[:, 2:-1], torch.zeros(300, 3, 2)], 1)
-    mask, groups = torch.zeros(300, 16, dtype=torch.bool), torch.arange(300) // 2
+    mask = torch.zeros(300, 16, dtype=torch.bool)
     mask[:8] = True
     for action, agrees in ((ahead, True), (ahead.flip(-1), False)):
-        data, found = TensorDict({"state": state, "action": action}, [300]), {}
+        data, found = TensorDict({"state": state, "action": action, "episode": torch.arange(300) // 2}, [300]), {}
         for name, options in {"known": {}, "guessed": {"guessed": True}, "none": {"axes": ()}}.items():
             torch.manual_seed(0)
             model = make_koopman_inverse_dynamics(2, 2, num_features=8)
             model.prepare(state)
-            model.fit_labels(data, mask, groups=groups, **({"axes": (0, 1)} | options))
+            model.fit_labels(data, mask, **({"axes": (0, 1)} | options))
             found[name] = model.action_decoder.linear.weight
         assert torch.equal(found["guessed"], found["known" if agrees else "none"])
 

@@ -148,13 +148,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
 
     @torch.no_grad()
     def fit_labels(
-        self,
-        windows: TensorDictBase,
-        mask: Tensor,
-        *,
-        groups: Tensor | None = None,
-        axes: Sequence[int] = (),
-        guessed: bool = False,
+        self, windows: TensorDictBase, mask: Tensor, *, axes: Sequence[int] = (), guessed: bool = False
     ) -> dict[str, Any]:
         """Fits the decoder in closed form, and chooses the block that a latent action with several reads.
 
@@ -173,8 +167,8 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         try:
             for block in self.latent_action.blocks:
                 self.latent_action.choose(block)
-                inputs, action, rows = self.labelled_frames(self.infer, windows, mask, groups)
-                fits[block] = self._fit_decoder(inputs, action, axes, guessed, groups=rows, **options)
+                inputs, action, groups = self.labelled_frames(self.infer, windows, mask)
+                fits[block] = self._fit_decoder(inputs, action, axes, guessed, groups=groups, **options)
         finally:
             self.train(was_training)
         best = min(fits, key=lambda block: fits[block].error / (RAW_SHARE if block == RAW else 1.0))
