@@ -150,10 +150,8 @@ def _flat(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
 def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
     """Makes a command, of a dataclass or a union of them that the first word chooses from, of the words of a call.
 
-    ``--help`` among them prints its options and leaves. ``how`` is what else :func:`tyro.cli` takes.
-
-    Raises:
-        SystemExit: with 2 for a wrong call, after a message on stderr; with 0 after a help.
+    ``--help`` among them prints its options and leaves with 0, a wrong call leaves with 2. ``how`` is what else
+    :func:`tyro.cli` takes.
     """
     arguments, short = list(arguments), dict[Any, str]()
     if arguments[:1] == ["train"] and {"-h", "--help"} & set(arguments):

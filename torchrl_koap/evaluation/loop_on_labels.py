@@ -56,9 +56,8 @@ def check_loop(
 ) -> dict[str, Any]:
     """Rolls a policy out on a ridge regression of the change of states, from recorded starts.
 
-    The policy acts without limits first, which says whether it is stable by itself; if a command leaves its range, it
-    acts once more with them. The ridge is fitted to all labels of the flat data ``[N]``; the demonstrated commands are
-    those of the label budget (``labelled``).
+    The policy acts without limits first; if a command leaves its range, it acts once more with them. The ridge is
+    fitted to all labels of the flat data ``[N]``; the demonstrated commands are those of the budget (``labelled``).
 
     Returns:
         dict: ``steps``, ``robots``, ``explained`` (share of the changes' variance on labels left out),

@@ -22,12 +22,8 @@ class PluginError(ValueError):
 def load_plugins(names: Sequence[str]) -> None:
     """Imports modules, by their dotted names, that register something when they are imported; later calls do nothing.
 
-    The current directory is searched after the Python path, so that a file beside the data is found, as by ``python
-    -m``.
-
-    Raises:
-        PluginError: if a module is not found, or fails when it is imported; the message names it, and where it was
-            looked for or what went wrong.
+    The current directory is searched after the Python path, so that a file beside the data is found. A PluginError
+    names a module that is not found, and where it was looked for, or what went wrong in its import.
     """
     if isinstance(names, str):
         raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")

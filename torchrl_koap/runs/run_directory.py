@@ -159,12 +159,7 @@ def pretrained_folders() -> dict[str, Path]:
 
 
 def find_run(name: str | Path) -> Path:
-    """The folder of a run: a path as it is, ``pretrained:NAME`` looked up.
-
-    Raises:
-        ValueError: if there is no trained policy of that name; the message suggests the nearest.
-        RunDirectoryError: if there are none at all: the library was installed without its repository.
-    """
+    """The folder of a run: a path as it is, ``pretrained:NAME`` looked up; an unknown name suggests the nearest."""
     name = str(name)
     if not name.startswith(PREFIX):
         return Path(name)

@@ -26,8 +26,8 @@ class AsynchronousAgent(Agent):
         first states of P'                           P_4 = P'_1, P_5 = P'_2: executed before P' is there
 
     Real-time chunking (arXiv 2506.07339) with the hard constraint: at every solver step the states that will have been
-    executed when the plan is ready take the place of the planner's own. How many these are is taken from the time that
-    the last plan took. Actions are decoded at every step from the history observed by then, as in ``"feedback"``.
+    executed when the plan is ready take the place of the planner's own, as many as the time of the last plan says.
+    Actions are decoded at every step from the history observed by then, as in ``"feedback"``.
 
     The first plan of an episode has no predecessor: hand the first observation to :meth:`reset`, which makes it before
     the clock runs.

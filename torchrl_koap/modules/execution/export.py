@@ -110,14 +110,9 @@ def export_policy(
     ``torch.export.load(file, extra_files={"facts.json": ""})``, the metadata of an ONNX model, entry by entry as JSON,
     ``get_metadata()`` of an AOTInductor package.
 
-    Keyword Args:
-        kind (str): ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) or ``"aoti"``
-            (AOTInductor; needs a C++ compiler).
-        tolerance (float): largest difference to the original, relative to the largest number of its output.
-
-    Raises:
-        ValueError: for another kind.
-        ExportError: if a package or compiler is missing, or the numbers differ.
+    Kinds are ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) and ``"aoti"`` (AOTInductor;
+    needs a C++ compiler). The tolerance is relative to the largest number of the original's output. It is an
+    ExportError if a package or compiler is missing, or the numbers differ.
     """
     write, read = lookup(_KINDS, kind, "export format")
     file = Path(file)

@@ -39,8 +39,7 @@ class ConditionalSampler(TensorDictModuleBase):
             further numbers that the condition holds, such as the relative positions of objects.
         solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
         num_steps (int): solver steps. Defaults to 10.
-        noise_key (NestedKey, optional): entry of start noise ``[*B, H, width]``, read if present. Defaults to
-            ``"noise"``.
+        noise_key (NestedKey, optional): entry of start noise ``[*B, H, width]``, read if present. Default: ``"noise"``.
 
     Raises:
         ValueError: for sizes below 1, several in- or out-keys, an unknown solver; at the call for a history or noise of
