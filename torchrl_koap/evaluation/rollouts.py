@@ -130,7 +130,7 @@ def rollouts_to_tensors(
     columns = [slice(part.start, part.start + 2) for part in (position, *objects)]
     paths = [torch.stack([seen[:, part] for part in columns], 1).float() for seen in frames]
     path = pad(paths, padding_value=torch.nan)
-    none = torch.zeros(0, 1, 1 + max(shown, default=1))
+    none = torch.zeros(0, 1, 1 + max((1, *shown)))
     made = [episode.get(PLAN, none)[::interval] for episode in episodes]
     plans = [plan[..., :2] if plans_position else none[..., :2] for plan in made]
     tensors = {
