@@ -195,14 +195,13 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         )
     data, report = trained.hide_labels(trained.data(config.dataset))
     steps = infer_steps(controller, trained.seen(data))
-    left = int(steps[EPISODE][~steps[HAS_ACTION]].unique().numel())
-    count = max(1, min(_FEW, left)) if config.count is None else config.count
+    left = len(steps[EPISODE][~steps[HAS_ACTION]].unique())
     choices = rank_trajectories(
         steps["latent_action"],
         steps[EPISODE],
         steps[HAS_ACTION],
         penalty=penalty,
-        count=count,
+        count=max(1, min(_FEW, left)) if config.count is None else config.count,
         bias=bool(controller.action_decoder.linear.bias.any()),
     )
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]

@@ -141,7 +141,5 @@ def open_logger(name: str, out: Path) -> Iterator[Any | None]:
 
 def log_scores(logger: Any, scores: Mapping[str, Any]) -> None:
     """Logs the scores of an evaluation that are finite numbers, as ``eval/NAME``."""
-    numbers = {
-        name: value for name, value in scores.items() if isinstance(value, (int, float)) and math.isfinite(value)
-    }
+    numbers = {name: v for name, v in scores.items() if isinstance(v, (int, float)) and math.isfinite(v)}
     logger.log_metrics({f"eval/{name}": float(value) for name, value in numbers.items()}, step=0)

@@ -217,9 +217,8 @@ class PlanningPolicy(TensorDictModuleBase):
             return actions
         commands, taken = actions[..., self.decoded["actions"]], actions.clone()
         last = observations[..., -1:, self.decoded["commands"]]
-        taken[..., self.decoded["actions"]] = (
-            torch.cat([last, commands.to(last.dtype)], -2).diff(dim=-2).to(taken.dtype)
-        )
+        changes = torch.cat([last, commands.to(last.dtype)], -2).diff(dim=-2)
+        taken[..., self.decoded["actions"]] = changes.to(taken.dtype)
         return taken
 
     def attach(self, env: EnvBase) -> None:

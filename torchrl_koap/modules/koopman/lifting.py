@@ -164,9 +164,7 @@ class KoopmanOperator(TensorDictModuleBase):
         """Draws ``K`` near the identity, and sets ``B`` to zero."""
         if self.input is not None:
             self.input.zero_()
-        self.weight.normal_(std=1e-3).add_(
-            torch.eye(self.latent_dim, dtype=self.weight.dtype, device=self.weight.device)
-        )
+        self.weight.normal_(std=1e-3).add_(torch.eye(self.latent_dim).to(self.weight))
 
     def eigenvalues(self) -> Tensor:
         """Computes the eigenvalues of ``K``, complex ``[m]``, largest modulus first."""

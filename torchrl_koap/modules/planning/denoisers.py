@@ -24,9 +24,7 @@ class StepEmbedding(nn.Module):
         half = embedding_dim // 2
         self.register_buffer("frequencies", torch.exp(torch.arange(half) * (-math.log(10000.0) / (half - 1))))
         self.network = nn.Sequential(
-            nn.Linear(embedding_dim, 4 * embedding_dim),
-            nn.SiLU(),
-            nn.Linear(4 * embedding_dim, embedding_dim),
+            nn.Linear(embedding_dim, 4 * embedding_dim), nn.SiLU(), nn.Linear(4 * embedding_dim, embedding_dim)
         )
 
     def forward(self, time: Tensor) -> Tensor:
