@@ -61,7 +61,7 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
             if (shown := {key: value for key, value in source.items() if key not in elsewhere})
         ],
         episodes=evaluation.get("episode") or evaluation.get("trajectory"),
-        again=[run.config["command"]] * _given(run.config, "command") + [_eval_command(run)] * bool(evaluation),
+        again=[config.get("command")] * _given(config, "command") + [_eval_command(run)] * bool(evaluation),
         configured=bool(config),
         has_command=_given(config, "command"),
         versions=config.get("versions"),
