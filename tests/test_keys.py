@@ -16,7 +16,6 @@ from torchrl_koap.modules import (
     LatentActionMLP,
     LinearActionDecoder,
 )
-from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 
 
 def flat(lengths=(3, 1, 4), dtype=torch.float32):
@@ -121,7 +120,6 @@ def test_blanked_commands():
     ("part", "entry"),
     [
         (KoopmanLifting(2, 4), "state"),
-        (CompactLifting(2, 2), "state"),
         (KoopmanOperator(4), "lifted_state"),
         (LatentActionMLP(2, 4), "state"),
         (LinearActionDecoder(4, 2), "latent_action"),

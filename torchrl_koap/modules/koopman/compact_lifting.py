@@ -263,4 +263,4 @@ class CompactLifting(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the lifted states."""
-        return tensordict.set(self.out_keys[0], self.encode(read_entry(self, tensordict, self.in_keys[0])))
+        return tensordict.set(LIFTED_STATE, self.encode(read_entry(self, tensordict, STATE, "rename_key_()")))
