@@ -24,12 +24,13 @@ from tables import open_table
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, train
 from torchrl_koap.data import read_recordings
+from torchrl_koap.envs.scooping.expert import HABITS
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.scooping import CAMERA, EMBODIMENTS
+from torchrl_koap.tasks.scooping import CAMERA
 from torchrl_koap.training.methods import METHODS as KNOWN
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.vision.embedding import embed_recordings, join_recordings, read_sources
@@ -38,7 +39,7 @@ from torchrl_koap.vision.encoder import SCOOPING, Projection, projection_of
 RESULTS = Path(__file__).parent / "results"
 Task = Literal["scooping", "scooping_moving_bowl"]
 Unlabelled = Literal["robot", "hand", "both", "none"]
-NETWORK = "torchrl_koap.vision.backbones:lite0_cells"
+NETWORK = Projection.load(SCOOPING).about["network"]
 FEW_ROBOTS = ("hand", "none")  # the labelled demonstrations are all there are of the robot
 METHODS = ("koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear")
 KEYS = ("labels", "unlabelled", "method", "seed", "n")
@@ -143,11 +144,11 @@ def main(
     for number in labels:
         if not 1 <= number <= demonstrations:
             raise ValueError(f"labels must be from 1 to the {demonstrations} demonstrations, got {number}")
-    for who in EMBODIMENTS:
+    for who in HABITS:
         if not (folder / who / "meta" / "info.json").exists():
             record_videos(folder / who, who, demonstrations, task=task)
     if fit:
-        recordings, _ = read_sources([folder / who for who in EMBODIMENTS], get_task(task))
+        recordings, _ = read_sources([folder / who for who in HABITS], get_task(task))
         print(embed_recordings(recordings, get_task(task), folder / "fit", network=NETWORK))
         shutil.copy(folder / "fit" / "cameras" / f"{CAMERA}.safetensors", SCOOPING.with_stem(task))
         return

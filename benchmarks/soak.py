@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -25,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 from tiny_runs import TINY, koap, write_demonstrations  # noqa: E402
 
 from torchrl_koap import load_policy
-from torchrl_koap.envs.registry import make_env_of
+from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import get_task
@@ -55,11 +56,11 @@ def quick_run(folder: str) -> str:
 def play(episodes: range, batch_size: int, run: str) -> Iterator[tuple[float, ...]]:
     """Episodes, seconds and memory after each batch; nothing of an episode is kept."""
     task = get_task("avoiding")
-    policy, make_env = load_policy(find_run(run)), make_env_of(task, num_threads=1)
+    policy, make = load_policy(find_run(run)), partial(make_env, task, max_steps=task.max_steps, noisy=True)
     began = time.perf_counter()
     for first in episodes[::batch_size]:
         seeds = range(first, min(first + batch_size, episodes.stop))
-        roll_out(policy, make_env, seeds, max_steps=task.max_steps, batch_size=batch_size)
+        roll_out(policy, make, seeds, max_steps=task.max_steps, batch_size=batch_size)
         yield seeds.stop, time.perf_counter() - began, resident(), largest()
 
 

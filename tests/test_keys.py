@@ -7,7 +7,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.data import flatten_trajectories
-from torchrl_koap.keys import REQUIRED, LayoutError, validate
+from torchrl_koap.files import DataError
+from torchrl_koap.keys import REQUIRED, validate
 from torchrl_koap.modules import (
     KoopmanLifting,
     KoopmanOperator,
@@ -26,7 +27,7 @@ def flat(lengths=(3, 1, 4), dtype=torch.float32):
 
 
 def problems(data, **kwargs):
-    with pytest.raises(LayoutError) as error:
+    with pytest.raises(DataError) as error:
         validate(data, **kwargs)
     assert all(problem in str(error.value) for problem in error.value.problems)
     return error.value.problems

@@ -13,7 +13,6 @@ COVERED_BY = {
     "commands/doctor.py": "commands/test_cli.py",
     "commands/run_commands.py": "commands/test_eval.py",
     "commands/subcommands.py": "commands/test_cli.py",
-    "data/formats/arrow.py": "data/formats/test_lerobot.py",
     "envs/experts/push_planning.py": "envs/experts/test_aligning.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/experts/sorting_decision.py": "envs/experts/test_sorting.py",

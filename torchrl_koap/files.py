@@ -11,9 +11,9 @@ import hashlib
 import json
 import math
 import os
+import secrets
 import shutil
 import stat
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
@@ -47,10 +47,16 @@ class DataError(ValueError):
         super().__init__(f"{source} cannot be used:{listed}")
 
 
-def some(names: Sequence[str], most: int = 5) -> str:
-    """Joins names for a message, the first few of them: ``"a.csv, b.csv and 1 more"``."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+def refuse(source: str | Path, problems: Sequence[str]) -> None:
+    """Raises a :class:`DataError` with all faults of a source, where there are any."""
+    if problems:
+        raise DataError(source, problems)
+
+
+def some(names: Sequence[object]) -> str:
+    """Joins names for a message, the first five of them: ``"a.csv, b.csv, c.csv, d.csv, e.csv and 1 more"``."""
+    more = len(names) - 5
+    return ", ".join(map(str, names[:5])) + (f" and {more} more" if more > 0 else "")
 
 
 def gathered(faults: Iterable[tuple[str, str]]) -> list[str]:
@@ -129,44 +135,31 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _naming(path):
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-        os.close(handle)
-        aside = Path(name)
-        try:
-            yield aside
-            aside.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
-            os.replace(aside, path)
-        except BaseException:
-            aside.unlink(missing_ok=True)
+    aside = _beside(path, "tmp")
+    try:
+        aside.touch(exist_ok=False)
+        yield aside
+        os.replace(aside, path)
+    except BaseException as error:
+        aside.unlink(missing_ok=True)
+        if not isinstance(error, OSError) or error.errno not in _NO_PLACE:
             raise
+        kept = "what was there before is kept" if path.exists() else "nothing of it is left"
+        raise OSError(error.errno, f"{path} could not be written: {error.strerror}; {kept}") from error
 
 
 @contextlib.contextmanager
 def replacing_folder(path: str | Path) -> Iterator[Path]:
     """Gives a folder to write into, beside ``path``, whose place it takes when the block ends without an error."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    aside = _beside(path, "tmp")
+    aside.mkdir(parents=True)
     try:
         yield aside
-        aside.chmod(0o777 & ~_umask())
         _exchange(aside, path)
     except BaseException:
         shutil.rmtree(aside, ignore_errors=True)
         raise
-
-
-@contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Says which file could not be written, and that nothing was lost."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in _NO_PLACE:
-            raise
-        kept = "what was there before is kept" if path.exists() else "nothing of it is left"
-        raise OSError(error.errno, f"{path} could not be written: {error.strerror}; {kept}") from error
 
 
 class LockedError(RuntimeError):
@@ -200,22 +193,19 @@ def _exchange(new: Path, path: Path) -> None:
     except OSError:
         if not path.is_dir():
             raise
-    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+    old = _beside(path, "old")
+    os.replace(path, old)
     try:
-        os.replace(path, old)
         os.replace(new, path)
     except BaseException:
-        if any(old.iterdir()) and not path.exists():
-            os.replace(old, path)
+        os.replace(old, path)
         raise
-    finally:
-        shutil.rmtree(old, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _beside(path: Path, ending: str) -> Path:
+    """A hidden name of its own in the same folder."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{ending}")
 
 
 _Made = TypeVar("_Made")

@@ -28,6 +28,7 @@ transition from ``x_t`` to ``x_{t+1}``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_koap.files import DataError
+from torchrl_koap.files import refuse
 
 OBSERVATION = "observation"
 STATE = "state"
@@ -68,13 +69,6 @@ _FLOATS = (OBSERVATION, STATE, ACTION, NEXT_OBSERVATION, NEXT_REWARD)
 _FLAGS = (HAS_ACTION, NEXT_DONE, NEXT_TERMINATED, NEXT_TRUNCATED)
 _COUNTS = (EPISODE, STEP_COUNT)
 REQUIRED = (OBSERVATION, ACTION, *_FLAGS, *_COUNTS, NEXT_OBSERVATION)
-
-
-class LayoutError(DataError):
-    """A tensordict that does not follow the storage layout."""
-
-    def __init__(self, problems: list[str]):
-        super().__init__("data that do not follow the storage layout", problems)
 
 
 def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, rename: str = "in_key=...") -> Tensor:
@@ -137,36 +131,37 @@ def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDic
             :func:`~torchrl_koap.data.label_budget.hide_commands` blanked them. Default: none.
 
     Raises:
-        LayoutError: with *all* problems: missing keys, wrong dtypes or shapes, non-finite states, labels that are NaN
+        DataError: with *all* problems: missing keys, wrong dtypes or shapes, non-finite states, labels that are NaN
             although ``has_action`` says they are there (or the reverse: a leak), step counts that do not restart with
             the trajectory, trajectories that are not contiguous.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.keys import LayoutError, validate
+        >>> from torchrl_koap.files import DataError
+        >>> from torchrl_koap.keys import validate
         >>> try:
         ...     validate(TensorDict({"observation": torch.zeros(3, 2)}, [3]))
-        ... except LayoutError as error:
+        ... except DataError as error:
         ...     print(error.problems[0])
         missing key 'action'
     """
     if data.batch_dims != 1:
-        raise LayoutError([f"batch size must be [N] (flat over steps), got {list(data.batch_size)}"])
-    if data.shape[0] == 0:
-        raise LayoutError(["there are no steps (batch size [0])"])
-    present = set(data.keys(include_nested=True, leaves_only=True))
-    problems = [f"missing key {key!r}" for key in REQUIRED if key not in present]
-    problems += _shape_problems(data, present)
-    if not problems:  # the rules below compare entries with each other and need all of them
-        problems += _value_problems(data, present, command)
-    if problems:
-        raise LayoutError(problems)
+        problems = [f"batch size must be [N] (flat over steps), got {list(data.batch_size)}"]
+    elif not len(data):
+        problems = ["there are no steps (batch size [0])"]
+    else:
+        present = set(data.keys(include_nested=True, leaves_only=True))
+        problems = [f"missing key {key!r}" for key in REQUIRED if key not in present]
+        problems += _shape_problems(data, present)
+        if not problems:  # the rules below compare entries with each other and need all of them
+            problems = list(_value_problems(data, present, command))
+    refuse("data that do not follow the storage layout", problems)
     return data
 
 
-def _shape_problems(data: TensorDictBase, present: set) -> list[str]:
-    steps, problems = data.shape[0], []
+def _shape_problems(data: TensorDictBase, present: set) -> Iterator[str]:
+    steps = len(data)
     kinds = (
         ("a float tensor [N, d]", _FLOATS, lambda value: value.ndim == 2 and value.is_floating_point()),
         ("a bool tensor [N, 1]", _FLAGS, lambda value: value.dtype == torch.bool and value.shape == (steps, 1)),
@@ -175,57 +170,49 @@ def _shape_problems(data: TensorDictBase, present: set) -> list[str]:
     for wanted, names, fits in kinds:
         for key in names:
             if key in present and not fits(value := data.get(key)):
-                problems.append(f"{key!r} must be {wanted}, got {value.dtype} {list(value.shape)}")
-    if not problems and {OBSERVATION, NEXT_OBSERVATION} <= present:
-        width, next_width = data.get(OBSERVATION).shape[-1], data.get(NEXT_OBSERVATION).shape[-1]
-        if width != next_width:
-            problems.append(f"'observation' has {width} columns, {NEXT_OBSERVATION!r} has {next_width}")
-    return problems
+                yield f"{key!r} must be {wanted}, got {value.dtype} {list(value.shape)}"
 
 
-def _value_problems(data: TensorDictBase, present: set, command: slice | None) -> list[str]:
-    problems = []
+def _value_problems(data: TensorDictBase, present: set, command: slice | None) -> Iterator[str]:
+    width, next_width = data.get(OBSERVATION).shape[-1], data.get(NEXT_OBSERVATION).shape[-1]
+    if width != next_width:
+        yield f"'observation' has {width} columns, {NEXT_OBSERVATION!r} has {next_width}"
     for key in (OBSERVATION, STATE, NEXT_OBSERVATION):
         if key in present:
             allowed = command if key != STATE else None
             bad = torch.cat([_not_finite(values, allowed) for values in data.get(key).split(_PART)])
             if bad.any():
-                problems.append(f"{key!r} is NaN or infinite in {int(bad.sum())} steps, first at step {_first(bad)}")
+                yield f"{key!r} is NaN or infinite in {int(bad.sum())} steps, first at step {_first(bad)}"
 
     action, has_action = data.get(ACTION), data.get(HAS_ACTION).squeeze(-1)
     lost = has_action & ~action.isfinite().all(-1)
     if lost.any():
-        problems.append(f"'action' is not finite in {int(lost.sum())} labelled steps, first at step {_first(lost)}")
+        yield f"'action' is not finite in {int(lost.sum())} labelled steps, first at step {_first(lost)}"
     leaked = ~has_action & ~action.isnan().all(-1)
     if leaked.any():
-        problems.append(
-            f"'action' holds numbers in {int(leaked.sum())} unlabelled steps, first at step {_first(leaked)}"
-            " (an action outside the label budget must be NaN)"
-        )
+        found = f"'action' holds numbers in {int(leaked.sum())} unlabelled steps, first at step {_first(leaked)}"
+        yield f"{found} (an action outside the label budget must be NaN)"
 
     episode, step_count = data.get(EPISODE), data.get(STEP_COUNT)
     same = episode[1:] == episode[:-1]
     edge = torch.ones(1, dtype=torch.bool, device=same.device)
     starts = torch.cat([edge, ~same])
     if int(starts.sum()) != episode[starts].unique().numel():
-        problems.append("'episode': the steps of a trajectory must lie one after the other")
+        yield "'episode': the steps of a trajectory must lie one after the other"
     wrong = starts & (step_count != 0)
     wrong[1:] |= same & (step_count[1:] != step_count[:-1] + 1)
     if wrong.any():
-        problems.append(f"'step_count' must count 0, 1, 2, ... in a trajectory, first fault at step {_first(wrong)}")
+        yield f"'step_count' must count 0, 1, 2, ... in a trajectory, first fault at step {_first(wrong)}"
 
     done = data.get(NEXT_DONE).squeeze(-1)
     ends = torch.cat([~same, edge])
     if (ends & ~done).any():
-        problems.append(f"('next', 'done') is False at the end of the trajectory at step {_first(ends & ~done)}")
+        yield f"('next', 'done') is False at the end of the trajectory at step {_first(ends & ~done)}"
     if (done & ~ends).any():
-        problems.append(f"('next', 'done') is True inside a trajectory at step {_first(done & ~ends)}")
+        yield f"('next', 'done') is True inside a trajectory at step {_first(done & ~ends)}"
     stopped = (data.get(NEXT_TERMINATED) | data.get(NEXT_TRUNCATED)).squeeze(-1)
     if (done != stopped).any():
-        problems.append(
-            f"('next', 'done') must be 'terminated or truncated', first fault at step {_first(done != stopped)}"
-        )
-    return problems
+        yield f"('next', 'done') must be 'terminated or truncated', first fault at step {_first(done != stopped)}"
 
 
 def _not_finite(values: torch.Tensor, allowed: slice | None) -> torch.Tensor:

@@ -32,7 +32,7 @@ from torchrl_koap.data import (
     make_window_buffer,
     select_state,
 )
-from torchrl_koap.envs import AvoidingEnv, mode_index_of
+from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
@@ -107,7 +107,7 @@ planner_loss.target_network_params.to_module(planner)
 policy = make_policy(planner, inverse_dynamics, state_of=task.state_columns)
 seeds = list(range(24))
 episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
-mode_index = mode_index_of(task)
+mode_index = task.modes.index_of
 result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
 rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], mode_index=mode_index, interval=4)
 rollouts = {name: tensor.numpy() for name, tensor in rollouts.items()}

@@ -50,11 +50,6 @@ def goal_reached(task, state):
     return (state[..., task.state_slices["puck_xy"]] - state.new_tensor(GOAL)).norm(dim=-1) < GOAL_RADIUS
 
 
-def mode_index(mode):
-    """Number of the mode from the environment's leaf ``mode`` [*B, 1]."""
-    return mode[..., 0].long()
-
-
 task = register_task(
     Task(
         name="push_past_a_post",
@@ -66,7 +61,7 @@ task = register_task(
         robot=(0, 1),
         relative_positions=(("robot_xy", "puck_xy"),),
         goal=f"{HERE}:goal_reached",
-        modes=Modes((("side", ("left", "right")),), index=f"{HERE}:mode_index", entropy="all"),
+        modes=Modes((("side", ("left", "right")),), leaves=((0,), (1,)), entropy="all"),
         env=f"{HERE}:PushEnv",
         expert=f"{HERE}:PushExpert",
         scene=Scene(

@@ -24,7 +24,7 @@ import torch
 from matplotlib.figure import Figure
 
 from torchrl_koap import get_task, load_policy
-from torchrl_koap.envs import AvoidingEnv, mode_index_of
+from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.runs.run_directory import find_run
@@ -74,7 +74,7 @@ def closed_loop(steps, temperature=1.0):
     policy = load_policy(run, temperature=temperature)
     policy.planner.num_steps = steps
     episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
-    return score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index_of(task)), episodes
+    return score(episodes, seeds, num_modes=task.num_modes, mode_index=task.modes.index_of), episodes
 
 
 print("\nclosed loop, 24 rollouts each")

@@ -9,7 +9,6 @@ import torch
 from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, select_state
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.files import DataError
-from torchrl_koap.keys import LayoutError
 from torchrl_koap.tasks import get_task
 
 AVOIDING = get_task("avoiding")
@@ -55,7 +54,7 @@ def test_save_refuses(tmp_path):
         save_ted(recorded(), tmp_path / "work", AVOIDING)
     with pytest.raises(TypeError, match="only tensors can be saved, .'note'. are none"):
         save_ted(recorded().set_non_tensor("note", "text"), tmp_path / "other", AVOIDING)
-    with pytest.raises(LayoutError):
+    with pytest.raises(DataError):
         save_ted(recorded().exclude("action"), tmp_path / "other", AVOIDING)
     with pytest.raises(DataError, match="holds no data set"):
         load_ted(tmp_path / "work")

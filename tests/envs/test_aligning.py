@@ -17,7 +17,7 @@ from env_test_base import (
 )
 
 from torchrl_koap.envs import AligningEnv
-from torchrl_koap.envs.aligning import INSIDE_REACH, mode_index
+from torchrl_koap.envs.aligning import INSIDE_REACH
 from torchrl_koap.envs.contexts import yaw_quaternions
 
 SENSITIVE = 1  # the recorded episode in which a start error of 1e-8 rad grows to millimetres
@@ -75,7 +75,7 @@ def test_first_observation_and_latency_of_one_step():
     np.testing.assert_allclose(seen[13:16], [0.55, 0.3, 0.0])
     np.testing.assert_allclose(seen[16:], yaw_quaternions(np.array(-0.7)))
     np.testing.assert_array_equal(first["context"], CONTEXT)
-    assert mode_index(first["mode"]).tolist() == [-1]
+    assert env.task.modes.index_of(first["mode"]).tolist() == [-1]
     step, before = torch.tensor([0.005, 0.010, -0.006], dtype=torch.float64), seen[3:13]
     for k in range(1, 6):
         out = act(env, step)["observation"][0].numpy()

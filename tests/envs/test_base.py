@@ -10,7 +10,7 @@ from torchrl_koap.envs.contexts import evaluation_contexts
 
 
 def started(make, task, steps, **options):
-    contexts = None if task == "avoiding" else evaluation_contexts(task, 2)
+    contexts = None if task == "avoiding" else evaluation_contexts(task)[:2]
     env = make(2, dtype=torch.float64, **options)
     data = env.reset() if contexts is None else env.reset(contexts=contexts)
     torch.manual_seed(0)

@@ -2,6 +2,7 @@
 """Contexts: ranges, repeatability, the shipped table, D3IL's own files, and what is said about wrong ones."""
 
 import hashlib
+import json
 import math
 import pickle
 
@@ -74,14 +75,14 @@ def test_the_table_holds_60_contexts_inside_the_ranges(task):
     np.testing.assert_array_equal(check_contexts(get_task(task), table), table)
     assert np.abs(table[..., 2]).max() <= math.radians(TASKS[task].scene.start_yaw[1])
     assert len(np.unique(table.reshape(60, -1), axis=0)) == 60
-    np.testing.assert_array_equal(evaluation_contexts(task, 3), table[:3])
+    np.testing.assert_array_equal(evaluation_contexts(task), table)
     table[:] = 0  # what is handed out is a copy
     assert evaluation_contexts(task).any()
 
 
 def test_the_table_is_the_one_that_results_refer_to():
     assert hashlib.sha256(contexts.TABLE.read_bytes()).hexdigest() == TABLE_CHECKSUM
-    stored = contexts._table()
+    stored = json.loads(contexts.TABLE.read_text())
     for task, seed in stored["seeds"].items():
         np.testing.assert_allclose(stored["contexts"][task], draw_contexts(task, 60, seed), rtol=0, atol=1e-6)
 
@@ -159,9 +160,6 @@ def test_contexts_that_a_task_never_draws_are_named():
 def test_bad_numbers_and_tasks_without_contexts():
     with pytest.raises(ValueError, match="at least 1, got 0"):
         draw_contexts("aligning", 0)
-    for num in (0, 61):
-        with pytest.raises(ValueError, match=f"holds 60 contexts of task 'aligning', asked for {num}"):
-            evaluation_contexts("aligning", num)
     for call in (lambda: draw_contexts("avoiding", 1), lambda: evaluation_contexts("avoiding")):
         with pytest.raises(ValueError, match="'avoiding' has no contexts"):
             call()

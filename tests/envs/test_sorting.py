@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import SortingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
-from torchrl_koap.envs.sorting import BIN_X, BIN_Y, mode_index
+from torchrl_koap.envs.sorting import BIN_X, BIN_Y
 from torchrl_koap.tasks.sorting import box_colours
 
 SENSITIVE = (1, 2)  # episodes in which a change of 1e-8 rad grows to millimetres
@@ -58,7 +58,7 @@ def test_parity_with_the_original_from_its_state():
 
 @pytest.mark.parametrize("num_boxes", [2, 4, 6])
 def test_all_numbers_of_boxes(num_boxes):
-    table = evaluation_contexts("sorting" if num_boxes == 4 else f"sorting_{num_boxes}", 2)
+    table = evaluation_contexts("sorting" if num_boxes == 4 else f"sorting_{num_boxes}")[:2]
     env = SortingEnv(2, num_boxes=num_boxes, dtype=torch.float64)
     check_env_specs(env)
     first = env.reset(contexts=table)
@@ -72,10 +72,9 @@ def test_all_numbers_of_boxes(num_boxes):
     np.testing.assert_allclose(
         env.sims.object_poses[..., 2], 0.13, atol=5e-4
     )  # pushed out of the platform, as measured
-    poses = env.raw_objects()
-    assert tuple(poses) == env.task.objects
-    for index, pose in enumerate(poses.values()):
-        assert pose.shape == (2, 7)
+    _, poses = env.raw_log()
+    assert poses.shape == (2, num_boxes, 7)
+    for index, pose in enumerate(poses.swapaxes(0, 1)):
         np.testing.assert_allclose(pose[:, :2], out["observation"][:, 4 + 3 * index : 6 + 3 * index], atol=1e-3)
 
 
@@ -122,7 +121,7 @@ def test_one_arrival_per_step_nearest_first_and_never_taken_back():
     assert put(env, [away, (0.625, 0.32), away, away])[1] == [1, 0, 1, -1]  # red in the blue bin
     assert put(env, [away, red, away, away]) == (False, [1, 0, 1, 0])
     assert put(env, [red, red, blue, blue]) == (True, [1, 0, 1, 0])
-    assert mode_index(torch.as_tensor(env._mode)).tolist() == [4, -1]
+    assert env.task.modes.index_of(torch.as_tensor(env._mode)).tolist() == [4, -1]
     env.set_state(1, env.get_state(0))
     assert env._noted[1].tolist() == [3, 0, 2, 1] and env._mode[1].tolist() == [1, 0, 1, 0]
     env.reset()

@@ -155,10 +155,8 @@ def test_raw_log_holds_joints_and_boxes_but_no_pose_command():
     env = StackingEnv(2, dtype=torch.float64, seed=0)
     env.reset()
     act(env, [0.01] * 7 + [0.08])
-    log, objects = env.raw_log(), env.raw_objects()
-    assert not {"des_c_pos", "des_c_quat"} & set(log)
+    log, poses = env.raw_log()
+    assert "des_c_pos" not in log
     np.testing.assert_array_equal(log["des_j_pos"], env.commands[:, :7])
-    assert log["gripper_width"].shape == (2,) and not log["des_j_vel"].any()
-    assert list(objects) == ["red", "green", "blue"] and objects["blue"].shape == (2, 7)
-    act(env, STILL_OPEN)
-    assert env.raw_log()["sim_step"].tolist() == [32, 32]
+    assert log["gripper_width"].shape == (2,)
+    assert poses.shape == (2, 3, 7)

@@ -31,7 +31,7 @@ def test_what_remains_is_what_the_task_shows_its_planner():
 
 
 def test_noise_has_the_stated_size_and_touches_nothing_else():
-    noisy = EndEffectorNoise("aligning", sigma=0.003, seed=1)
+    noisy = EndEffectorNoise("aligning", sigma=0.003)
     clean = torch.zeros(4000, 20)
     found = noisy(TensorDict({"observation": clean}, [4000]))["observation"]
     measured = get_task("aligning").observation["measured_xyz"]

@@ -58,7 +58,7 @@ def test_a_planner_alone_goes_on_from_its_own_plans():
 
 @pytest.mark.parametrize("name", ["aligning", "sorting", "stacking"])
 def test_contexts_are_found_again_in_the_first_observation(name):
-    task, contexts = get_task(name), evaluation_contexts(name, 3)
+    task, contexts = get_task(name), evaluation_contexts(name)[:3]
     env = make_env(name, 3, dtype=torch.float64)
     found = contexts_of(task, env.reset(contexts=contexts)["observation"]).numpy()
     assert abs(found[..., :2] - contexts[..., :2]).max() < 1e-3  # the reset lasts 1 ms

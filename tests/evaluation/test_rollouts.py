@@ -9,12 +9,13 @@ from torchrl.envs import TransformedEnv
 from toy_episodes import episode_of, number
 from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
 
-from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.transforms import EndEffectorNoise
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.modules import make_policy
+from torchrl_koap.tasks import get_task
 
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
 
@@ -30,7 +31,7 @@ def together():
 
 
 def facts(episodes, seeds=SEEDS):
-    rows = score(episodes, seeds, num_modes=24, mode_index=mode_index)["episode"]
+    rows = score(episodes, seeds, num_modes=24, mode_index=get_task("avoiding").modes.index_of)["episode"]
     return [(row["seed"], row["outcome"], row["mode"], row["steps"]) for row in rows]
 
 

@@ -4,7 +4,6 @@
 import numpy as np
 
 from torchrl_koap.data.formats.writers import LeRobotWriter
-from torchrl_koap.envs.scooping.recording import FilmedEpisode
 from torchrl_koap.tasks import get_task
 
 CAMERA = "observation.images.third_person"
@@ -14,7 +13,7 @@ def episode(embodiment, length=6, seed=0):
     generator = np.random.default_rng(seed)
     frames = generator.integers(0, 256, (length + 1, 8, 8, 3), dtype=np.uint8)
     action = generator.normal(size=(length, 7)) if embodiment == "robot" else None
-    return FilmedEpisode(frames, generator.normal(size=(length + 1, 3)), action)
+    return frames, generator.normal(size=(length + 1, 3)), action
 
 
 def write_camera_set(folder, embodiment, count=2, first=0):
@@ -23,6 +22,6 @@ def write_camera_set(folder, embodiment, count=2, first=0):
         folder, fps=10, state_names="xyz", action_names=actions, camera=CAMERA, embodiment=embodiment, task="scoop"
     )
     for seed in range(first, first + count):
-        seen = episode(embodiment, 6 + seed, seed)
-        writer.add(seen.state, seen.action, frames=seen.frames)
+        frames, states, actions = episode(embodiment, 6 + seed, seed)
+        writer.add(states, actions, frames=frames)
     return writer.close()

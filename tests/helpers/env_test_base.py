@@ -203,7 +203,7 @@ class ContextTestBase(EnvTestBase):
         torch.testing.assert_close(env.reset()["context"], again, rtol=0, atol=0)
 
     def test_wrong_contexts_are_named(self):
-        env, contexts = self.make(2), evaluation_contexts(self.make().task, 2)
+        env, contexts = self.make(2), evaluation_contexts(self.make().task)[:2]
         with pytest.raises(ValueError, match="wanted 2, got 1"):
             env.reset(contexts=contexts[:1])
         contexts[1, -1, 0] = 9.0

@@ -13,7 +13,6 @@ from torchrl_koap.tasks import get_task
 
 LABELS = {
     "unit": "trajectory",
-    "requested": 0.5,
     "selected_units": 1,
     "total_units": 2,
     "labelled_transitions": 20,

@@ -15,7 +15,7 @@ from small_controllers import plain_task
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.envs import make_env, mode_index_of
+from torchrl_koap.envs import make_env
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.evaluation.diagnosis import contexts_of
@@ -81,10 +81,10 @@ def test_contexts_come_from_the_task():
 def test_modes_scores_and_goal():
     task = get_task(NAME)
     assert [task.modes.name_of(mode) for mode in (0, 1, -1)] == ["left", "right", "no mode"]
-    assert mode_index_of(NAME)(torch.tensor([[1], [-1]])).tolist() == [1, -1]
+    assert task.modes.index_of(torch.tensor([[1], [-1]])).tolist() == [1, -1]
     env = make_env(task, 4, max_steps=5)
     episodes = list(env.rollout(5, break_when_any_done=False))
-    result = score(episodes, range(4), num_modes=2, mode_index=mode_index_of(task), contexts=[0, 0, 1, 1])
+    result = score(episodes, range(4), num_modes=2, mode_index=task.modes.index_of, contexts=[0, 0, 1, 1])
     assert result["rates"]["success"]["rate"] == 0.0 and result["episodes"] == 4
     assert task.goal_reached(torch.tensor([[0.0, 0.0, 0.5, 0.4], [0.5, 0.4, 0.0, 0.0]])).tolist() == [True, False]
 

@@ -43,6 +43,10 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
             "scene.shared_starts: 1 regions for 2 bodies",
         ),
         ({"modes": Modes(entropy="some")}, "modes.entropy: wanted one of all, contexts, solved_contexts, got 'some'"),
+        (
+            {"modes": Modes((("side", ("left", "right")),), leaves=((0,),))},
+            "modes.leaves: wanted one for each of 2 modes, got 1",
+        ),
     ],
 )
 def test_facts_that_do_not_fit_are_named(change, fault):

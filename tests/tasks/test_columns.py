@@ -46,17 +46,6 @@ def test_columns_have_names_and_units():
     assert columns.state_units == ("m", "m", "", "") and columns.state_dim == 4
 
 
-def test_a_feature_of_ones_own_is_an_import_string():
-    columns = Columns(**TOY, state={"tool": "plain", "box_xy": "torch:sin"})
-    assert columns.state_dim == 4 and columns.state_names[2:] == ("box_xy_0", "box_xy_1")
-    observation = torch.arange(7.0)[None]
-    wanted = torch.tensor([[2.0, 3.0, *torch.arange(4.0, 6.0).sin()]])
-    torch.testing.assert_close(columns.state_of(observation), wanted)
-    broken = Columns(**TOY, state={"tool": "torch:sinus"})
-    with pytest.raises(ValueError, match="a feature of task 'toy': module 'torch' has no 'sinus'"):
-        broken.state_of(observation)
-
-
 def test_wrong_observations_are_named():
     with pytest.raises(ValueError, match="task 'sorting' has 16 columns, got 4"):
         get_task("sorting").state_of(torch.zeros(2, 4))

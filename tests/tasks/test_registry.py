@@ -40,9 +40,7 @@ def test_a_task_may_be_registered_again_but_no_other_of_its_name(tasks):
     ("field", "value"),
     [
         *((field, "my_package:code") for field in ("env", "expert", "goal", "score", "tool_kinematics")),
-        ("modes", Modes(index="my_package:code")),
         ("modes", Modes(of_path="my_package:code")),
-        ("state", {"tool": "my_package:code"}),
     ],
 )
 def test_a_task_that_somebody_sent_may_name_no_code(field, value):

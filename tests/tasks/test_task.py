@@ -12,7 +12,6 @@ import pytest
 import torch
 from toy_task import TOY
 
-from torchrl_koap.envs import mode_index_of
 from torchrl_koap.tasks import TASKS, Action, Task, avoiding, get_task, sorting
 
 
@@ -113,18 +112,18 @@ for _name, _boxes in {"sorting": 4, "sorting_2": 2, "sorting_6": 6, "po_sorting"
 def test_modes_are_numbered_and_named_as_the_environment_tells_them(name):
     leaves, words = LEAVES[name]
     modes = TASKS[name].modes
-    assert mode_index_of(name)(leaves).tolist() == list(range(modes.number)) and TASKS[name].num_modes == modes.number
+    assert modes.index_of(leaves).tolist() == list(range(modes.number)) and TASKS[name].num_modes == modes.number
     assert [modes.name_of(mode) for mode in range(modes.number)] == [", ".join(each) for each in words]
     assert modes.name_of(modes.number) == modes.name_of(-1) == "no mode"
     undecided = leaves.clone()
     undecided[:, :2] = 0 if name == "avoiding" else -1
-    assert (mode_index_of(name)(undecided) == -1).all()
-    assert mode_index_of(name)(leaves.expand(2, -1, -1)).shape == (2, modes.number)
+    assert (modes.index_of(undecided) == -1).all()
+    assert modes.index_of(leaves.expand(2, -1, -1)).shape == (2, modes.number)
 
 
 def test_a_leaf_of_another_task_is_refused():
     with pytest.raises(ValueError, match=r"mode must have 9 entries on the last axis, got shape \[3, 8\]"):
-        mode_index_of("avoiding")(torch.zeros(3, 8))
+        TASKS["avoiding"].modes.index_of(torch.zeros(3, 8))
 
 
 def test_a_path_of_avoiding_tells_its_mode():

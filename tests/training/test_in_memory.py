@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig, Trained, fit, train
 from torchrl_koap.data import LabelBudget, cut_windows, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.data.ted import load_ted
-from torchrl_koap.keys import LayoutError
+from torchrl_koap.files import DataError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.runs.weights import load_tensors
@@ -166,7 +166,7 @@ def test_refusals():
         fit(select_state(data, (0, 1, 2)), task)
     wrong = data.clone()
     wrong["has_action"][-1] = True
-    with pytest.raises(LayoutError, match="'action' is not finite in 1 labelled steps"):
+    with pytest.raises(DataError, match="'action' is not finite in 1 labelled steps"):
         fit(wrong, task)
     planner = fit(data, task, method="linear", planner={"steps": 1, **SMALL}, progress=False).planner
     with pytest.raises(ValueError, match="method 'dp' samples actions and has no planner"):

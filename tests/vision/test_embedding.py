@@ -104,9 +104,9 @@ def test_a_task_with_embeddings_of_its_own_takes_several_sources(tmp_path):
     assert about["lengths"] == [6, 7, 6, 7] and about["labelled_steps"] == 13 and about["task"] == "scooping"
     assert data["has_action"][:13].all() and not data["has_action"][13:].any()
     wanted = load_encoder(tmp_path / "both" / "cameras" / "third_person.safetensors")
-    frames = torch.from_numpy(episode("robot").frames)
+    frames, states, _ = (torch.from_numpy(part) for part in episode("robot"))
     torch.testing.assert_close(data["observation"][:6, :96], wanted.embed(frames)[:6], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(data["observation"][:6, 96:], episode("robot").state[:6], rtol=1e-6)
+    np.testing.assert_allclose(data["observation"][:6, 96:], states[:6], rtol=1e-6)
 
 
 def embedder_of(size):

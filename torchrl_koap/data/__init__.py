@@ -15,8 +15,7 @@ from torchrl_koap.data.trajectories import (
     flatten_trajectories,
     select_state,
 )
-from torchrl_koap.data.window_sampler import WindowSampler
-from torchrl_koap.data.windows import WindowTable, cut_windows, make_window_buffer
+from torchrl_koap.data.windows import WindowSampler, WindowTable, cut_windows, make_window_buffer
 from torchrl_koap.files import DataError
 
 __all__ = [

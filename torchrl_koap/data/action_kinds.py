@@ -184,7 +184,5 @@ def _clear(one: np.ndarray | float, other: np.ndarray | float) -> np.ndarray | b
 
 
 def _correlations(likely: list[LikelyKind]) -> str:
-    columns, changes = (
-        np.mean([getattr(each, name) for each in likely]) for name in ("follows_column", "follows_change")
-    )
+    columns, changes = np.mean([(each.follows_column, each.follows_change) for each in likely], axis=0)
     return f"mean correlation {columns:.2f} with a column, {changes:.2f} with its change"

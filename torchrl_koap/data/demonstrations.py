@@ -22,7 +22,7 @@ from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
 from torchrl_koap.data.quality import constant_columns, find_warnings
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state
-from torchrl_koap.files import DataError, option
+from torchrl_koap.files import option, refuse
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
@@ -222,8 +222,7 @@ def make_demonstrations(
             f"robot: {which} never move where there are labels, so nothing tells what an action does: name others in"
             f" {option('robot')}"
         )
-    if problems:
-        raise DataError(f"task {name!r}", problems)
+    refuse(f"task {name!r}", problems)
     constants = constant_columns(np.concatenate(actions))
     data = flatten_trajectories([frames - origin for frames in recordings.states], actions)
     moved = [others.index(column) for column in reached]

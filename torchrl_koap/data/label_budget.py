@@ -32,7 +32,6 @@ class LabelReport:
     """What a label budget spent."""
 
     unit: str  # what was drawn
-    requested: float | int  # the fraction or count that was asked for
     selected_units: int
     total_units: int
     labelled_transitions: int  # distinct transitions that keep their action
@@ -165,7 +164,6 @@ class LabelBudget:
         touched = np.add.reduceat(kept, starts, dtype=np.int64) > 0
         report = LabelReport(
             unit=self.unit,
-            requested=next((asked for asked in (self.fraction, self.count) if asked is not None), len(chosen)),
             selected_units=len(chosen),
             total_units=len(first),
             labelled_transitions=int(kept.sum()),

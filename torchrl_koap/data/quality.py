@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -102,27 +101,22 @@ def _trajectory_warnings(
             yield f"{name}: {names[far]} reaches {farthest[far]:.3g} {units[far]}"
 
 
-def _short(lengths: Sequence[int], called: Sequence[str]) -> list[str]:
+def _short(lengths: Sequence[int], called: Sequence[str]) -> Iterator[str]:
     short = [f"{name} ({length})" for name, length in zip(called, lengths, strict=True) if length < WINDOW]
-    if not short:
-        return []
-    return [
-        f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
-        f" refuse them: {some(short)}; leave them out (`koap convert --drop-short`)"
-    ]
+    if short:
+        yield (
+            f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
+            f" refuse them: {some(short)}; leave them out (`koap convert --drop-short`)"
+        )
 
 
-def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
-    found: list[str] = []
+def _column_warnings(state: Tensor, names: Sequence[str]) -> Iterator[str]:
     first: dict[bytes, str] = {}
     for name, values in zip(names, state.unbind(-1), strict=True):
         if bool((values == values[:1]).all()):
-            found.append(f"column {name!r} is {values[0]:g} in all {len(values)} steps: it says nothing")
-            continue
-        same = first.setdefault(_digest(values), name)
-        if same is not name:
-            found.append(f"columns {same!r} and {name!r} are the same in every step")
-    return found
+            yield f"column {name!r} is {values[0]:g} in all {len(values)} steps: it says nothing"
+        elif (same := first.setdefault(_digest(values), name)) is not name:
+            yield f"columns {same!r} and {name!r} are the same in every step"
 
 
 def _clocks(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
@@ -165,54 +159,34 @@ def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
     return found
 
 
-def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> list[str]:
-    ends = still_ends(trajectories)
-    shares = ends.sum(0) / sum(map(len, trajectories))
-    if shares.max() <= MUCH:
-        return []
-    lengths = np.array([len(frames) for frames in trajectories])
-    longest = int((ends.sum(1) / lengths).argmax())
-    return [
-        f"nothing moves in {shares[0]:.0%} of all frames at the start and {shares[1]:.0%} at the end of trajectories"
-        f" (most in {called[longest]}: {ends[longest, 0]} and {ends[longest, 1]} of {lengths[longest]}), so a policy"
-        " may learn to stand still: cut them (`koap convert --trim-still`)"
-    ]
+def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> Iterator[str]:
+    ends, lengths = still_ends(trajectories), np.array([len(frames) for frames in trajectories])
+    shares, longest = ends.sum(0) / lengths.sum(), int((ends.sum(1) / lengths).argmax())
+    if shares.max() > MUCH:
+        yield (
+            f"nothing moves in {shares[0]:.0%} of all frames at the start and {shares[1]:.0%} at the end of"
+            f" trajectories (most in {called[longest]}: {ends[longest, 0]} and {ends[longest, 1]} of"
+            f" {lengths[longest]}), so a policy may learn to stand still: cut them (`koap convert --trim-still`)"
+        )
 
 
 def trim_still(recordings: Recordings) -> Recordings:
     """Cuts the frames at both ends of trajectories in which nothing moves; ``skipped`` counts them."""
     ends = still_ends(recordings.states)
-    spans = [(start, len(frames) - end) for frames, (start, end) in zip(recordings.states, ends, strict=True)]
-    return replace(
-        recordings,
-        states=[frames[start:end] for frames, (start, end) in zip(recordings.states, spans, strict=True)],
-        actions=[steps[start : end - 1] for steps, (start, end) in zip(recordings.actions, spans, strict=True)],
-        cameras={
-            name: [clip.take(range(*span)) for clip, span in zip(clips, spans, strict=True)]
-            for name, clips in recordings.cameras.items()
-        },
-        skipped=(*recordings.skipped, f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"),
-    )
+    spans = [
+        (number, ends[number, 0], len(frames) - ends[number, 1]) for number, frames in enumerate(recordings.states)
+    ]
+    return recordings.cut(spans, [f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"])
 
 
 def drop_short(recordings: Recordings) -> Recordings:
     """Leaves out trajectories with fewer steps than a window; ``skipped`` names them."""
-    kept = [index for index, steps in enumerate(recordings.actions) if len(steps) >= WINDOW]
-    if not kept:
+    lengths = list(map(len, recordings.states))
+    spans = [(number, 0, length) for number, length in enumerate(lengths) if length > WINDOW]
+    if not spans:
         raise DataError("these recordings", f"no trajectory has the {WINDOW} steps of a window")
-    short = [
-        f"{name} ({len(steps)} steps)"
-        for name, steps in zip(recordings.sources, recordings.actions, strict=True)
-        if len(steps) < WINDOW
-    ]
-    return replace(
-        recordings,
-        states=[recordings.states[index] for index in kept],
-        actions=[recordings.actions[index] for index in kept],
-        sources=tuple(recordings.sources[index] for index in kept),
-        cameras={name: [clips[index] for index in kept] for name, clips in recordings.cameras.items()},
-        skipped=(*recordings.skipped, *short),
-    )
+    named = zip(recordings.sources, lengths, strict=True)
+    return recordings.cut(spans, [f"{name} ({length - 1} steps)" for name, length in named if length <= WINDOW])
 
 
 def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | None]:

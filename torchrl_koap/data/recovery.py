@@ -35,14 +35,12 @@ class RecoveryAugmentation(TensorDictModuleBase):
     A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
     there. The augmentation shows it such states together with the way back.
 
-    Frames that all move alike show the moment of a push, and the earlier velocity. Where motions are so smooth that
-    velocity follows from position, the difference of the two betrays the shift, and a planner learns to answer small
-    errors of velocity with large ones. With ``under_way`` the robot is on its way back already, as in the next steps of
-    the loop: :math:`x'_{t-j} = x_{t-j} + \rho^{-j} \delta`.
+    Frames that all move alike show the moment of a push, and the earlier velocity. With ``under_way`` the robot is on
+    its way back already, as in the next steps of the loop: :math:`x'_{t-j} = x_{t-j} + \rho^{-j} \delta`. Choose it
+    where motions are so smooth that velocity follows from position, so that the difference of the two betrays a shift.
 
     An arm with more joints than its tool needs is moved aside at the tool: the tool is displaced, and the joints follow
-    by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`. Joints shifted one by one would mostly
-    turn the elbow about, and a planner that has seen that learns to wander.
+    by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`.
 
     Args:
         sigma (float): typical size of the shift, in the units of the state; with ``tool`` that of the tool (m).
@@ -139,10 +137,9 @@ class GripperRecovery(TensorDictModuleBase):
         w'_{t-j} = w_0, \qquad w'_{t+i} = \min(w_{t+i},\; w_{open} - \rho^i (w_{open} - w_0)), \qquad
         w_0 \sim U(0, w_{empty})
 
-    Demonstrations in which every grasp succeeds never show fingers that are closed with nothing between them. A planner
-    trained on them alone has no idea what comes next, plans that they stay as they are, and one grasp that misses ends
-    the episode: the fingers never open again. Windows are left alone in which the fingers hold something, or close
-    within the steps that they need to open.
+    Demonstrations in which every grasp succeeds never show fingers that are closed on nothing, so a planner leaves them
+    closed after a grasp that misses. Windows are left alone in which the fingers hold something, or close within the
+    steps that they need to open.
 
     Args:
         column (int): state column of the width between the fingers (m).
@@ -182,10 +179,9 @@ class NeighborRecovery(TensorDictModuleBase):
         x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
         \delta = s\, r\, (y_t - x_t), \; r \sim U(0, 1)
 
-    with the present frame :math:`y_t` of the window of the batch that is nearest to it there.
-    :class:`~torchrl_koap.data.RecoveryAugmentation` displaces the robot, which takes columns that are its position. In
-    the embedding of a camera's picture none is, and a random vector is no picture; the difference of two pictures
-    nearly is one, and the nearest other one mostly shows the robot a little beside where it is.
+    with the present frame :math:`y_t` of the window of the batch that is nearest to it there. It is for embeddings of
+    pictures, of which no column is a position: the nearest other one mostly shows the robot a little beside where it
+    is.
 
     Args:
         share (float): ``s``, farthest share of the way to the neighbour; 0 changes nothing.

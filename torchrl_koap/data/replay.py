@@ -11,7 +11,6 @@ from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets import register_dataset
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 
-from torchrl_koap import keys
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport
 from torchrl_koap.data.sources import open_dataset
 from torchrl_koap.tasks import get_task
@@ -59,7 +58,6 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
     ):
         self.root = Path(root).expanduser()
         data, self.task = open_dataset(root, task=get_task(task))
-        keys.validate(data, command=self.task.command_columns)
         self.label_report: LabelReport | None = None
         if label_budget is not None:
             data, self.label_report = label_budget.apply(data, command=self.task.command_columns)
@@ -75,10 +73,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         """Folder of the demonstrations."""
         return self.root
 
-    @property
-    def data_path_root(self) -> Path:
-        """Folder of the demonstrations."""
-        return self.root
+    data_path_root = data_path
 
     def _is_downloaded(self) -> bool:
         return True

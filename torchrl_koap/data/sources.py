@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torchrl_koap.data.d3il.conversion import CONVERTERS, read_raw
 from torchrl_koap.data.formats import FORMATS, find_format
 from torchrl_koap.data.ted import read_about, read_steps, stored_folder, stored_task
-from torchrl_koap.data.trajectories import flatten_trajectories, select_state
+from torchrl_koap.data.trajectories import flatten_trajectories, select_state, trajectory_lengths
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import Task, get_task
 
@@ -125,11 +125,10 @@ def with_noise(data: TensorDictBase, columns: slice, sigma: float) -> TensorDict
     """
     generator = torch.Generator().manual_seed(0)
     now, following = data["observation"].clone(), data["next", "observation"].clone()
-    last = torch.ones(len(now), dtype=torch.bool)
-    last[:-1] = data["episode"][1:] != data["episode"][:-1]
-    shape = now[:, columns].shape
+    shape, last = now[:, columns].shape, trajectory_lengths(data).cumsum(0) - 1
     noise, ends = (sigma * torch.randn(shape, generator=generator, dtype=now.dtype) for _ in range(2))
-    after = torch.where(last[:, None], ends, noise.roll(-1, 0))
+    after = noise.roll(-1, 0)
+    after[last] = ends[last]
     now[:, columns] += noise
     following[:, columns] += after
     return data.copy().set("observation", now).set("next", data["next"].copy().set("observation", following))

@@ -15,8 +15,7 @@ from torchrl_koap.keys import ACTION, STATE
 class RandomPlanarTransform(TensorDictModuleBase):
     """Random planar transform: moves and turns the whole scene, tool and objects together, about a vertical axis.
 
-    How a tool pushes an object does not depend on where on the table that happens. A planner trained on few hundred
-    demonstrations does not find that out by itself.
+    How a tool pushes an object does not depend on where on the table that happens.
 
     Args:
         points (sequence): state columns ``(x, y)`` of every position.

@@ -45,15 +45,14 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
         Path: the folder.
 
     Raises:
-        LayoutError: if the data do not follow the storage layout.
+        DataError: if the data do not follow the storage layout.
         TypeError: if an entry is no tensor.
         FileExistsError: if the folder holds something other than a data set.
 
     Examples:
         >>> import tempfile
         >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories, save_ted
-        >>> from torchrl_koap.data.ted import load_ted
+        >>> from torchrl_koap.data import flatten_trajectories, load_ted, save_ted
         >>> from torchrl_koap.data.ted import read_about
         >>> from torchrl_koap.tasks import get_task
         >>> data = flatten_trajectories([torch.rand(4, 4), torch.rand(6, 4)], [torch.rand(3, 2), torch.rand(5, 2)])
@@ -162,15 +161,12 @@ def read_steps(folder: str | Path) -> TensorDict:
     """Reads the data of a data set ``[N]``, whatever their task, or says what is damaged."""
     about, path = read_about(folder), Path(folder) / _STEPS
     try:
-        changed = path.stat().st_size != about["bytes"] or sha256_of(path) != about["sha256"]
-        entries = {} if changed else load_file(path)
+        if path.stat().st_size != about["bytes"] or sha256_of(path) != about["sha256"]:
+            raise DataError(path, "it was changed: its checksum is another one")
+        return TensorDict(load_file(path), [about["steps"]]).unflatten_keys("/")
+    except DataError:
+        raise
     except FileNotFoundError:
         raise DataError(path, "it is missing") from None
-    except (OSError, SafetensorError, ValueError, KeyError) as error:
-        raise DataError(path, str(error)) from error
-    if changed:
-        raise DataError(path, "it was changed: its checksum is another one")
-    try:
-        return TensorDict(entries, [about["steps"]]).unflatten_keys("/")
-    except (RuntimeError, ValueError, KeyError, TypeError) as error:
+    except (OSError, SafetensorError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise DataError(path, f"its entries do not have {about['steps']} steps: {error}") from error

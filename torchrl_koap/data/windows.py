@@ -1,6 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Windows of consecutive steps: where they may start, which frames they have, all of them at once or a replay buffer.
 
+In the buffer a *sampler* draws numbers of windows, a *sample unit* turns each into ``T`` storage indices. TorchRL's own
+unit ``Sequence`` and its ``SliceSampler`` give flat batches ``[B * T]``, know no padding and no strata.
+
 With ``pad_before`` and ``pad_after`` windows may reach over the ends of their trajectory by that many frames, whose
 place is taken by the first or last step::
 
@@ -11,17 +14,25 @@ place is taken by the first or last step::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import (
+    ImmutableDatasetWriter,
+    RandomSampler,
+    ReplayBuffer,
+    Storage,
+    TensorDictReplayBuffer,
+    TensorStorage,
+)
+from torchrl.data.replay_buffers import SampleUnit
 
 from torchrl_koap import keys
-from torchrl_koap.data.window_sampler import WindowSampler, WindowUnit
 from torchrl_koap.files import some
 
 Rows = TypeVar("Rows", Tensor, TensorDictBase)
@@ -31,13 +42,7 @@ Rows = TypeVar("Rows", Tensor, TensorDictBase)
 class WindowTable:
     """All windows of a data set.
 
-    Args:
-        starts (Tensor): int64 ``[M]``, storage index of frame 0; outside the trajectory where frames are padded.
-        first (Tensor): int64 ``[M]``, index of the first step of the window's trajectory.
-        last (Tensor): int64 ``[M]``, index of its last step.
-        labelled (Tensor): bool ``[M]``, whether a frame that counts has an action label and neither that frame nor the
-            one after it is padded.
-        window (int): frames per window.
+    A window is *labelled* if a frame that counts has an action label and neither that frame nor the next one is padded.
 
     Examples:
         >>> import torch
@@ -49,11 +54,11 @@ class WindowTable:
         tensor([[1, 2, 3, 4]])
     """
 
-    starts: Tensor
-    first: Tensor
-    last: Tensor
-    labelled: Tensor
-    window: int
+    starts: Tensor  # int64 [M], storage index of frame 0; outside the trajectory where frames are padded
+    first: Tensor  # int64 [M], index of the first step of the window's trajectory
+    last: Tensor  # int64 [M], index of its last step
+    labelled: Tensor  # bool [M]
+    window: int  # frames per window
 
     @classmethod
     def build(
@@ -92,8 +97,13 @@ class WindowTable:
         first = new.nonzero().squeeze(-1)
         lengths = torch.diff(first, append=torch.tensor([steps], device=device))
         windows = (lengths + pad_before + pad_after - window + 1).clamp_min(0)
-        _check_lengths(episode[first], lengths, windows, window - pad_before - pad_after)
-
+        if (short := windows == 0).any():
+            named = zip(episode[first][short].tolist(), lengths[short].tolist(), strict=True)
+            raise ValueError(
+                f"{int(short.sum())} of {len(lengths)} trajectories are shorter than a window"
+                f" ({window - pad_before - pad_after} steps):"
+                f" {some([f'{number} ({length} steps)' for number, length in named])}"
+            )
         trajectory = torch.arange(len(first), device=device).repeat_interleave(windows)
         number = torch.arange(len(trajectory), device=device) - (windows.cumsum(0) - windows)[trajectory]
         starts = first[trajectory] - pad_before + number
@@ -122,6 +132,85 @@ class WindowTable:
         wanted = starts.unsqueeze(-1) + torch.arange(self.window, device=starts.device)
         inside = wanted.clamp(first.unsqueeze(-1), last.unsqueeze(-1))
         return inside, inside != wanted
+
+
+class WindowUnit(SampleUnit):
+    """Turns numbers of windows ``[B]`` into storage indices ``[B, T]``, by :meth:`WindowTable.frames`.
+
+    With ``padded`` bool ``[B, T]``, which of them are padded, is the entry ``padded`` of the sample's info.
+    """
+
+    def __init__(self, frames: Callable[[Tensor], tuple[Tensor, Tensor]], *, padded: bool = False):
+        self._frames, self._padded = frames, padded
+
+    def expand(self, index: Tensor, info: dict[str, Any], storage: Storage | None) -> tuple[Tensor, dict[str, Any]]:
+        """Storage indices ``[B, T]`` of the windows ``[B]``, and ``info`` with ``padded`` where it is handed out."""
+        frames, padded = self._frames(index)
+        return frames, info | {keys.PADDED: padded} if self._padded else info
+
+
+class WindowSampler(RandomSampler):
+    """Draws windows with replacement, each equally likely.
+
+    Draws come from the global torch generator (of the table's device), unless the buffer was given its own.
+
+    Args:
+        labelled (Tensor): bool ``[M]``, which windows have a label on an inner frame (``WindowTable.labelled``).
+
+    Keyword Args:
+        labelled_share (float, optional): in a batch of ``B``, ``round(labelled_share * B)`` windows (half up) have a
+            label and come first; the others have none, as far as such windows exist. Default: windows are drawn without
+            regard to labels.
+
+    Raises:
+        ValueError: for a share outside (0, 1], or if labelled windows are asked for and there are none.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import WindowSampler
+        >>> sampler = WindowSampler(torch.tensor([False, True, False]), labelled_share=0.5)
+        >>> sampler.sample(None, 4)[0][:2]
+        tensor([1, 1])
+    """
+
+    def __init__(self, labelled: Tensor, *, labelled_share: float | None = None):
+        if labelled_share is not None and not 0 < labelled_share <= 1:
+            raise ValueError(f"labelled_share must be in (0, 1], got {labelled_share}")
+        if labelled_share is not None and not labelled.any():
+            raise ValueError(
+                f"labelled_share is {labelled_share}, but none of the {len(labelled)} windows has a label on an inner"
+                " frame; leave labelled_share out to train without labels"
+            )
+        self.labelled_share = labelled_share
+        everything = torch.arange(len(labelled), device=labelled.device)
+        stratified = labelled_share is not None
+        self._labelled = everything[labelled] if stratified else everything[:0]
+        self._others = everything[~labelled] if stratified and not labelled.all() else everything
+
+    def number_labelled(self, batch_size: int) -> int:
+        """Number of windows of a batch that have a label.
+
+        Raises:
+            ValueError: if the share of a batch of that size is no window at all.
+        """
+        if self.labelled_share is None:
+            return 0
+        number = math.floor(self.labelled_share * batch_size + 0.5)
+        if number == 0:
+            raise ValueError(f"labelled_share {self.labelled_share} of a batch of {batch_size} is no window at all")
+        return number
+
+    def sample(self, storage: Storage | None, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Draws numbers of windows, int64 ``[batch_size]``."""
+        number = self.number_labelled(batch_size)
+        if self.labelled_share is None:
+            return self._draw(self._others, batch_size), {}
+        return torch.cat([self._draw(self._labelled, number), self._draw(self._others, batch_size - number)]), {}
+
+    def _draw(self, choices: Tensor, number: int) -> Tensor:
+        device = choices.device if self._rng is None else self._rng.device
+        drawn = torch.randint(len(choices), (number,), device=device, generator=self._rng)
+        return choices[drawn.to(choices.device)]
 
 
 def spread_evenly(rows: Rows, most: int) -> Rows:
@@ -219,15 +308,4 @@ def make_window_buffer(
         sample_unit=WindowUnit(table.frames, padded=padded),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
-    )
-
-
-def _check_lengths(episodes: Tensor, lengths: Tensor, windows: Tensor, least: int) -> None:
-    short = windows == 0
-    if not short.any():
-        return
-    named = zip(episodes[short].tolist(), lengths[short].tolist(), strict=True)
-    raise ValueError(
-        f"{int(short.sum())} of {len(lengths)} trajectories are shorter than a window ({least} steps):"
-        f" {some([f'{episode} ({length} steps)' for episode, length in named])}"
     )

@@ -4,7 +4,7 @@
 from torchrl_koap.envs.aligning import AligningEnv
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.registry import ManipulationGymEnv, make_env, mode_index_of
+from torchrl_koap.envs.registry import ManipulationGymEnv, make_env
 from torchrl_koap.envs.scooping import ScoopingEnv
 from torchrl_koap.envs.sorting import SortingEnv
 from torchrl_koap.envs.stacking import StackingEnv
@@ -18,5 +18,4 @@ __all__ = [
     "SortingEnv",
     "StackingEnv",
     "make_env",
-    "mode_index_of",
 ]

@@ -6,13 +6,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import panda, scene
 from torchrl_koap.tasks.aligning import BASE_HALF, DISTANCE_TOLERANCE, ROTATION_TOLERANCE
-from torchrl_koap.tasks.modes import index_among
 
 INSIDE_REACH = 0.051  # m; the rod is inside the tray if nearer to its centre than this
 # name, direction from the centre, colour
@@ -22,11 +20,6 @@ WALLS = (
     ("wall_left", (-1, 0), (1, 0, 0, 1)),
     ("wall_near", (0, -1), (0, 1, 1, 1)),
 )
-
-
-def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the mode ``[*B]``: 0 if the tray was last pushed from inside, 1 from outside."""
-    return index_among(((0,), (1,)), mode)
 
 
 def aligned(tray: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -52,8 +45,7 @@ class AligningEnv(ManipulationEnv):
     ``context``     [n, 2, 3] ``dtype``         start of the tray, and target: x, y (m), yaw (rad)
     =============== ========= ================= ===============================================================
 
-    There is no failure. Unlike the original, exact alignment counts (its rotation distance has no clipping and becomes
-    NaN).
+    There is no failure. Unlike the original, exact alignment counts: its rotation distance becomes NaN.
 
     Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
@@ -64,7 +56,7 @@ class AligningEnv(ManipulationEnv):
         torch.Size([2, 3, 20])
     """
 
-    TASK, MAX_STEPS = "aligning", 400
+    TASK = "aligning"
     START_JOINTS = (
         -0.39275835987073354,
         0.32177812339570716,
@@ -98,9 +90,10 @@ class AligningEnv(ManipulationEnv):
         gap = self.sims.tcp_position[rows, :2] - self.sims.object_poses[rows, 0, :2]
         self._mode[rows, 0] = np.linalg.norm(gap, axis=1) >= INSIDE_REACH
 
-    def raw_objects(self) -> dict[str, np.ndarray]:
-        """Poses of tray and target as D3IL's recorder logs them."""
-        return super().raw_objects() | {"target": self.targets}
+    def raw_log(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """What D3IL's recorder logs, the target among the objects."""
+        robot, tray = super().raw_log()
+        return robot, np.concatenate([tray, self.targets[:, None]], axis=1)
 
     def _scene(self) -> Any:
         root = scene()

@@ -3,24 +3,13 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import PANDA, panda, scene
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_REACH, ROW_Y
-from torchrl_koap.tasks.modes import index_among
-
-# flags of every mode: one gap of the two, three and four of the rows
-_FLAGS = [[gap in gaps for gap in range(9)] for gaps in itertools.product((0, 1), (2, 3, 4), (5, 6, 7, 8))]
-
-
-def mode_index(flags: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the mode, ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x."""
-    return index_among(_FLAGS, flags)
 
 
 class AvoidingEnv(ManipulationEnv):
@@ -34,13 +23,11 @@ class AvoidingEnv(ManipulationEnv):
     ``action``      [n, 2]    ``dtype``         change of the commanded xy (m)
     ``success``     [n, 1]    bool              the rod has crossed y = 0.35 before any collision was seen
     ``collision``   [n, 1]    bool              the rod was seen touching a cylinder before it crossed
-    ``mode``        [n, 9]    bool              passage flags, see :func:`mode_index`
+    ``mode``        [n, 9]    bool              which gaps were passed, of rows of 2, 3 and 4
     =============== ========= ================= ===============================================================
 
-    Kept from the original because policies experience it: the measured xy is one control step old (the first step
-    repeats the reset's), ``success``, ``collision`` and ``done`` come one step after the state that caused them,
-    collisions are looked at once per control step (a graze in between is missed), and crossing the line while touching
-    is a success. Unlike the original, collisions are seen in every environment, not only in the first one.
+    Collisions are looked at once per control step, as in the original, so a graze in between is missed. Crossing the
+    line while touching is a success.
 
     The commanded height is held at the TCP height after the reset, the orientation at (0, 1, 0, 0). Every episode
     starts in the same state. Human demonstrators move the command by at most 0.012 m per axis and step, the range of
@@ -57,7 +44,7 @@ class AvoidingEnv(ManipulationEnv):
         [15.0, 15.0]
     """
 
-    TASK, MAX_STEPS = "avoiding", 250
+    TASK = "avoiding"
     START_JOINTS = (
         -0.3564086847191448,
         0.42944545403685397,

@@ -51,7 +51,8 @@ class ManipulationEnv(EnvBase):
     Args:
         num_envs (int): number of environments, the batch size.
         num_threads (int): threads that advance them; results do not depend on it.
-        max_steps (int, optional): control steps after which an episode is truncated. Default: ``MAX_STEPS``.
+        max_steps (int, optional): control steps after which an episode is truncated. Default: those of the
+            task.
         seed (int, optional): seed of the random contexts.
         device (torch.device, optional): device of the tensors handed out; the physics runs on the CPU.
         dtype (torch.dtype): floating type of observation, action and reward.
@@ -77,7 +78,7 @@ class ManipulationEnv(EnvBase):
     MODE_ENTRIES: int | None = 1  # of the leaf ``mode``; None: one per object
     MODE_VALUES: int | None = None  # its entries are -1 (undecided) to this - 1, int64; None: flags, bool
     COLLIDES = False  # an episode can end by a collision
-    MAX_STEPS = 400  # control steps after which an episode is truncated
+    CAMERA = "cage"  # of pictures
     SUBSTEPS = 35  # physics steps (1 ms) per control step
     COMMAND_DIM = 7  # numbers that make up a command
     RESET_WIDTH = controller.FINGER_RESET  # finger target during the reset's substep (m)
@@ -93,15 +94,15 @@ class ManipulationEnv(EnvBase):
         *,
         task: Task | None = None,
     ):
-        max_steps = self.MAX_STEPS if max_steps is None else max_steps
+        task = get_task(self.TASK) if task is None else task
+        max_steps = task.max_steps if max_steps is None else max_steps
         for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise ValueError(f"dtype must be a floating torch.dtype, got {dtype!r}")
         super().__init__(device=device, batch_size=[num_envs])
-        self.task = get_task(self.TASK) if task is None else task
-        self.max_steps = max_steps
+        self.task, self.max_steps = task, max_steps
         self.sims: Any = self._simulations(num_envs, num_threads)
         self._dtype = dtype
         self._episode = episode = self._episode_arrays(num_envs)
@@ -315,8 +316,10 @@ class ManipulationEnv(EnvBase):
         """Which episodes are decided or have used up their steps, bool [n]."""
         return self._success | self._collision | (self._steps >= self.max_steps)
 
-    def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = "cage") -> np.ndarray:
-        """Draws one environment, uint8 [height, width, 3]; cameras: ``"front"``, ``"cage"`` (D3IL's) and ``"wrist"``.
+    def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str | None = None) -> np.ndarray:
+        """Draws one environment, uint8 [height, width, 3], by default with the class's ``CAMERA``.
+
+        Cameras are ``"front"``, ``"cage"`` (D3IL's) and ``"wrist"``; Scooping's ``"third_person"`` and ``"front"``.
 
         Raises:
             RuntimeError: if no OpenGL library can be used.
@@ -328,7 +331,7 @@ class ManipulationEnv(EnvBase):
             if self._renderer is not None:
                 self._renderer.close()
             self._renderer = Renderer(self.sims.model, width, height)
-        return self._renderer.render(self.sims.data[index], camera)
+        return self._renderer.render(self.sims.data[index], camera or self.CAMERA)
 
     def close(self, **kwargs) -> None:
         """Frees graphics memory, if any was used, and the threads."""
@@ -338,12 +341,12 @@ class ManipulationEnv(EnvBase):
         self.sims.close()
         super().close(**kwargs)
 
-    def raw_log(self) -> dict[str, np.ndarray]:
-        """Returns what D3IL's recorder logs for the last control step, and its command ``des_c_pos`` (m)."""
-        pose = {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:]}
-        return self.sims.logged() | (pose if self.COMMAND_DIM == 7 else {})  # joints are in the log already
+    def raw_log(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Returns what D3IL's recorder logs for the last control step.
 
-    def raw_objects(self) -> dict[str, np.ndarray]:
-        """Returns the poses [n, 7] (m, quaternion) of the task's objects by name, as D3IL's recorder logs them."""
-        poses = self.sims.logged_poses()
-        return {name: poses[:, index] for index, name in enumerate(self.task.objects[: poses.shape[1]])}
+        Arrays ``[n, ...]`` of the robot, the command ``des_c_pos`` (m) among them, and the poses of the task's
+        objects ``[n, objects, 7]`` (m, quaternion).
+        """
+        robot, poses = self.sims.logged()
+        pose = {"des_c_pos": self.commands[:, :3]} if self.COMMAND_DIM == 7 else {}  # joints are in the log already
+        return robot | pose, poses

@@ -6,7 +6,6 @@ A context is ``[objects, 3]``: x, y (m) and yaw (rad) of every object of ``Task.
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 from pathlib import Path
@@ -48,26 +47,18 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
     return contexts
 
 
-@functools.cache
-def _table() -> dict:
-    return json.loads(TABLE.read_text())
-
-
-def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) -> np.ndarray:
-    """Returns the first contexts of the fixed table on which methods are compared, float64 ``[num, objects, 3]``.
+def evaluation_contexts(task: Task | str) -> np.ndarray:
+    """Returns the fixed table of contexts on which methods are compared, float64 ``[60, objects, 3]``.
 
     The table (``evaluation_contexts.json``) never changes. Contexts of a task that is not in it are drawn with a seed
-    that its name alone decides. More than the table holds are refused.
+    that its name alone decides.
     """
     task = get_task(task)
     _scene(task)
-    rows = _table()["contexts"].get(task.source)
+    rows = json.loads(TABLE.read_text())["contexts"].get(task.source)
     if rows is None:  # not D3IL's: the same ones every time
-        seed = [*task.source.encode()]
-        rows = draw_contexts(task, NUM_EVALUATION_CONTEXTS, np.random.default_rng(seed)).tolist()
-    if not 1 <= num <= len(rows):
-        raise ValueError(f"the table holds {len(rows)} contexts of task {task.name!r}, asked for {num}")
-    return np.array(rows[:num])
+        return draw_contexts(task, NUM_EVALUATION_CONTEXTS, np.random.default_rng([*task.source.encode()]))
+    return np.array(rows)
 
 
 def check_contexts(task: Task, contexts) -> np.ndarray:

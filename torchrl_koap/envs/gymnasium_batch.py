@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.vector.utils import iterate
+from gymnasium.wrappers.utils import create_zero_array
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -41,9 +42,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, index: int, *, max_steps: int, success_key: str | None = None):
         super().__init__(env)
         self.index, self.max_steps, self.success_key = index, max_steps, success_key
-        space = env.observation_space
-        nothing = gymnasium.vector.utils.create_empty_array(space, n=1, fn=np.zeros)
-        self._last = next(iter(gymnasium.vector.utils.iterate(gymnasium.vector.utils.batch_space(space, 1), nothing)))
+        self._last = create_zero_array(env.observation_space)
         self._error, self._steps, self._over, self._success = "", 0, True, False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -158,7 +157,7 @@ class GymnasiumBatch(EnvBase):
         record: EpisodeRecord | None = None,
     ):
         super().__init__(batch_size=[num_envs])
-        self.env_id, self.task, self._observe = env_id, task, observe
+        self.task, self._observe = task, observe
         self._origin, self._added = map(np.asarray, task.origins or (0.0, 0.0))
         self.record = EpisodeRecord() if record is None else record
         make = partial(gymnasium.make, env_id, **(env_kwargs or {}))
@@ -177,9 +176,10 @@ class GymnasiumBatch(EnvBase):
         finally:
             first.close()
         self.max_steps = max_steps or self.own_limit or task.max_steps
-        episode = partial(_make_episode, make, max_steps=self.max_steps, success_key=success_key)
+        options = {"max_steps": self.max_steps, "success_key": success_key}
         vector = partial(AsyncVectorEnv, context=_FORK) if processes else SyncVectorEnv
-        self._env = vector([partial(episode, index) for index in range(num_envs)], copy=False)
+        episodes = [lambda index=index: GymnasiumEpisode(make(), index, **options) for index in range(num_envs)]
+        self._env = vector(episodes, copy=False)
         self._seeds: list[int | None] = [None] * num_envs
         self._begun_with = list(self._seeds)
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -251,13 +251,8 @@ class GymnasiumBatch(EnvBase):
 
 
 _ENDS = ("done", "terminated", "truncated")
-# a process that is spawned imports everything again, for seconds in every batch, and knows no environment that a plugin
-# has registered
+# a process that is spawned imports everything again, and knows no environment that a plugin has registered
 _FORK = "fork" if sys.platform == "linux" else None
-
-
-def _make_episode(make: Any, index: int, **options: Any) -> GymnasiumEpisode:
-    return GymnasiumEpisode(make(), index, **options)
 
 
 def _probe(env_id: str, env: gymnasium.Env, success_key: str | None) -> str | None:

@@ -8,7 +8,7 @@ What an environment has to offer, D3IL's (:class:`~torchrl_koap.envs.Manipulatio
     reset            reset(contexts=[n, bodies, 3]) starts the episodes there, where the task has bodies; x, y (m), yaw
                      (rad). Without it the environment draws them. One call resets all environments
     set_seed         of the contexts that it draws
-    observation      [n, obs]; success [n, 1] bool, latched until the reset; mode [n, ...], what Task.modes.index reads
+    observation      [n, obs]; success [n, 1] bool, latched until the reset; mode [n, ...], one of Task.modes.leaves
     collision        [n, 1] bool, where an episode can end by one
     context          [n, bodies, 3], where the task has bodies
     reward, done, terminated, truncated
@@ -18,7 +18,6 @@ Films read ``sims.model`` and ``sims.data`` of MuJoCo where they are there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -34,12 +33,13 @@ from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task, get_task
 
 
-def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
+def make_env(task: Task | str, num_envs: int = 1, *, noisy: bool = False, **options: Any) -> EnvBase:
     """Makes the task's environment.
 
     Args:
-        task (Task or str): the task.
+        task (Task or str): the task, or its name.
         num_envs (int): number of parallel episodes.
+        noisy (bool): the measured end effector is disturbed, as ``Task.noise`` says and policies meet it.
         **options: further arguments of the environment, such as ``num_threads``, ``max_steps`` and ``dtype``. They
             join, and go before, ``Task.env_options``.
 
@@ -60,44 +60,8 @@ def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
             f"task {task.name!r} has no environment (Task.env is None): it can be trained on data, but not rolled out,"
             " recorded or drawn by a simulator. `koap eval --env ID` takes an environment of Gymnasium"
         )
-    return resolve(task.env, f"env of task {task.name!r}")(num_envs, **{**task.env_options, **options})
-
-
-def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
-    """Returns a function from a number of parallel episodes to the task's environment as policies meet it.
-
-    With ``Task.noise`` the measured end effector is disturbed. A task without an environment is refused at once.
-    """
-    if task.env is None:
-        make_env(task)  # tells so now rather than at the first rollout
-
-    def make(num_envs: int) -> EnvBase:
-        env = make_env(task, num_envs, num_threads=num_threads, max_steps=task.max_steps)
-        return TransformedEnv(env, EndEffectorNoise(task, task.noise)) if task.noise else env
-
-    return make
-
-
-def mode_index_of(task: Task | str) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Returns the function that turns a task's leaf ``mode`` into a number.
-
-    Args:
-        task (Task or str): the task.
-
-    Returns:
-        callable: leaf ``mode`` ``[*B, ...]`` to the number of the mode ``[*B]``, int64, -1 while it is not decided; 0
-        for a task without modes.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs import mode_index_of
-        >>> mode_index_of("sorting_2")(torch.tensor([[1, 0], [-1, -1]]))
-        tensor([ 1, -1])
-    """
-    task = get_task(task)
-    if task.modes.index is None:
-        return lambda mode: torch.zeros(mode.shape[:-1], dtype=torch.int64, device=mode.device)
-    return resolve(task.modes.index, f"modes.index of task {task.name!r}")
+    env = resolve(task.env, f"env of task {task.name!r}")(num_envs, **{**task.env_options, **options})
+    return TransformedEnv(env, EndEffectorNoise(task, task.noise)) if noisy and task.noise else env
 
 
 IDS = {"Avoiding-v0": "avoiding", "Aligning-v0": "aligning", "Stacking-v0": "stacking"}
@@ -146,7 +110,6 @@ class ManipulationGymEnv(gymnasium.Env):
         self.metadata = self.metadata | {"render_fps": round(facts.control_hz)}
         self.task = facts
         self.batched = make_env(facts, 1, max_steps=facts.max_steps, dtype=torch.float64)
-        self._mode_index = mode_index_of(facts)
         self._size = {"width": width, "height": height}
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
         low, high = (
@@ -189,7 +152,7 @@ class ManipulationGymEnv(gymnasium.Env):
         info = {
             keys.SUCCESS: data[keys.SUCCESS].item(),
             keys.MODE: data[keys.MODE][0].numpy(),
-            "mode_index": self._mode_index(data[keys.MODE]).item(),
+            "mode_index": self.task.modes.index_of(data[keys.MODE]).item(),
         }
         if keys.COLLISION in data.keys():
             info[keys.COLLISION] = data[keys.COLLISION].item()

@@ -11,14 +11,12 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
 from torchrl_koap.tasks.columns import tan_yaw
-from torchrl_koap.tasks.modes import index_among
 from torchrl_koap.tasks.sorting import (
     BIN_WALLS,
     BIN_X,
     BIN_Y,
     BOX_HALF,
     PLATFORM_X,
-    arrival_orders,
     box_colours,
     in_bins,
     sorting_task,
@@ -27,11 +25,6 @@ from torchrl_koap.tasks.sorting import (
 RED, BLUE = 0, 1
 PLATFORM_TOP = 0.1  # (m)
 _COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
-
-
-def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the order in which the colours arrived, in lexicographic order (red before blue)."""
-    return index_among(arrival_orders(mode.shape[-1]), mode)
 
 
 class SortingEnv(ManipulationEnv):
@@ -53,9 +46,7 @@ class SortingEnv(ManipulationEnv):
     There is no failure; a box that lies in the wrong bin stays there.
 
     Arrivals are noted as in the original: at most one per control step, and only if the box that is nearest to the
-    centre of its own bin among those not noted yet is inside. A noted box that leaves its bin stays noted. The
-    original asks with four boxes for a third one of each colour too and is told (0, -0.0085); such a box is farther
-    from its bin than any box that is inside, so it changes nothing and is left out here.
+    centre of its own bin among those not noted yet is inside. A noted box that leaves its bin stays noted.
 
     Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
@@ -66,7 +57,6 @@ class SortingEnv(ManipulationEnv):
         torch.Size([2, 3, 16])
     """
 
-    MAX_STEPS = 700
     START_JOINTS = (
         -0.32682662579052857,
         0.24562566192918364,

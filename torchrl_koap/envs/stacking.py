@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -14,24 +13,12 @@ from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import tan_yaw
-from torchrl_koap.tasks.modes import index_among
 from torchrl_koap.tasks.stacking import BOXES, TARGET, TARGET_HALF, ZONE_RADIUS, piled
 
 OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them
 COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
-ORDERS = tuple(itertools.permutations(range(3)))  # in which the boxes can arrive: the modes
 JOINT_BOUND = 0.03  # rad per control step
 GRIPPER_BOUND = 0.08  # m
-
-
-def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Returns the number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5."""
-    return index_among(ORDERS, mode)
-
-
-def first_box(mode: torch.Tensor) -> torch.Tensor:
-    """Returns the mode of Stacking-1, the first box of a leaf ``mode`` ``[*B, 3]``; -1 while there is none."""
-    return mode[..., 0].long()
 
 
 class StackingEnv(ManipulationEnv):
@@ -67,7 +54,7 @@ class StackingEnv(ManipulationEnv):
         torch.Size([2, 3, 31])
     """
 
-    MAX_STEPS, SUBSTEPS = 1000, 30
+    SUBSTEPS = 30
     START_JOINTS = (
         -1.1708457375867388e-08,
         -0.043618586668494642,

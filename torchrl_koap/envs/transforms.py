@@ -49,12 +49,11 @@ class PartialObservation(ObservationTransform):
 
 
 class EndEffectorNoise(ObservationTransform):
-    """Adds Gaussian noise to the measured end effector.
+    """Adds Gaussian noise to the measured end effector; after :meth:`seed_episodes` every environment has its own.
 
     Args:
         task (Task or str): the task; its part ``Task.position`` is disturbed.
         sigma (float): standard deviation (m).
-        seed (int): seed of the noise. After :meth:`seed_episodes` every environment has a generator of its own.
 
     Raises:
         ValueError: if sigma is negative.
@@ -70,13 +69,13 @@ class EndEffectorNoise(ObservationTransform):
         [[False, False, True, True]]
     """
 
-    def __init__(self, task: Task | str, sigma: float, seed: int = 0):
+    def __init__(self, task: Task | str, sigma: float):
         if not sigma >= 0:
             raise ValueError(f"sigma must be >= 0, got {sigma}")
         super().__init__(in_keys=[OBSERVATION], out_keys=[OBSERVATION])
         task = get_task(task)
         self.sigma, self.part = sigma, task.observation[task.position]
-        self._generators = [torch.Generator().manual_seed(seed)]
+        self._generators = [torch.Generator().manual_seed(0)]
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
         """Gives every environment its own noise, so that an episode does not depend on the batch it runs in."""

@@ -182,10 +182,11 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
     """
     numbers, contexts = choose_contexts(task, config)
     if config.env is None:
-        from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
+        from torchrl_koap.envs.registry import make_env  # takes seconds
 
-        make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
-        return RolloutEnvironment(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+        options = {"num_threads": config.threads or torch.get_num_threads(), "max_steps": task.max_steps}
+        make = partial(make_env, task, noisy=True, **options)
+        return RolloutEnvironment(make, task.max_steps, task.modes.index_of, task.num_modes, numbers, contexts)
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 
     record = EpisodeRecord()

@@ -53,7 +53,7 @@ register_task(
         goal="torchrl_koap.tasks.aligning:goal_reached",
         modes=Modes(
             (("pushed from", ("inside", "outside")),),
-            index="torchrl_koap.envs.aligning:mode_index",
+            leaves=((0,), (1,)),
             entropy="contexts",
         ),
         env="torchrl_koap.envs.aligning:AligningEnv",

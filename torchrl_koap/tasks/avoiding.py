@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from torch import Tensor
 
@@ -24,6 +26,10 @@ OBSTACLES = (
     ("row3_left", 0.35, ROW_Y[2], 0.025, 0.1),
     ("row3_mid", 0.5, ROW_Y[2], 0.025, 0.1),
     ("row3_right", 0.65, ROW_Y[2], 0.025, 0.1),
+)
+# whether each of the gaps was passed, two, three and four of the rows, in every mode
+_FLAGS = tuple(
+    tuple(int(gap in gaps) for gap in range(9)) for gaps in itertools.product((0, 1), (2, 3, 4), (5, 6, 7, 8))
 )
 
 
@@ -71,7 +77,7 @@ register_task(
                 ("row 2", ("left", "middle", "right")),
                 ("row 3", ("gap 1", "gap 2", "gap 3", "gap 4")),
             ),
-            index="torchrl_koap.envs.avoiding:mode_index",
+            leaves=_FLAGS,
             of_path="torchrl_koap.tasks.avoiding:mode_of_path",
         ),
         env="torchrl_koap.envs.avoiding:AvoidingEnv",

@@ -15,18 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_koap.lookup import resolve
-
-
-def plain(columns: Tensor) -> Tensor:
-    """Returns the columns as they are."""
-    return columns
-
-
-def plane(position: Tensor) -> Tensor:
-    """Returns ``x, y`` of a position ``[*B, 3]`` whose height is that of the surface it lies on."""
-    return position[..., :2]
-
 
 def double_yaw(tan_yaw: Tensor) -> Tensor:
     """Computes ``cos 2 yaw, sin 2 yaw`` from ``tan(yaw)`` ``[*B, 1]``: continuous where the tangent has its poles."""
@@ -47,11 +35,13 @@ def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
     return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2)))
 
 
-# names that a feature gives to its columns; those of a plain part, and of a feature of one's own, are numbered
-FEATURE_COLUMNS = {"plane": ("x", "y"), "tan_yaw": ("cos_2yaw", "sin_2yaw"), "quaternion": ("cos_yaw", "sin_yaw")}
-# a feature of one's own is named by its import string
-FEATURES = {"plain": plain, "plane": plane, "tan_yaw": double_yaw, "quaternion": yaw_of}
-
+# what the state shows of a part, and how its columns are called then; those of a plain part keep their names
+FEATURES: dict[str, tuple[Callable[[Tensor], Tensor], tuple[str, ...]]] = {
+    "plain": (lambda columns: columns, ()),
+    "plane": (lambda position: position[..., :2], ("x", "y")),  # its height is that of the surface it lies on
+    "tan_yaw": (double_yaw, ("cos_2yaw", "sin_2yaw")),
+    "quaternion": (yaw_of, ("cos_yaw", "sin_yaw")),
+}
 _THOUSANDTHS = {"m": "mm", "rad": "mrad", "s": "ms", "N": "mN"}  # units in which small values are shown
 
 
@@ -68,8 +58,8 @@ class Columns:
             them; robots report and take numbers with it (:class:`~torchrl_koap.modules.Agent`). Empty: nothing.
         command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
             never shown to planner or controller. None: the observation holds no command.
-        state (dict): part of the observation to name of its feature (``FEATURES``) or its import
-            string, in the order of the state. Empty: every part but the command and the hidden ones, unchanged.
+        state (dict): part of the observation to name of its feature (``FEATURES``), in the order of the state. Empty:
+            every part but the command and the hidden ones, unchanged.
         hidden (tuple of str): further parts that planner and controller must not see.
 
     Examples:
@@ -166,7 +156,7 @@ class Columns:
                 f"an observation of task {self.name!r} has {self.observation_dim} columns, got {observation.shape[-1]}"
             )
         parts = self.state_parts.items()
-        return torch.cat([self._feature(kind)(observation[..., self.observation[name]]) for name, kind in parts], -1)
+        return torch.cat([FEATURES[kind][0](observation[..., self.observation[name]]) for name, kind in parts], -1)
 
     def _column_names(self, part: str) -> tuple[str, ...]:
         columns = self.observation_parts[part]
@@ -174,17 +164,8 @@ class Columns:
             return tuple(columns)
         return (part,) if columns == 1 else tuple(f"{part}_{index}" for index in range(columns))
 
-    def _feature(self, kind: str) -> Callable[[Tensor], Tensor]:
-        return FEATURES[kind] if kind in FEATURES else resolve(kind, f"a feature of task {self.name!r}")
-
     def _feature_names(self, part: str, kind: str) -> tuple[str, ...]:
-        if kind == "plain":
-            return self._column_names(part)
-        if kind in FEATURE_COLUMNS:
-            return tuple(f"{part}_{name}" for name in FEATURE_COLUMNS[kind])
-        columns = self.observation[part]
-        width = self._feature(kind)(torch.zeros(1, columns.stop - columns.start)).shape[-1]
-        return tuple(f"{part}_{index}" for index in range(width))
+        return self._column_names(part) if kind == "plain" else tuple(f"{part}_{name}" for name in FEATURES[kind][1])
 
 
 def _slices(widths: Mapping[str, int]) -> dict[str, slice]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,8 +16,8 @@ class Modes:
 
     Args:
         choices (tuple): what a mode is made of, slowest digit first: ``(choice, names of its values)`` each.
-        index (str): import string of the function from the leaf ``mode`` ``[*B, ...]`` to the number of the mode
-            ``[*B]``, int64, -1 while it is not decided.
+        leaves (tuple): the environment's leaf ``mode`` in every mode, or how it begins there, in the order of their
+            numbers. Empty: there is one mode.
         entropy (str): over which episodes the entropy of the modes is taken: ``"all"`` successful ones together, or
             per context and then averaged over ``"contexts"`` or ``"solved_contexts"`` (those with a success).
         of_path (str, optional): import string of the function from recorded positions of the tool ``[T, 2]`` (numpy, m)
@@ -29,10 +28,12 @@ class Modes:
         >>> modes = Modes((("row 1", ("left", "right")), ("row 2", ("left", "middle", "right"))))
         >>> modes.number, modes.name_of(5), modes.name_of(-1)
         (6, 'right, right', 'no mode')
+        >>> Modes((("side", ("left", "right")),), leaves=((0,), (1,))).index_of(torch.tensor([[1], [-1]]))
+        tensor([ 1, -1])
     """
 
     choices: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    index: str | None = None
+    leaves: tuple[tuple[int, ...], ...] = ()
     entropy: str = "all"
     of_path: str | None = None
 
@@ -51,10 +52,15 @@ class Modes:
             words.append(names[digit])
         return ", ".join(reversed(words))
 
+    def index_of(self, leaf: Tensor) -> Tensor:
+        """Numbers the modes of leaves ``mode`` ``[*B, entries]``, int64 ``[*B]``, -1 while none is decided.
 
-def index_among(leaves: Sequence[Sequence[int]], leaf: Tensor) -> Tensor:
-    """Returns which of the leaves of all modes a leaf ``mode`` ``[*B, entries]`` is, int64 ``[*B]``; -1: none."""
-    if leaf.shape[-1] != len(leaves[0]):
-        raise ValueError(f"mode must have {len(leaves[0])} entries on the last axis, got shape {list(leaf.shape)}")
-    same = (leaf.unsqueeze(-2) == torch.tensor(leaves, device=leaf.device)).all(-1)
-    return torch.where(same.any(-1), same.to(torch.int64).argmax(-1), -1)
+        Raises:
+            ValueError: if a leaf has fewer entries than those of the modes.
+        """
+        leaves = torch.tensor(self.leaves or ((),), device=leaf.device)
+        entries = leaves.shape[-1]
+        if leaf.shape[-1] < entries:
+            raise ValueError(f"mode must have {entries} entries on the last axis, got shape {list(leaf.shape)}")
+        same = (leaf[..., None, :entries] == leaves).all(-1)
+        return torch.where(same.any(-1), same.to(torch.int64).argmax(-1), -1)

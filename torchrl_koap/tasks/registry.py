@@ -17,11 +17,8 @@ def register_task(task: Task) -> Task:
     or through an entry point of the group ``torchrl_koap.tasks`` (a module, or a :class:`Task` in it) of an installed
     package.
 
-    Args:
-        task (Task): the task. The same task may be registered again.
-
     Returns:
-        Task: the task.
+        Task: the task, which may be registered again.
 
     Raises:
         ValueError: if another task has the name.
@@ -43,10 +40,10 @@ def register_task(task: Task) -> Task:
 
 
 def get_task(name: Task | str) -> Task:
-    """Looks a task up by name, a task being itself; installed packages are asked if the name is not known yet.
+    """Looks a task up by name; installed packages are asked if the name is not known yet.
 
     Returns:
-        Task: the registered task.
+        Task: the registered task; a task itself.
 
     Raises:
         ValueError: if the name is unknown; the message suggests the nearest one.

@@ -25,7 +25,6 @@ NUM_PIECES, PIECE_RADIUS = 36, 0.009  # m
 START_HEIGHT = 0.2  # of the spoon (m)
 START_HALF = 0.02  # half the extent of a start region (m)
 STARTS = {"left": (0.5, 0.22), "near": (0.33, 0.0), "right": (0.5, -0.22)}  # of the spoon: x, y (m)
-EMBODIMENTS = ("robot", "hand")
 FRAME_HZ = 10.0  # frames, and actions, per second
 CONTROL_HZ = 30.0  # commands per second
 EMBEDDING_DIM = 96  # columns

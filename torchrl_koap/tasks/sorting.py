@@ -96,7 +96,7 @@ def _sorting(num_boxes: int) -> Task:
         goal="torchrl_koap.tasks.sorting:goal_reached",
         modes=Modes(
             (("order of arrival", orders),),
-            index="torchrl_koap.envs.sorting:mode_index",
+            leaves=arrival_orders(num_boxes),
             entropy="solved_contexts",
         ),
         env="torchrl_koap.envs.sorting:SortingEnv",

@@ -22,6 +22,7 @@ HEIGHT_GAP = 0.03  # m; boxes lie on top of each other if all their heights diff
 # name, half sizes (m)
 BOXES = (("red", (0.03, 0.03, 0.03)), ("green", (0.03, 0.03, 0.03)), ("blue", (0.03, 0.05, 0.03)))
 NAMES = tuple(name for name, _ in BOXES)
+ORDERS = tuple(itertools.permutations(range(3)))  # in which the boxes can arrive: the modes
 # where each box starts: x range, y range (m)
 _STARTS = (((0.35, 0.45), (-0.25, -0.15)), ((0.35, 0.45), (-0.1, 0.0)), ((0.55, 0.6), (-0.2, 0.0)))
 _JOINTS = {f"joint {joint}": Action("rad") for joint in range(1, 8)}
@@ -74,8 +75,8 @@ _STACKING = register_task(
         ),
         goal="torchrl_koap.tasks.stacking:goal_reached",
         modes=Modes(
-            (("order of arrival", tuple(", ".join(order) for order in itertools.permutations(NAMES))),),
-            index="torchrl_koap.envs.stacking:mode_index",
+            (("order of arrival", tuple(", ".join(NAMES[box] for box in order) for order in ORDERS)),),
+            leaves=ORDERS,
             entropy="solved_contexts",
         ),
         score="torchrl_koap.evaluation.scores:stacking_scores",
@@ -113,7 +114,7 @@ _STACKING_1 = register_task(
         name="stacking_1",
         max_steps=400,
         goal="torchrl_koap.tasks.stacking:first_box_reached",
-        modes=Modes((("first box", NAMES),), "torchrl_koap.envs.stacking:first_box", "solved_contexts"),
+        modes=Modes((("first box", NAMES),), ((0,), (1,), (2,)), "solved_contexts"),
         score=None,  # an episode ends with the first box
         env_options={"num_boxes": 1},
         data_from="stacking",

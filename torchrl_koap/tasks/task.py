@@ -72,12 +72,10 @@ class Task(Columns):
         position (str): the part that pictures draw, ``x, y`` first.
         max_steps (int): control steps after which an episode is truncated.
         control_hz (float): control steps per second.
-        robot (tuple of int): state columns of the robot itself: the recovery augmentation shifts them, and the
-            controller reads them (see :meth:`controller_columns`).
+        robot (tuple of int): state columns of the robot itself, which recovery shifts and the controller reads.
         tool_kinematics (str, optional): import string of the function from the robot's joints ``[*B, J]`` to the
             position of the tool ``[*B, 3]``, where joints are commanded; ``position`` then follows them.
-        planar_parts (tuple of str): parts whose positions and yaws may be moved and turned together for training;
-            empty if the place on the table matters.
+        planar_parts (tuple of str): parts whose positions and yaws may be moved and turned together for training.
         interchangeable (tuple): groups of bodies that may be permuted for training.
         relative_positions (tuple): what the planner is told besides the state: ``(part, seen from part, in the frame of
             part, yaw of part)``, the last two optional (see :meth:`relative_columns`).
@@ -86,8 +84,7 @@ class Task(Columns):
         modes (Modes): the ways in which the task can be done.
         score (str, optional): import string of a function of the result of
             :func:`~torchrl_koap.evaluation.scores.score`, the episodes and their contexts that returns further figures.
-        noise (float): standard deviation of the noise on the measured end effector (m), in rollouts and on the
-            demonstrations as they are loaded.
+        noise (float): standard deviation of the noise on the measured end effector (m), in demonstrations too.
         env (str, optional): import string of the environment (:mod:`torchrl_koap.envs.registry` says what it has to
             offer). None: a robot with data and no simulator.
         env_options (dict): its further keyword arguments.
@@ -295,9 +292,7 @@ class Task(Columns):
     def import_strings(self) -> dict[str, str]:
         """Returns the import strings by the field that has them: the code that using the task may run."""
         named = {field: getattr(self, field) for field in ("env", "expert", "goal", "score")}
-        named |= {"tool_kinematics": self.tool_kinematics, "modes.index": self.modes.index}
-        named["modes.of_path"] = self.modes.of_path
-        named |= {f"state.{part}": kind for part, kind in self.state.items() if ":" in kind}
+        named |= {"tool_kinematics": self.tool_kinematics, "modes.of_path": self.modes.of_path}
         return {place: value for place, value in named.items() if value}
 
     def to_json(self) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def fit(
     Raises:
         ValueError: for an unknown method or option, data without any label or that do not fit the task, or trajectories
             shorter than a window.
-        LayoutError: if the data do not follow the storage layout.
+        DataError: if the data do not follow the storage layout.
 
     Examples:
         >>> import numpy as np

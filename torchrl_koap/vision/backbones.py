@@ -77,7 +77,7 @@ def load_backbone(network: str | None = None) -> Backbone:
         ...
         ValueError: network 'builtins:int' is no nn.Module and makes none, it makes int
     """
-    if network is None:
+    if network in (None, NETWORK):
         return Backbone(*_lite0(_BLOCKS), NETWORK)
     found = resolve(network, "network")
     stages = found if isinstance(found, nn.Module) else found()

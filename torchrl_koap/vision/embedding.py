@@ -122,7 +122,9 @@ def embed_recordings(
             if progress is not None:
                 progress(done, total)
         width = task.observation[name].stop - task.observation[name].start if name in task.observation else components
-        fitted = film.fit(width) if projection is None else projection
+        fitted = projection
+        if fitted is None:
+            fitted = Projection.fit(film.sample(held_out=False), width, encoder.identity)
         fitted.save(out / CAMERAS / f"{name}.safetensors")
         fitted = Projection.load(out / CAMERAS / f"{name}.safetensors")  # as it is used
         embedded[name] = [fitted(features) for features in film.features()]
@@ -184,15 +186,13 @@ class _Film:
         self.clips = recordings.cameras[camera]
         about = [encoder.identity, [asdict(clip) for clip in self.clips]]
         key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
-        self._folder, self._frames, self._seconds = folder / f"{camera}-{key}", 0, 0.0
-
-    def _file(self, index: int) -> Path:
-        return self._folder / f"{index:06d}.safetensors"
+        self._files = [folder / f"{camera}-{key}" / f"{index:06d}.safetensors" for index in range(len(self.clips))]
+        self._frames, self._seconds = 0, 0.0
 
     def embed(self) -> Iterator[int]:
         """Writes the features of trajectories that lack them; yields numbers of frames as they are done."""
-        for index, clip in enumerate(self.clips):
-            if self._file(index).is_file():
+        for index, (file, clip) in enumerate(zip(self._files, self.clips, strict=True)):
+            if file.is_file():
                 yield len(clip)
                 continue
             found, frames = [], _read(self.recordings, self.camera, index, self.encoder.size)
@@ -201,32 +201,25 @@ class _Film:
                 found.append(self.encoder.features(torch.from_numpy(np.stack(part))))
                 self._frames, self._seconds = self._frames + len(part), self._seconds + time.perf_counter() - began
                 yield len(part)
-            with replacing_file(self._file(index)) as aside:
+            with replacing_file(file) as aside:
                 save_file({"features": torch.cat(found)}, aside)
 
     def features(self) -> Iterator[Tensor]:
         """Features ``[T, F]`` of every trajectory."""
-        for index in range(len(self.clips)):
-            yield load_file(self._file(index))["features"]
+        for file in self._files:
+            yield load_file(file)["features"]
 
-    def _sample(self, held_out: bool) -> Tensor:
+    def sample(self, held_out: bool) -> Tensor:
         """Features of up to so many frames, spread evenly."""
-        apart = len(self.clips) >= HELD_OUT
-        rows = [
-            index for index in range(len(self.clips)) if not apart or (index % HELD_OUT == HELD_OUT - 1) == held_out
-        ]
+        rows = range(len(self.clips))
+        if len(rows) >= HELD_OUT:
+            rows = [index for index in rows if (index % HELD_OUT == HELD_OUT - 1) == held_out]
         every = max(1, -(-sum(len(self.clips[index]) for index in rows) // MOST))
-        return torch.cat([load_file(self._file(index))["features"][index % every :: every] for index in rows])
-
-    def fit(self, components: int) -> Projection:
-        """Principal components of the features."""
-        fitted = Projection.fit(self._sample(held_out=False), components)
-        fitted.about = self.encoder.identity
-        return fitted
+        return torch.cat([load_file(self._files[index])["features"][index % every :: every] for index in rows])
 
     def report(self, projection: Projection) -> CameraReport:
         """How much of the frames they keep that they were not fitted to."""
-        kept = projection.kept(self._sample(held_out=True))
+        kept = projection.kept(self.sample(held_out=True))
         rate = self._frames / self._seconds if self._frames else float("nan")
         height, width = self.encoder.size
         return CameraReport((height, width), projection.dim, kept, rate)

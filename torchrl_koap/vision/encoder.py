@@ -19,7 +19,7 @@ from torchrl.envs.transforms import ObservationTransform
 from torchrl_koap.data.ted import stored_folder
 from torchrl_koap.files import check_file, replacing_file
 from torchrl_koap.keys import read_entry
-from torchrl_koap.vision.backbones import NETWORK, Backbone, WeightsError, load_backbone
+from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
 
 BATCH = 32  # frames that go through the network at once
 SHORT_SIDE = 96  # pixels that the network is shown of the shorter side of a frame
@@ -81,7 +81,6 @@ class FrozenImageEncoder(ObservationTransform):
             "weights": self.backbone.digest,
             "network": self.backbone.name,
             "places": "x".join(map(str, maps.shape[2:])),
-            "pooling": "moments" if maps.shape[2:].numel() > 1 else "of the network",
             "size": "x".join(map(str, self.size)),
         }
 
@@ -118,8 +117,7 @@ class FrozenImageEncoder(ObservationTransform):
         features = self.features(frames.cpu())
         return (features if self.projection is None else self.projection(features)).to(frames.device)
 
-    def _apply_transform(self, frames: Tensor) -> Tensor:
-        return self.embed(frames)
+    _apply_transform = embed
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sets the embeddings of the frames of a tensordict."""
@@ -190,7 +188,7 @@ class Projection(nn.Module):
         self.register_buffer("components", components)
 
     @classmethod
-    def fit(cls, features: Tensor, dim: int) -> Projection:
+    def fit(cls, features: Tensor, dim: int, about: Mapping[str, str] | None = None) -> Projection:
         """Fits ``dim`` components to features ``[N, F]``, more of both, of frames that are not all alike."""
         if min(features.shape) <= dim:
             raise ValueError(f"{dim} components need more frames and features than that, got {list(features.shape)}")
@@ -198,17 +196,11 @@ class Projection(nn.Module):
         if bool((features == features[:1]).all()):
             raise ValueError(f"all {len(features)} frames look the same to the network: there is nothing to embed")
         mean = features.mean(0)
-        centred = features - mean
-        if len(centred) < centred.shape[1]:  # the small one of the two products
-            values, left = torch.linalg.eigh(centred @ centred.T)
-            values, left = values.flip(0)[:dim].clamp_min(1e-12), left.flip(1)[:, :dim]
-            axes = centred.T @ left / values.sqrt()
-        else:
-            values, axes = torch.linalg.eigh(centred.T @ centred)
-            values, axes = values.flip(0)[:dim], axes.flip(1)[:, :dim]
+        _, values, axes = torch.linalg.svd(features - mean, full_matrices=False)
+        axes = axes[:dim].T
         signs = axes.gather(0, axes.abs().argmax(0, keepdim=True)).sign()  # the same on every machine
-        scale = (values[0] / (len(features) - 1)).sqrt()
-        return cls(mean.float(), (axes * signs / scale).float())
+        scale = values[0] / (len(features) - 1) ** 0.5
+        return cls(mean.float(), (axes * signs / scale).float(), about)
 
     @property
     def dim(self) -> int:
@@ -299,13 +291,11 @@ def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | 
     """
     fitted = projection if isinstance(projection, Projection) else Projection.load(projection)
     about = fitted.about
-    if network is None and about["network"] != NETWORK:
-        network = about["network"]
     try:
         height, width = (int(side) for side in about["size"].split("x"))
     except ValueError as error:
         raise ValueError(f"the description of the projection cannot be used, size: {error}") from error
-    backbone = load_backbone(network)
+    backbone = load_backbone(network or about["network"])
     if backbone.digest != about["weights"]:
         raise WeightsError(
             f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"

@@ -39,25 +39,23 @@ class Observer:
 
     def __init__(self, task: Task, cameras: Mapping[str, Projection]):
         self.cameras = dict(cameras)
-        self._widths = {name: part.stop - part.start for name, part in task.observation.items()}
-        self._hidden = set(task.hidden)
+        widths = {name: part.stop - part.start for name, part in task.observation.items()}
         for name, projection in cameras.items():
-            if self._widths.get(name) != projection.dim:
+            if widths.get(name) != projection.dim:
                 raise ValueError(
                     f"camera {name!r} has embeddings of {projection.dim} columns, task {task.name!r} has"
-                    f" {self._widths.get(name, 'none')} of that name"
+                    f" {widths.get(name, 'none')} of that name"
                 )
+        self._parts = list(widths)
+        self._numbers = {name: width for name, width in widths.items() if name not in cameras}  # no embeddings
+        self._needed = [*([] if self._numbers.keys() <= {*task.hidden} else [STATE]), *cameras]
+        self.state_dim = sum(self._numbers.values())  # columns that are no embedding
         self._encoders: dict[str, FrozenImageEncoder] = {}
 
     @classmethod
     def of(cls, task: Task, cameras: Mapping[str, Projection]) -> Observer | None:
         """Makes one where there are cameras, else None."""
         return cls(task, cameras) if cameras else None
-
-    @property
-    def state_dim(self) -> int:
-        """Number of observation columns that are no embedding."""
-        return sum(width for name, width in self._widths.items() if name not in self.cameras)
 
     def example(self) -> dict[str, np.ndarray]:
         """Zeros and black frames, as a robot gives them."""
@@ -72,10 +70,8 @@ class Observer:
             given (mapping): ``"state"``, the columns that are no embedding ``[*B, d]``, left out where the policy sees
                 none of them; and a frame of every camera by its name, uint8 ``[*B, H, W, 3]``.
         """
-        numbers = {name: width for name, width in self._widths.items() if name not in self.cameras}
-        wanted = [*([STATE] if numbers else []), *self.cameras]
-        needed = [name for name in wanted if name != STATE or not set(numbers) <= self._hidden]
-        missing = [name for name in needed if name not in given]
+        wanted = [*([STATE] if self._numbers else []), *self.cameras]
+        missing = [name for name in self._needed if name not in given]
         unknown = [name for name in given if name not in wanted]
         if missing or unknown:
             what = f"has no {missing[0]!r}" if missing else f"has an unknown {unknown[0]!r}"
@@ -85,9 +81,9 @@ class Observer:
         state = observed_numbers(given.get(STATE, np.zeros((*batch, self.state_dim))))
         if state.shape != (*batch, self.state_dim):
             raise ValueError(f"'state' must be {[*batch, self.state_dim]} beside these frames, got {list(state.shape)}")
-        seen |= dict(zip(numbers, state.split(list(numbers.values()), -1), strict=True))
+        seen |= dict(zip(self._numbers, state.split(list(self._numbers.values()), -1), strict=True))
         dtype = torch.promote_types(state.dtype, torch.float32)
-        return torch.cat([seen[name].to(dtype) for name in self._widths], -1)
+        return torch.cat([seen[name].to(dtype) for name in self._parts], -1)
 
     def _embedded(self, name: str, frames: Any) -> Tensor:
         """Embeddings ``[*B, d]`` of one camera's frames."""

@@ -111,11 +111,11 @@ def test_pictures_of_lerobot(tmp_path, embodiment):
     recordings = read_recordings(write_camera_set(tmp_path / "set", embodiment), action_dim=7)
     assert recordings.state_names == ("x", "y", "z") and list(recordings.skipped) == ["timestamp"]
     for seed in range(2):
-        wanted = episode(embodiment, 6 + seed, seed)
-        np.testing.assert_array_equal(read(recordings, "third_person", seed), wanted.frames)
-        np.testing.assert_allclose(recordings.states[seed], wanted.state, rtol=1e-6)
+        frames, states, actions = episode(embodiment, 6 + seed, seed)
+        np.testing.assert_array_equal(read(recordings, "third_person", seed), frames)
+        np.testing.assert_allclose(recordings.states[seed], states, rtol=1e-6)
         if embodiment == "robot":
-            np.testing.assert_allclose(recordings.actions[seed], wanted.action, rtol=1e-6)
+            np.testing.assert_allclose(recordings.actions[seed], actions, rtol=1e-6)
     assert bool(recordings.num_labels) == (embodiment == "robot")
 
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
+from torchrl_koap.data.formats.lerobot import read_lerobot
 from torchrl_koap.files import DataError
 
 pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
@@ -210,7 +210,6 @@ def test_another_width_than_described_is_told(tmp_path):
 
 
 def test_descriptions_that_are_none(tmp_path):
-    assert not is_lerobot(tmp_path)
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta/info.json").write_text(json.dumps({"features": FEATURES}))
     with pytest.raises(FileNotFoundError, match=r"no \*\.parquet below"):

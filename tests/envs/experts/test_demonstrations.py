@@ -10,7 +10,7 @@ from command_calls import contents
 
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.experts import demonstrations
 from torchrl_koap.envs.experts.avoiding import AvoidingExpert
 from torchrl_koap.envs.experts.demonstrations import (
@@ -77,13 +77,13 @@ def test_replayed_actions_give_the_same_episode(recording):
         )  # the command of row 0 is a step from the start
         for row, action in enumerate(torch.cat([first, part["action"]])):
             step = env.step(step.set("action", action[None]))["next"]
-            assert np.allclose(env.raw_log()["c_pos"][0, :2], frames[row, 2:], atol=1e-9, rtol=0)
+            assert np.allclose(env.raw_log()[0]["c_pos"][0, :2], frames[row, 2:], atol=1e-9, rtol=0)
             seen = step["observation"][0].numpy()
             assert np.allclose(seen[:2], frames[row, :2], atol=1e-12, rtol=0)
             # the environment hands out the position of 1 ms before the recorder's
             assert np.allclose(seen[2:], frames[row, 2:], atol=1e-3, rtol=0)
         assert step["success"].item() and not step["collision"].item()
-        assert mode_index(step["mode"]).item() == report.each("mode")[index]
+        assert env.task.modes.index_of(step["mode"]).item() == report.each("mode")[index]
 
 
 def test_modes_are_balanced():

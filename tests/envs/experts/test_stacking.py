@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl_koap.envs import StackingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.experts.stacking import StackingExpert
-from torchrl_koap.envs.stacking import ORDERS
+from torchrl_koap.tasks.stacking import ORDERS
 
 LIMIT = 1000
 
@@ -21,7 +21,7 @@ class TestStackingExpert(ContextExpertTestBase):
 
 @pytest.fixture(scope="module")
 def played():
-    return first_attempts("stacking", range(6), evaluation_contexts("stacking", 6), [(1, mode) for mode in range(6)])
+    return first_attempts("stacking", range(6), evaluation_contexts("stacking")[:6], [(1, mode) for mode in range(6)])
 
 
 def test_every_order_is_stacked(played):
@@ -45,7 +45,7 @@ def test_motion_is_smooth(played):
 
 
 def test_a_box_that_was_taken_away_is_fetched_again():
-    context = evaluation_contexts("stacking", 1)
+    context = evaluation_contexts("stacking")[:1]
     env, expert = StackingEnv(1, max_steps=LIMIT, dtype=torch.float64), StackingExpert([0], context, [0])
     out, stolen = env.reset(contexts=context), False
     for _ in range(LIMIT):

@@ -45,7 +45,7 @@ def play(embodiment, context=NEAR, targets=None):
     """An episode of the expert, or of given targets; the targets and the simulation."""
     sims = ScoopingSimulations(embodiment, 1)
     bowls = context[None, 1, :2] if len(context) > 1 else None
-    sims.reset(ONE, start_joints(context, embodiment)[None], context[:1, 2], bowls)
+    sims.reset(ONE, start_joints(context, embodiment, SpoonKinematics())[None], context[:1, 2], bowls)
     if targets is not None:
         for target in targets:
             sims.advance(ONE, target[None])
@@ -77,7 +77,7 @@ def test_specs_and_start():
 
 def test_the_robot_s_demonstration_succeeds_in_the_environment_too():
     targets, sims = play("robot")
-    assert sims.success[0] and sims.rim[0] and sims.pieces_on_spoon()[0] >= 1
+    assert sims.success[0] and sims.rim[0] and sims.pieces_on_spoon(0) >= 1
     env = ScoopingEnv(num_envs=1, embed=False)
     data = env.reset(contexts=NEAR[None])
     for target in targets:
@@ -122,7 +122,7 @@ def test_scores_tell_the_starts_apart():
 def test_the_camera_sees_the_embodiments_differ(embodiment, graphics):
     renderer = Renderer(ScoopingSimulations(embodiment, 1).model, 96, 96, shadows=False)
     sims = ScoopingSimulations(embodiment, 1)
-    sims.reset(np.arange(1), start_joints(NEAR, embodiment)[None], [0.0])
+    sims.reset(np.arange(1), start_joints(NEAR, embodiment, SpoonKinematics())[None], [0.0])
     picture = renderer.render(sims.data[0], "third_person").astype(int)
     renderer.close()
     assert picture.shape == (96, 96, 3)

@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from torchrl_koap.data.d3il.unpickling import load_pickle
-from torchrl_koap.files import DataError
+from torchrl_koap.files import DataError, refuse
 from torchrl_koap.tasks.action_rules import gripper_command
 from torchrl_koap.tasks.columns import tan_yaw
 
@@ -157,45 +157,38 @@ def read_raw(
         if progress is not None and index:
             progress(index, len(files))
         try:
-            episode = read_raw_episode(file, robot=converter.robot, objects=converter.objects)
+            seen, done = converter.convert(_read_episode(file, converter))
         except DataError as error:
             problems += [f"{file}: {problem}" for problem in error.problems]
-            continue
         except OSError as error:
             problems.append(f"{file}: cannot be read: {error}")
-            continue
-        logged = set(episode.objects)
-        if set(converter.objects) not in (logged, logged - {*converter.unread}):
-            wanted = ", ".join(converter.objects) or "no objects"
-            problems.append(f"{file}: of another task: it logs {', '.join(map(str, episode.objects))}, wanted {wanted}")
-        elif not problems:
-            seen, done = converter.convert(episode)
+        else:
             frames.append(seen)
             actions.append(done)
-    if problems:
-        raise DataError(root, problems)
+    refuse(root, problems)
     return frames, actions
 
 
-def read_raw_episode(path: str | Path, *, robot: Sequence[str] = (), objects: Sequence[str] = ()) -> RawEpisode:
-    """Reads and checks a pickle, in which entries ``robot`` and poses of ``objects`` must be there."""
+def _read_episode(path: Path, converter: Converter) -> RawEpisode:
+    """Reads and checks a pickle, in which the converter's entries and poses must be there."""
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("robot"), dict):
         held = f"the keys {sorted(map(str, content))}" if isinstance(content, dict) else f"a {type(content).__name__}"
         raise DataError(path, f"missing key 'robot' (a dictionary of arrays); the file holds {held}")
     others = {key: value for key, value in content.items() if key not in ("robot", "context")}
-    problems = _problems(content["robot"], others, robot=robot, objects=objects)
-    if problems:
-        raise DataError(path, problems)
+    refuse(path, _problems(content["robot"], others, converter))
+    if set(converter.objects) not in (set(others), {*others} - {*converter.unread}):
+        wanted = ", ".join(converter.objects) or "no objects"
+        raise DataError(path, f"of another task: it logs {', '.join(map(str, others))}, wanted {wanted}")
     return RawEpisode(content["robot"], others)
 
 
-def _problems(robot_arrays, object_arrays, *, robot: Sequence[str], objects: Sequence[str]) -> list[str]:
+def _problems(robot: Mapping[str, Any], objects: Mapping[str, Any], converter: Converter) -> list[str]:
     problems = []
-    tables: list[tuple[str, Any, Mapping, Sequence[str]]] = [("robot", robot_arrays, ROBOT_COLUMNS, robot)]
-    for name in dict.fromkeys((*object_arrays, *objects)):
-        needed = ("pos", "quat") if name in objects else ()
-        tables.append((name, object_arrays.get(name), OBJECT_COLUMNS, needed))
+    tables: list[tuple[str, Any, Mapping, Sequence[str]]] = [("robot", robot, ROBOT_COLUMNS, converter.robot)]
+    for name in dict.fromkeys((*objects, *converter.objects)):
+        needed = ("pos", "quat") if name in converter.objects else ()
+        tables.append((name, objects.get(name), OBJECT_COLUMNS, needed))
     lengths = {}
     for name, entries, columns, required in tables:
         if not isinstance(entries, Mapping):

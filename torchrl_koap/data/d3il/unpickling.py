@@ -6,8 +6,7 @@ A pickle is a program. Two gates stand before this one runs:
 1. The instructions are *scanned* without executing them: those that plain data never need (extension codes, persistent
    ids, class instances) are refused.
 2. The file is loaded with *stand-ins* for numpy's constructors; every other class or function that it asks for is
-   refused by name. Stand-ins check types, shapes and byte counts and build a view of the bytes in the file, so a
-   declared shape can never allocate more than the file holds.
+   refused by name. Stand-ins build views of the bytes in the file, so no declared shape allocates more than it holds.
 """
 
 from __future__ import annotations
@@ -111,9 +110,6 @@ class _RestrictedUnpickler(pickle.Unpickler):
             raise _asks_for(_spelled(module, attribute))
         return _StandIn(f"{module}.{attribute}", _STAND_INS[module, attribute])
 
-    def persistent_load(self, pid):
-        raise _asks_for(f"data outside the file (persistent id {pid!r})")
-
 
 class _StandIn:
     """Takes the place of a class or function; can be called, and cannot be changed by the file."""
@@ -141,9 +137,7 @@ class _ElementType:
         self.dtype = np.dtype(code)
 
     def __setstate__(self, state):
-        byte_order, *structure = state[1:5]
-        if any(part is not None for part in structure):
-            raise _RefusedError("structured element types are refused; only plain arrays are read")
+        byte_order = state[1]  # the rest is for structured types, which have no code that is read
         if byte_order in ("<", ">"):
             self.dtype = self.dtype.newbyteorder(byte_order)
         elif byte_order not in ("|", "="):

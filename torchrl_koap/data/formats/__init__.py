@@ -13,12 +13,12 @@ import torch
 
 from torchrl_koap import keys
 from torchrl_koap.data.formats.frames import stored_clips
-from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
+from torchrl_koap.data.formats.lerobot import INFO, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
-from torchrl_koap.data.formats.robomimic import is_hdf5, read_robomimic
-from torchrl_koap.data.formats.tables import is_table_folder, read_tables
+from torchrl_koap.data.formats.robomimic import read_robomimic
+from torchrl_koap.data.formats.tables import read_tables, table_files
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
 from torchrl_koap.data.ted import load_ted, read_about, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
@@ -97,20 +97,20 @@ FORMATS = {
     ),
     "robomimic": Format(
         "an HDF5 file in robomimic's layout (*.hdf5)",
-        is_hdf5,
+        lambda source: Path(source).suffix.lower() in (".hdf5", ".h5") and Path(source).is_file(),
         read_robomimic,
         ("observations", *COMMON),
     ),
     "lerobot": Format(
         "a LeRobot data set (meta/info.json)",
-        is_lerobot,
+        lambda source: (Path(source) / INFO).is_file(),
         read_lerobot,
         ("observations", "episodes", *COMMON),
         write_lerobot,
     ),
     "npz": Format(
         "a table, or a folder of tables (*.npz, *.csv, *.parquet), a trajectory each",
-        is_table_folder,
+        lambda source: bool(table_files(source)),
         read_tables,
         ("action_columns", *COMMON),
         write_npz,

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN, Clock, find_rate, rises_evenly, told_rate, usual_rate
-from torchrl_koap.data.formats.frames import Clip, check_cameras
+from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
-from torchrl_koap.files import DataError, gathered, option, some
+from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import lookup
 
 
@@ -71,10 +71,8 @@ def assemble(
         )
         for piece in pieces
     ]
-    problems += gathered([*_other_names(pieces), *_other_lengths(pieces)])
-    if problems:
-        raise DataError(source, problems)
-    check_cameras(pieces, source)
+    refuse(source, problems + gathered([*_other_names(pieces), *_other_lengths(pieces)]))
+    refuse(source, list(_camera_faults(pieces)))
     parts = [part for piece in pieces for part in _episodes(piece, problems)]
     short = [f"{part.name} (fewer than two frames)" for part in parts if part.frames < 2]
     pieces = [part for part in parts if part.frames > 1]
@@ -109,8 +107,7 @@ def assemble(
     left_out += [name for name in drop_columns if name not in left_out]
     if not observed:
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
-    if problems:
-        raise DataError(source, problems)
+    refuse(source, problems)
     recordings = make_recordings(
         [_stack(piece.states, observed) for piece in pieces],
         [_stack(piece.actions, acting) if piece.actions else None for piece in pieces],
@@ -218,7 +215,7 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     Told by the numbers of the episode, by a frame counter or a clock that starts again, and by flags of starts and
     ends. Rows of one episode that lie out of order are sorted by its counter or clock.
     """
-    rows = np.arange(len(next(iter(piece.states.values()), ())))
+    rows = np.arange(piece.frames)
     called = {kind_of(name)[0]: name for name in reversed(piece.states)}
     columns = {kind: piece.states[name] for kind, name in called.items()}
     frame, clock = columns.get("frame"), columns.get("clock")
@@ -302,6 +299,19 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
             if missing or more:
                 said = [f"lacks {missing}"] * bool(missing) + [f"has {more} besides"] * bool(more)
                 yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}"
+
+
+def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:
+    """Pieces that lack a camera that others have, or a frame per row."""
+    for name in dict.fromkeys(name for piece in pieces for name in piece.cameras):
+        cure = f"record them, or leave the camera out by {option('drop_columns')} {name}"
+        absent = [piece.name for piece in pieces if name not in piece.cameras]
+        if absent:
+            yield f"camera {name!r} has no frames in {some(absent)}: {cure}"
+        for piece in pieces:
+            number = len(piece.cameras.get(name, range(piece.frames)))
+            if number != piece.frames:
+                yield f"{piece.name}: camera {name!r} has {number} frames for {piece.frames} rows: {cure}"
 
 
 def _other_lengths(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:

@@ -19,15 +19,12 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.arrow import import_pyarrow
-from torchrl_koap.files import DataError, option, read_bytes, some
-
-if TYPE_CHECKING:
-    from torchrl_koap.data.formats.columns import Piece
+from torchrl_koap.data.formats.kinds import import_pyarrow
+from torchrl_koap.files import read_bytes, some
 
 PICTURES = (".png", ".jpg", ".jpeg")
 TIMES = "_times.npy"
@@ -37,13 +34,7 @@ _COLOURS = {1: "greyscale", 2: "greyscale with alpha", 4: "RGBA"}
 
 @dataclass(frozen=True)
 class Clip:
-    """Where the frames of one camera in one trajectory lie.
-
-    Examples:
-        >>> from torchrl_koap.data.formats.frames import Clip
-        >>> Clip("run/top.npy", (0, 1, 2, 3)).take([1, 3]).numbers
-        (1, 3)
-    """
+    """Where the frames of one camera in one trajectory lie."""
 
     file: str  # a folder of pictures, an array (*.npy), an HDF5 file, a parquet file, or a video
     numbers: tuple[int, ...]  # for every row that of its frame, in the file's own count
@@ -238,7 +229,7 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
             held = [held[index] for index in _nearest(stamps, clock, name)]
         elif held != list(range(held[0], held[0] + len(held))):
             absent = sorted({*range(held[0], held[-1])} - {*held})
-            raise ValueError(f"camera {name!r}: frame {some([str(number) for number in absent])} is missing")
+            raise ValueError(f"camera {name!r}: frame {some(absent)} is missing")
         found[name] = Clip(str(path.resolve()), tuple(held))
     return found
 
@@ -295,20 +286,3 @@ def _video_starts(root: Path, camera: str) -> dict[int, tuple[int, int, float]]:
             for row in table.select(["episode_index", *columns]).to_pylist():
                 found[row["episode_index"]] = tuple(row[column] for column in columns)
     return found
-
-
-def check_cameras(pieces: Sequence[Piece], source: str) -> None:
-    """Checks that every trajectory has every camera, and a frame per row."""
-    names = dict.fromkeys(name for piece in pieces for name in piece.cameras)
-    problems = []
-    for name in names:
-        cure = f"record them, or leave the camera out by {option('drop_columns')} {name}"
-        absent = [piece.name for piece in pieces if name not in piece.cameras]
-        if absent:
-            problems.append(f"camera {name!r} has no frames in {some(absent)}: {cure}")
-        for piece in pieces:
-            clip, rows = piece.cameras.get(name), len(next(iter(piece.states.values()), ()))
-            if clip is not None and len(clip) != rows:
-                problems.append(f"{piece.name}: camera {name!r} has {len(clip)} frames for {rows} rows: {cure}")
-    if problems:
-        raise DataError(source, problems)

@@ -21,24 +21,18 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import lerobot_clips
-from torchrl_koap.data.formats.kinds import kind_of
+from torchrl_koap.data.formats.kinds import import_pyarrow, kind_of, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, read_json, some
+from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, read_json, refuse, some
 
 PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
 SURROUNDINGS = "observation.environment_state"  # its columns are told by their names, which begin like it
 EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
 IMAGES = ("image", "video")
-_INFO = "meta/info.json"
+INFO = "meta/info.json"
 _LARGEST = 1 << 40  # bytes of a file of rows
-
-
-def is_lerobot(folder: str | Path) -> bool:
-    """Whether a folder is a LeRobot data set."""
-    return (Path(folder) / _INFO).is_file()
 
 
 def read_lerobot(
@@ -51,7 +45,8 @@ def read_lerobot(
     info = read_info(root)
     known = info["features"]
     observed = [name for name in known if name.startswith(PREFIX)]
-    images = [name for name in observed if _is_image(known[name])]
+    cameras = [name for name in observed if known[name].get("dtype") in IMAGES]
+    images = [name for name in observed if name in cameras or len(known[name].get("shape") or [1]) > 1]
     usable = [name for name in observed if name not in images and known[name].get("dtype") != "string"]
     chosen = usable if observations is None else list(observations)
     problems = [
@@ -66,8 +61,7 @@ def read_lerobot(
     ]
     if not chosen:
         problems.append(f"no feature {PREFIX}* holds numbers; there are {', '.join(observed) or 'none'}")
-    if problems:
-        raise DataError(root, problems)
+    refuse(root, problems)
     flags = [name for name in known if name not in observed and kind_of(name)[0] in ("start", "end")]
     rows, undescribed = read_rows(root, chosen, flags=flags, episodes=episodes)
     if not rows:
@@ -79,8 +73,7 @@ def read_lerobot(
         for name, (there, said) in wide.items()
         if said not in (0, there)
     ]
-    if problems:
-        raise DataError(root, problems)
+    refuse(root, problems)
     if ACTION not in first and not width:
         silent = "no file has actions, and info.json does not say how many columns an action has"
         raise DataError(root, f"{silent}: say it in {option('action_dim')}")
@@ -88,7 +81,6 @@ def read_lerobot(
     if len(set(names)) < len(names):  # two features with the same names of columns
         names = [label for name in chosen for label in _names({}, name, first[name].shape[1])]
     acting = _names(known.get(ACTION) or {}, ACTION, first[ACTION].shape[1] if ACTION in first else width)
-    cameras = [name for name in images if known[name].get("dtype") in IMAGES]
     clips, pieces = lerobot_clips(root, info, cameras, rows), []
     unseen = [name for name in images if name.split(".")[-1] not in clips[min(rows)]]
     absent = [f"{name} (its videos are not here)" if name in cameras else name for name in unseen]
@@ -116,9 +108,9 @@ def read_lerobot(
 
 def read_info(root: str | Path) -> dict[str, Any]:
     """Reads the description of a data set, or says what is wrong with it."""
-    file = Path(root).expanduser() / _INFO
+    file = Path(root).expanduser() / INFO
     if not file.is_file():
-        raise FileNotFoundError(f"no LeRobot data set in {root}: it has no {_INFO}")
+        raise FileNotFoundError(f"no LeRobot data set in {root}: it has no {INFO}")
     info = read_json(file)
     features = info.get("features") or {}
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
@@ -145,23 +137,18 @@ def read_rows(
                 columns[name] = numbers(table[name], name, announced=announced, files=files)
             except ValueError as error:
                 problems.append(str(error))
-    if problems:
-        raise DataError(root, problems)
+    refuse(root, problems)
     episode, frame = (columns.pop(name)[:, 0] for name in (EPISODE, FRAME))
     found, starts = np.unique(episode.astype(int), return_index=True)
     ends, expected = [*starts[1:], len(episode)], _expected_lengths(root)
     missing = sorted((set(episodes) or expected.keys()) - {*found.tolist()})
     if missing:
-        absent, there = (some([str(number) for number in numbers]) for numbers in (missing, found))
-        problems = [
-            f"{len(missing)} episodes are missing: {absent}; name in {option('episodes')} those to read: {there}"
-        ]
+        cure = f"name in {option('episodes')} those to read: {some(found)}"
+        problems = [f"{len(missing)} episodes are missing: {some(missing)}; {cure}"]
     rows: dict[int, dict[str, Any]] = {}
     unlisted = [number for number in found.tolist() if expected and not episodes and number not in expected]
     if unlisted:
-        said = (
-            f"the description of episodes lacks {some([str(number) for number in unlisted])}, of which there are rows"
-        )
+        said = f"the description of episodes lacks {some(unlisted)}, of which there are rows"
         problems.append(f"{said}: name in {option('episodes')} those to read")
     for number, start, end in zip(found.tolist(), starts, ends, strict=True):
         if episodes and number not in episodes:
@@ -173,8 +160,7 @@ def read_rows(
             problems.append(f"{files[start]}: column {FRAME!r} of episode {number} must count 0, 1, 2, ...")
         rows[number] = {name: values[start:end] for name, values in columns.items()}
         rows[number] |= {FRAME: frame[start:end], "file": files[start]}
-    if problems:
-        raise DataError(root, problems)
+    refuse(root, problems)
     return rows, unread
 
 
@@ -211,8 +197,7 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
                 faults.append((str(file), f"column {name!r} must hold numbers or lists of numbers, got {got}"))
             elif kind != kinds[name]:
                 faults.append((str(file), f"column {name!r} holds {got}, that of another file {kinds[name]}"))
-    if faults:
-        raise DataError(root, gathered(faults))
+    refuse(root, gathered(faults))
     try:
         data = pyarrow.dataset.dataset(files, schema=pyarrow.schema(list(kinds.items())), format="parquet")
         table = data.to_table(columns=[*kinds, "__filename"])
@@ -254,10 +239,6 @@ def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
     if isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given):
         return given if name != SURROUNDINGS else [f"{short}_{label}" for label in given]
     return [short] if width == 1 else [f"{short}_{index}" for index in range(width)]
-
-
-def _is_image(feature: Mapping[str, Any]) -> bool:
-    return feature.get("dtype") in IMAGES or len(feature.get("shape") or [1]) > 1
 
 
 def _rate(info: Mapping[str, Any]) -> float | None:

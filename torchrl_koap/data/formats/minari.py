@@ -12,7 +12,7 @@ import numpy as np
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.kinds import spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, gathered
+from torchrl_koap.files import DataError, gathered, refuse
 
 PREFIX = "minari:"
 
@@ -56,8 +56,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
             continue
         acting = {f"action_{index}": values for index, values in enumerate(steps.reshape(len(steps), -1).T)}
         pieces.append(Piece(str(episode.id), states, acting))
-    if faults:
-        raise DataError(source, gathered(faults))
+    refuse(source, gathered(faults))
     return assemble(
         pieces,
         source,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,29 +20,14 @@ import torch
 from numpy.typing import ArrayLike
 
 from torchrl_koap.data.formats.frames import Clip
-from torchrl_koap.files import DataError, gathered, option
+from torchrl_koap.files import DataError, gathered, option, refuse
 
 FRAMES, STEPS = "[T, d]", "[T, a] or [T - 1, a]"
-FROM_FILES = "files are read by read_recordings (`koap convert`)"
-NO_ACTIONS = (
-    f"say in {option('action_dim')} how many columns an action has, or in {option('action_columns')} which columns of a"
-    " table are actions"
-)
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Trajectories as arrays, with the names of their columns.
-
-    Args:
-        states (list of np.ndarray): frames of every trajectory ``[T_i, d]``, float64.
-        actions (list of np.ndarray): actions of every trajectory ``[T_i - 1, a]``, float64; NaN rows have no label.
-        state_names (tuple of str): names of the ``d`` state columns.
-        action_names (tuple of str): names of the ``a`` action columns.
-        sources (tuple of str): where each trajectory is from, for messages.
-        control_hz (float, optional): frames per second, if the source says so.
-        skipped (tuple of str): entries of the source that were left out.
-        cameras (dict): by camera for every trajectory where its ``T_i`` frames lie.
+    """Trajectories as float64 arrays, with the names of their columns.
 
     Examples:
         >>> import numpy as np
@@ -52,14 +37,14 @@ class Recordings:
         (('state_0', 'state_1', 'state_2'), 4)
     """
 
-    states: list[np.ndarray]
-    actions: list[np.ndarray]
-    state_names: tuple[str, ...]
-    action_names: tuple[str, ...]
-    sources: tuple[str, ...]
-    control_hz: float | None = None
-    skipped: tuple[str, ...] = field(default=())
-    cameras: Mapping[str, Sequence[Clip]] = field(default_factory=dict)
+    states: list[np.ndarray]  # frames of every trajectory [T_i, d]
+    actions: list[np.ndarray]  # of every trajectory [T_i - 1, a]; NaN rows have no label
+    state_names: tuple[str, ...]  # of the d columns
+    action_names: tuple[str, ...]  # of the a columns
+    sources: tuple[str, ...]  # where each trajectory is from, for messages
+    control_hz: float | None = None  # frames per second, if the source says so
+    skipped: tuple[str, ...] = ()  # entries of the source that were left out
+    cameras: Mapping[str, Sequence[Clip]] = field(default_factory=dict)  # where the T_i frames of every trajectory lie
 
     @property
     def num_labels(self) -> int:
@@ -70,6 +55,20 @@ class Recordings:
     def moving(self) -> np.ndarray:
         """Which state columns change within a recording, as goals do not: bool ``[d]``."""
         return np.any([(frames[1:] != frames[:-1]).any(0) for frames in self.states], axis=0)
+
+    def cut(self, spans: Sequence[tuple[int, int, int]], skipped: Sequence[str]) -> Recordings:
+        """Keeps of trajectories, by their numbers, the frames from one to the one behind the last."""
+        return replace(
+            self,
+            states=[self.states[number][start:end] for number, start, end in spans],
+            actions=[self.actions[number][start : end - 1] for number, start, end in spans],
+            sources=tuple(self.sources[number] for number, *_ in spans),
+            cameras={
+                name: [clips[number].take(range(start, end)) for number, start, end in spans]
+                for name, clips in self.cameras.items()
+            },
+            skipped=(*self.skipped, *skipped),
+        )
 
 
 def make_recordings(
@@ -136,7 +135,8 @@ def make_recordings(
         raise DataError(source, f"{option('action_dim')} must be a positive whole number, got {action_dim!r}")
     if wide is None:
         wide = 1
-        problems += [] if faults else [f"no trajectory has actions: {NO_ACTIONS}"]
+        cure = f"say in {option('action_dim')} how many columns an action has, or in {option('action_columns')} which"
+        problems += [] if faults else [f"no trajectory has actions: {cure} columns of a table are actions"]
     elif action_dim is not None and action_dim != wide:
         problems.append(f"actions have {wide} columns, {option('action_dim')} says {action_dim}")
     given_states = _names(state_names, width, "state", problems)
@@ -163,14 +163,14 @@ def make_recordings(
     problems += _sparse([array for array in known if array is not None and array.shape[1] == wide], given_actions)
     if control_hz is not None:
         problems += wrong_rate(control_hz, "control_hz")
-    if problems or faults:
-        raise DataError(source, [*gathered(faults), *problems])
-    steps = [
-        np.full((len(seen) - 1, wide), np.nan) if done is None else _whole(done[: len(seen) - 1])
-        for seen, done in zip(frames, known, strict=True)
-    ]
+    refuse(source, [*gathered(faults), *problems])
     unknown = [np.isnan(array).sum(-1) for array in known if array is not None]
     partly = sum(int(((0 < columns) & (columns < wide)).sum()) for columns in unknown)
+    steps = [
+        np.full((len(seen) - 1, wide), np.nan) if done is None else done[: len(seen) - 1]
+        for seen, done in zip(frames, known, strict=True)
+    ]  # an action of which some columns are unknown is unknown
+    steps = [np.where(np.isnan(part).any(-1, keepdims=True), np.nan, part) for part in steps]
     skipped = [*skipped, *([f"{partly} actions of which only some columns are known"] if partly else [])]
     return Recordings(
         frames,
@@ -197,9 +197,8 @@ def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
         if not isinstance(values, (str, Path, Mapping)):
             return list(values)
     kind = type(values).__name__
-    raise DataError(
-        source, f"{what} must be a sequence of arrays {wanted}, one per trajectory, got {kind}: {FROM_FILES}"
-    )
+    said = f"{what} must be a sequence of arrays {wanted}, one per trajectory, got {kind}"
+    raise DataError(source, f"{said}: files are read by read_recordings (`koap convert`)")
 
 
 def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str, str]]) -> np.ndarray | None:
@@ -207,12 +206,10 @@ def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str
     try:
         if isinstance(value, torch.Tensor):
             value = value.detach().cpu().resolve_conj().resolve_neg()
-            array = (value.double() if value.is_floating_point() else value).numpy()
-        elif isinstance(value, np.ma.MaskedArray):
-            array = value.astype(np.float64).filled(np.nan) if value.dtype.kind in "fiub" else value.data
-        else:
-            array = np.asarray(value)
-            array = array.astype(np.float64) if array.dtype == object else array
+            value = (value.double() if value.is_floating_point() else value).numpy()
+        array = np.ma.asarray(value)
+        if array.dtype.kind in "fiubO":
+            array = array.astype(np.float64).filled(np.nan)
     except (ValueError, TypeError, RuntimeError):  # ragged lists; other objects; sparse tensors
         said = f"{what} are no table of numbers, got {type(value).__name__}"
         if isinstance(value, (list, tuple)) and len(widths := sorted({np.size(row) for row in value})) > 1:
@@ -221,10 +218,10 @@ def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str
         return None
     if array.ndim != 2 or not array.shape[-1]:
         faults.append((name, f"{what} must be {wanted}, got {list(array.shape)}"))
-    elif array.dtype.kind not in "fiub":
+    elif array.dtype.kind != "f":
         faults.append((name, f"{what} are {array.dtype}, wanted numbers in the unit that the robot reports"))
     else:
-        return array.astype(np.float64)
+        return array
     return None
 
 
@@ -241,11 +238,6 @@ def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:
         " which all columns are known are labels: repeat its last value where it holds on, or drop it in"
         f" {option('drop_columns')}"
     ]
-
-
-def _whole(steps: np.ndarray) -> np.ndarray:
-    """An action of which some columns are unknown is unknown."""
-    return np.where(np.isnan(steps).any(-1, keepdims=True), np.nan, steps)
 
 
 def _names(given: Sequence[str] | None, width: int, kind: str, problems: list[str]) -> tuple[str, ...]:

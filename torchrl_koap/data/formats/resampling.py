@@ -10,7 +10,7 @@ import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
-from torchrl_koap.files import DataError, option, some
+from torchrl_koap.files import DataError, option, refuse, some
 from torchrl_koap.lookup import lookup
 
 # kinds of actions by name: whether they add up over the frames of a longer step; None where the name does not tell
@@ -49,8 +49,7 @@ def resampled(
     problems = wrong_rate(control_hz, "resample")
     if times is None and known is None:
         problems.append(f"the rate of the recordings is not known: pass {option('control_hz')}")
-    if problems:
-        raise DataError("these recordings", problems)
+    refuse("these recordings", problems)
     if times is None:
         times = [np.arange(len(frames)) / known for frames in recordings.states]
     usual = [float(np.median(np.diff(at))) for at in times]
@@ -71,10 +70,11 @@ def resampled(
             "actions of kind 'delta' may be changes over one frame, which add up over a longer step, or velocities or"
             f" efforts, which hold on: pass {option('action_kind')} 'change' or 'velocity'"
         )
-    if problems:
-        raise DataError("these recordings", problems)
+    refuse("these recordings", problems)
     adding = np.array(summing, dtype=bool)
-    bounds = np.where(_switches(np.concatenate(recordings.states)), 0, leap_bounds(recordings.states)[0])
+    columns = np.concatenate(recordings.states).T
+    switches = [bool((each == each.round()).all()) and len(np.unique(each)) <= _LEVELS for each in columns]
+    bounds = np.where(switches, 0, leap_bounds(recordings.states)[0])
     parts: list[tuple[str, np.ndarray, np.ndarray, int, np.ndarray]] = []
     gaps: list[str] = []
     short: list[str] = []
@@ -117,11 +117,6 @@ def leap_bounds(trajectories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndar
     spans = np.ptp(np.concatenate(trajectories), axis=0)
     usual = np.array([np.median(moved) if len(moved := step[step > 0]) else np.inf for step in steps.T])
     return np.maximum(LEAP * spans, UNUSUAL * usual), usual
-
-
-def _switches(frames: np.ndarray) -> list[bool]:
-    """Which columns of ``[N, d]`` are few integers."""
-    return [bool((column == column.round()).all()) and len(np.unique(column)) <= _LEVELS for column in frames.T]
 
 
 def _states(frames: np.ndarray, times: np.ndarray, new: np.ndarray, bounds: np.ndarray) -> np.ndarray:

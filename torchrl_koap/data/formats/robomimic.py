@@ -25,16 +25,11 @@ from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, gathered, option
+from torchrl_koap.files import DataError, gathered, option, refuse
 
 NEXT = "next_obs"
 BESIDE = ("episode", "frame", "start", "end")  # what entries beside the observations may be
 _SAME, _ROUNDED = 1e-3, 1e-6  # share of a column's range, and of its numbers, that is rounding
-
-
-def is_hdf5(path: str | Path) -> bool:
-    """Whether a path is an HDF5 file, by its name."""
-    return Path(path).suffix.lower() in (".hdf5", ".h5") and Path(path).is_file()
 
 
 def read_robomimic(
@@ -89,8 +84,7 @@ def _read(
         faults.append(("data/*/obs", f"no entry is a table of numbers; there are {', '.join(first['obs'])}"))
     followed = {name for name in demos if use_next and all(entry in data[name].get(NEXT, {}) for entry in chosen)}
     pieces = [_piece(data[name], name, chosen, faults, behind=name in followed) for name in demos]
-    if faults:
-        raise DataError(file, gathered(faults))
+    refuse(file, gathered(faults))
     seen = {name for piece in pieces for name in (*piece.states, *piece.cameras)}
     skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
     skipped += [name for name in sorted(first) if name not in ("obs", NEXT, "actions", *seen)]

@@ -28,13 +28,20 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import clips_beside
-from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, number_of
+from torchrl_koap.data.formats.kinds import (
+    as_numbers,
+    import_pyarrow,
+    is_action,
+    kind_of,
+    number_of,
+    number_type,
+    numbers,
+)
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
-from torchrl_koap.files import DataError, gathered, option
+from torchrl_koap.files import DataError, gathered, option, refuse
 from torchrl_koap.lookup import lookup
 
 # what readers of damaged files raise
@@ -45,9 +52,10 @@ _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "fram
 _Table = tuple[Piece, "float | None", list[str]]  # columns, declared rate, and what is not read
 
 
-def is_table_folder(folder: str | Path) -> bool:
-    """Whether a folder holds tables of this kind, or is one itself."""
-    return any(_files(Path(folder)))
+def table_files(folder: str | Path) -> list[Path]:
+    """Finds the tables in a folder, in the order of their names; one that is given itself is the only one."""
+    found = [Path(folder)] if Path(folder).is_file() else sorted(Path(folder).glob("[!.]*"))
+    return [path for path in found if path.suffix.lower() in _READERS and path.is_file()]
 
 
 def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = None, **options: Any) -> Recordings:
@@ -56,8 +64,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     In NumPy archives actions are an entry and no ``action_columns``. The options are those of
     :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
-    folder = Path(folder)
-    files = _files(folder)
+    folder, files = Path(folder), table_files(folder)
     if not files:
         raise FileNotFoundError(f"{folder} holds no *.npz, *.csv or *.parquet files")
     archives = [file.name for file in files if file.suffix.lower() == ".npz"]
@@ -74,8 +81,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
             tables.append((_with_cameras(piece, file), rate, unread))
         except (ValueError, OSError) as error:
             faults.append((str(file), str(error)))
-    if faults:
-        raise DataError(folder, gathered(faults))
+    refuse(folder, gathered(faults))
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
         if "resample" not in options or len(rates) < len(tables):
@@ -102,15 +108,9 @@ def _with_cameras(piece: Piece, file: Path) -> Piece:
     return replace(piece, cameras=clips_beside(file, clock))
 
 
-def _files(folder: Path) -> list[Path]:
-    found = [folder] if folder.is_file() else sorted(folder.glob("[!.]*"))
-    return [path for path in found if path.suffix.lower() in _READERS and path.is_file()]
-
-
 def _stamped(piece: Piece, rate: float) -> Piece:
     """A piece with time stamps by its rate, unless it has some."""
-    frames = len(next(iter(piece.states.values())))
-    return replace(piece, states={"timestamp": np.arange(frames) / rate} | piece.states)
+    return replace(piece, states={"timestamp": np.arange(piece.frames) / rate} | piece.states)
 
 
 def _entries(file: Path) -> dict[str, np.ndarray]:

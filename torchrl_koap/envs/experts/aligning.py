@@ -11,8 +11,7 @@ to the target, and then
     4. lets go     when nothing more can be reached from this contact, and picks another one: through the middle of the
                    tray (mode 0), or over its walls (mode 1)
 
-From inside, a corner holds the rod best and serves for the way; the last few centimetres are pushed at a wall. All
-randomness of an episode is drawn from its own seed.
+From inside, a corner holds the rod best and serves for the way; the last few centimetres are pushed at a wall.
 """
 
 from __future__ import annotations

@@ -10,8 +10,6 @@ deflection, and a dead zone. In one control step it
                    and takes back whatever would run into a cylinder
     3. moves the   stick, whose deflection follows the decision over about five control steps, with a slowly
        stick       drifting hand
-
-All randomness of an episode is drawn from its own seed.
 """
 
 from __future__ import annotations

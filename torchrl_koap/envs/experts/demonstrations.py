@@ -35,7 +35,6 @@ from torchrl_koap.envs.experts.disturbances import (
     Disturbances,
     choose_disturbed,
     disturbed_columns,
-    share_disturbed,
 )
 from torchrl_koap.envs.experts.recording import FAULTS, Attempt, expert_of, play
 from torchrl_koap.envs.registry import make_env
@@ -83,20 +82,7 @@ class RecordingReport:
         discarded = {name: sum(counts.get(name, 0) for counts in self.each("failures")) for name in FAULTS}
         notes = {"seed": self.seed, "modes": self.each("mode"), "attempts": self.each("attempts")}
         notes["discarded_attempts"] = discarded
-        if not self.disturbance:
-            return notes
-        chosen, spells = [log["attempts"] for log in self.logs if log["disturbed"]], self.each("spells")
-        kinds = Counter(kind for episode in spells for _, _, kind in episode)
-        return notes | {
-            "disturbance": {
-                "share": self.disturbance,
-                "disturbed_demonstrations": len(chosen),
-                "attempts_under_disturbance": sum(chosen),
-                "recovered_at_the_first_attempt": chosen.count(1),
-                "kept": {kind: kinds[kind] for kind in KINDS},
-                "spells": [[list(spell) for spell in episode] for episode in spells],
-            }
-        }
+        return notes | ({"disturbance": self.disturbance, "spells": self.each("spells")} if self.disturbance else {})
 
     def __str__(self) -> str:
         notes, modes, rows = self.notes, self.each("mode"), self.each("rows")
@@ -108,10 +94,11 @@ class RecordingReport:
             f" discarded attempts: {discarded or 'none'}"
         )
         if self.disturbance:
-            told = notes["disturbance"]
-            kept = ", ".join(f"{n} {kind}" for kind, n in told["kept"].items())
-            said += f"; {told['disturbed_demonstrations']} disturbed ({kept}), of which the operator recovered in"
-            said += f" {told['disturbed_demonstrations']} of {told['attempts_under_disturbance']} attempts"
+            chosen = [log["attempts"] for log in self.logs if log["disturbed"]]
+            kinds = Counter(kind for spells in self.each("spells") for *_, kind in spells)
+            kept = ", ".join(f"{kinds[kind]} {kind}" for kind in KINDS)
+            said += f"; {len(chosen)} disturbed ({kept}), of which the operator recovered in"
+            said += f" {len(chosen)} of {sum(chosen)} attempts"
         return said
 
 
@@ -131,10 +118,10 @@ def record_demonstrations(
     """
     task, start = get_task(task), time.perf_counter()
     takes = list(iterate_takes(task, episodes, seed, disturbance=disturbance, **options))
-    seconds, share = time.perf_counter() - start, share_disturbed(task, disturbance)
+    seconds, share = time.perf_counter() - start, _share(task, disturbance)
     report = RecordingReport(get_task(task.source), seed, [take.log for take in takes], seconds, share)
-    frames = [torch.from_numpy(take.frames) for take in takes]
-    return flatten_trajectories(frames, [torch.from_numpy(take.actions) for take in takes], dtype=dtype), report
+    frames, actions = [take.frames for take in takes], [take.actions for take in takes]
+    return flatten_trajectories(frames, actions, dtype=dtype), report
 
 
 def iterate_takes(
@@ -160,7 +147,7 @@ def iterate_takes(
         RecordingError: if an episode fails again and again; it names the expert and the last failure.
     """
     task = get_task(task)
-    disturbance = share_disturbed(task, disturbance)
+    disturbance = _share(task, disturbance)
     task = get_task(task.source)
     expert_of(task)
     numbers = {"episodes": episodes, "seed": seed, "num_threads": num_threads, "batch_size": batch_size}
@@ -262,9 +249,6 @@ def _within(spells: Sequence[tuple[int, int, str]], found: Attempt) -> tuple[tup
     return tuple(spell for spell in moved if spell[0] < spell[1])
 
 
-_REQUEST = "request.json"
-
-
 def record_to_folder(
     folder: str | Path,
     task: Task,
@@ -277,68 +261,46 @@ def record_to_folder(
 ) -> RecordingReport:
     """Records demonstrations into a folder; called again with the same arguments, it goes on where it was interrupted.
 
-    Arguments are those of :func:`~torchrl_koap.envs.experts.demonstrations.iterate_takes`. A folder that holds
+    Arguments are those of :func:`iterate_takes`. A folder that holds
     demonstrations already, or other unfinished ones, or that another process records into, is refused.
     """
-    start, disturbance = time.perf_counter(), share_disturbed(task, disturbance)
+    start, disturbance = time.perf_counter(), _share(task, disturbance)
     task = get_task(task.source)
     request = {"task": task.name, "episodes": episodes, "seed": seed, "disturbance": disturbance}
     iterating = functools.partial(iterate_takes, task, episodes, seed, disturbance=disturbance, **options)
     iterating()  # looks at the arguments before anything is written
-    files = _Files(Path(folder), episodes)
-    files.refuse_others(request)
-    with one_at_a_time(files.unfinished / ".lock", busy=f"another process records into {folder}"):
-        done = files.begin(request)
+    ted, unfinished = Path(folder) / "ted", Path(folder) / "unfinished"
+    begun, files = unfinished / "request.json", [unfinished / f"{number:05d}.npz" for number in range(episodes)]
+    if ted.exists():
+        raise FileExistsError(f"{ted} exists already; choose another --out")
+    there = json.loads(begun.read_text()) if begun.exists() else request
+    other = [f"{key} {there.get(key)!r}, not {value!r}" for key, value in request.items() if there.get(key) != value]
+    if other:
+        raise FileExistsError(
+            f"{unfinished} holds an interrupted recording with {', '.join(other)}: ask for the same to go on, or remove"
+            " it"
+        )
+    with one_at_a_time(unfinished / ".lock", busy=f"another process records into {folder}"):
+        with replacing_file(begun) as aside:
+            aside.write_text(json.dumps(request))
+        done = [number for number, file in enumerate(files) if file.exists()]
         if progress is not None:
             progress(len(done), episodes)
         for take in iterating(progress=progress, done=done):
-            files.add(take)
-        frames, actions, logs = files.read()
+            with replacing_file(files[take.number]) as aside, open(aside, "wb") as stream:
+                np.savez(stream, frames=take.frames, actions=take.actions, log=json.dumps(take.log))
+        frames, actions, logs = [], [], []
+        for file in files:
+            with np.load(file, allow_pickle=False) as held:
+                frames.append(held["frames"])
+                actions.append(held["actions"])
+                logs.append(json.loads(held["log"].item()))
         report = RecordingReport(task, seed, logs, time.perf_counter() - start, disturbance)
-        save_ted(flatten_trajectories(frames, actions), files.ted, task, report.notes)
-    shutil.rmtree(files.unfinished)
+        save_ted(flatten_trajectories(frames, actions), ted, task, report.notes)
+    shutil.rmtree(unfinished)
     return report
 
 
-class _Files:
-    """Files of one recording."""
-
-    def __init__(self, folder: Path, episodes: int):
-        self.ted, self.unfinished, self._episodes = folder / "ted", folder / "unfinished", episodes
-
-    def refuse_others(self, request: dict) -> None:
-        begun = self.unfinished / _REQUEST
-        if self.ted.exists():
-            raise FileExistsError(f"{self.ted} exists already; choose another --out")
-        there = json.loads(begun.read_text()) if begun.exists() else request
-        asked = request.items()
-        other = [f"{key} {there.get(key)!r}, not {value!r}" for key, value in asked if there.get(key) != value]
-        if other:
-            raise FileExistsError(
-                f"{self.unfinished} holds an interrupted recording with {', '.join(other)}: ask for the same to go on,"
-                " or remove it"
-            )
-
-    def begin(self, request: dict) -> set[int]:
-        """Notes what is asked for; returns the numbers of the demonstrations that are there already."""
-        self.unfinished.mkdir(parents=True, exist_ok=True)
-        with replacing_file(self.unfinished / _REQUEST) as aside:
-            aside.write_text(json.dumps(request))
-        return {index for index in range(self._episodes) if self._file(index).exists()}
-
-    def add(self, take: Take) -> None:
-        with replacing_file(self._file(take.number)) as aside, open(aside, "wb") as file:
-            np.savez(file, frames=take.frames, actions=take.actions, log=json.dumps(take.log))
-
-    def read(self) -> tuple[list[torch.Tensor], list[torch.Tensor], list[dict]]:
-        """Frames, actions and log of all demonstrations."""
-        frames, actions, logs = [], [], []
-        for index in range(self._episodes):
-            with np.load(self._file(index), allow_pickle=False) as held:
-                frames.append(torch.from_numpy(held["frames"]).float())
-                actions.append(torch.from_numpy(held["actions"]).float())
-                logs.append(json.loads(held["log"].item()))
-        return frames, actions, logs
-
-    def _file(self, index: int) -> Path:
-        return self.unfinished / f"{index:0{max(3, len(str(self._episodes - 1)))}d}.npz"
+def _share(task: Task, asked: float | None) -> float:
+    """The share of the demonstrations in which the operator is disturbed: the task's if none is asked for."""
+    return task.defaults.disturbance if asked is None else asked

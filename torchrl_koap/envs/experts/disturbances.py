@@ -9,8 +9,6 @@ that is executed, and that command is what the recording holds::
     late_turn    for a while the operator goes on as it did before
     drift        for a while the height of a tool that is pushed about sinks or rises unnoticed, where an action
                  commands it
-
-All draws come from the seed of the attempt, so an episode does not depend on the others in the batch.
 """
 
 from __future__ import annotations
@@ -30,11 +28,6 @@ _STEPS = {"impulse": (2, 6), "slip": (4, 11), "late_turn": (4, 11), "drift": (4,
 _SLIP = (0.6, 1.4)  # rad
 _DRIFT = (0.1, 0.35)  # of the size of the operator's own steps
 _MEMORY = 0.98  # of the size of the operator's own steps
-
-
-def share_disturbed(task: Task, share: float | None) -> float:
-    """Returns the share of the demonstrations in which the operator is disturbed: the task's if none is asked for."""
-    return task.defaults.disturbance if share is None else share
 
 
 def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:

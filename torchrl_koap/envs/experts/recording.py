@@ -18,7 +18,6 @@ from torchrl_koap import keys
 from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter, RawEpisode
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.experts.disturbances import Disturbances
-from torchrl_koap.envs.registry import mode_index_of
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task, get_task
 
@@ -44,7 +43,8 @@ class Expert(abc.ABC):
     """Plays a batch of ``n`` episodes of a task; a subclass is named by ``Task.expert``.
 
     Each episode has a mode and a seed, an integer or a sequence of integers as for ``numpy.random.default_rng``; in a
-    task with bodies also a context ``[bodies, 3]``: x, y (m), yaw (rad).
+    task with bodies also a context ``[bodies, 3]``: x, y (m), yaw (rad). All that is random about it comes from its
+    seed, so it does not depend on the others of the batch.
 
     Raises:
         ValueError: if a mode does not exist, or the numbers of modes, seeds and contexts differ.
@@ -134,7 +134,7 @@ def play(
     active = np.arange(count) < playing
     data = env.reset() if contexts is None else env.reset(contexts=contexts)
     frames, actions, logs = [data[keys.OBSERVATION].numpy().copy()], [], []
-    index_of, touched, lengths = mode_index_of(task), np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
+    touched, lengths = np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
     success, reached = np.zeros(count, dtype=bool), np.full(count, -1)
     for _ in range(env.max_steps):
         action = np.zeros((count, task.action_dim))
@@ -146,10 +146,10 @@ def play(
         frames.append(data[keys.OBSERVATION].numpy().copy())
         actions.append(action)
         if converter is not None:
-            logs.append((env.raw_log(), env.raw_objects()))
+            logs.append(env.raw_log())
         lengths += active
         success = np.where(active, data[keys.SUCCESS].squeeze(-1).numpy(), success)
-        reached = np.where(active, index_of(data[keys.MODE]).numpy(), reached)
+        reached = np.where(active, task.modes.index_of(data[keys.MODE]).numpy(), reached)
         touched |= active & expert.touching(env)
         active[:playing] &= ~expert.finished
         active &= ~touched
@@ -175,11 +175,12 @@ def play(
     return results
 
 
-def _converted(converter: Converter, logs: Sequence[tuple[dict, dict]], row: int) -> tuple[np.ndarray, np.ndarray]:
+def _converted(
+    converter: Converter, logs: Sequence[tuple[dict, np.ndarray]], row: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Frames and actions of an episode from what D3IL's recorder logs, as its files are converted."""
     robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in converter.robot}
-    objects = {}
-    for name, own in zip(converter.objects, logs[0][1], strict=True):
-        poses = np.stack([poses[own][row] for _, poses in logs])
-        objects[name] = {"pos": poses[:, :3], "quat": poses[:, 3:]}
+    poses = np.stack([poses[row] for _, poses in logs], axis=1)  # [objects, T, 7]
+    each = zip(converter.objects, poses, strict=True)
+    objects = {name: {"pos": own[:, :3], "quat": own[:, 3:]} for name, own in each}
     return converter.convert(RawEpisode(robot=robot, objects=objects))

@@ -10,8 +10,7 @@ motions. In one control step it
     3. moves the rod    around all boxes to that place, or, once behind the box, forwards; while pushing it steers
                         twice as far to the side as the box lies off, which brings the box back in front of it
 
-The last two are in :mod:`torchrl_koap.envs.experts.sorting_decision`. All randomness of an episode comes from its own
-seed.
+The last two are in :mod:`torchrl_koap.envs.experts.sorting_decision`.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _LATENCY = 2.0  # control steps from what is seen to when an action begins to sh
 
 
 class SortingExpert(Expert):
-    """Scripted expert of Sorting; modes are orders of colours, see :func:`~torchrl_koap.envs.sorting.mode_index`.
+    """Scripted expert of Sorting; modes are orders of colours (``arrival_orders``).
 
     It has finished when it has had nothing left to do for a few control steps.
     """

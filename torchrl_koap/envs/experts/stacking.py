@@ -9,8 +9,7 @@ What it does next follows from what it sees now, so similar situations give simi
     release   fingers open; then up and on to the next box
 
 A box that slipped or fell is fetched again. Poses of the tool centre point (TCP) are decided here; joint commands come
-from the controller's inverse kinematics. All randomness of an episode is drawn when the expert is made, from its own
-seed: an episode does not depend on the others in the batch, and nothing touches a global generator.
+from the controller's inverse kinematics.
 """
 
 from __future__ import annotations
@@ -23,8 +22,7 @@ import numpy as np
 
 from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
-from torchrl_koap.envs.stacking import ORDERS
-from torchrl_koap.tasks.stacking import BOXES, TARGET
+from torchrl_koap.tasks.stacking import BOXES, ORDERS, TARGET
 
 GRIPPER_OPEN, GRIPPER_CLOSED = 0.08, 0.06  # gripper commands: the distances of the fingers that will result (m)
 HALF_SIZES = np.array([size[:2] for _, size in BOXES])
@@ -43,7 +41,7 @@ _HORIZON = 1500  # control steps for which the wobble of the hand is drawn
 
 
 class StackingExpert(Expert):
-    """Scripted expert of Stacking; modes are orders of the boxes, see :func:`~torchrl_koap.envs.stacking.mode_index`.
+    """Scripted expert of Stacking; modes are orders of the boxes, ``ORDERS``.
 
     It has finished when it has let go of the third box and drawn back.
     """

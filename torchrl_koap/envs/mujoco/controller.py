@@ -29,20 +29,10 @@ FINGER_OPEN = 0.04
 FINGER_RESET = 0.001
 
 # Columns of the pointer table: addresses of one simulation's arrays inside its mjData.
-QPOS, QVEL, CTRL, BIAS, TCP_POS, TCP_QUAT, ANCHORS, JOINT_AXES, OBJECTS = range(9)
+QPOS, QVEL, CTRL, BIAS, TCP_POS, OBJECTS = range(6)
 # Columns of the log row written after the first substep of a control step; the free bodies' poses follow them.
-LOG_COLUMNS = {
-    "j_pos": slice(0, 7),
-    "j_vel": slice(7, 14),
-    "des_j_pos": slice(14, 21),
-    "des_j_vel": slice(21, 28),
-    "des_j_acc": slice(28, 35),
-    "c_pos": slice(35, 38),
-    "c_quat": slice(38, 42),
-    "c_vel": slice(42, 45),
-    "gripper_width": slice(45, 46),
-}
-LOG_WIDTH = 46
+LOG_COLUMNS = {"j_pos": slice(0, 7), "des_j_pos": slice(7, 14), "c_pos": slice(14, 17), "gripper_width": 17}
+LOG_WIDTH = 18
 
 
 @functools.cache
@@ -92,39 +82,29 @@ def _finger_forces(position, velocity, width, grasping, ctrl):
 
 
 @njit(cache=True)
-def _write_log(row, pointers, qpos, qvel, q_des, v_des, a_des, tcp, quat):
-    """Log row of D3IL's recorder: joints after the substep, TCP pose at its beginning.
-
-    The velocity mixes both as the original does: Jacobian of the beginning, joint velocities after the substep.
-    """
-    anchors, joint_axes = _array(pointers[ANCHORS], 21), _array(pointers[JOINT_AXES], 21)
-    row[42:45] = 0.0
+def _write_log(row, pointers, qpos, q_des):
+    """Log row of D3IL's recorder: joints after the substep, TCP position at its beginning."""
+    tcp, objects = _array(pointers[TCP_POS], 3), _array(pointers[OBJECTS], len(row) - LOG_WIDTH)
     for j in range(7):
-        row[j], row[7 + j], row[14 + j], row[21 + j], row[28 + j] = qpos[j], qvel[j], q_des[j], v_des[j], a_des[j]
-        zx, zy, zz = joint_axes[3 * j], joint_axes[3 * j + 1], joint_axes[3 * j + 2]
-        rx, ry, rz = tcp[0] - anchors[3 * j], tcp[1] - anchors[3 * j + 1], tcp[2] - anchors[3 * j + 2]
-        row[42] += qvel[j] * (zy * rz - zz * ry)
-        row[43] += qvel[j] * (zz * rx - zx * rz)
-        row[44] += qvel[j] * (zx * ry - zy * rx)
-    row[35], row[36], row[37] = tcp[0], tcp[1], tcp[2]
-    row[38], row[39], row[40], row[41] = quat[0], quat[1], quat[2], quat[3]
-    row[45] = qpos[7] + qpos[8]
-    objects = _array(pointers[OBJECTS], len(row) - LOG_WIDTH)
+        row[j], row[7 + j] = qpos[j], q_des[j]
+    for k in range(3):
+        row[14 + k] = tcp[k]
+    row[17] = qpos[7] + qpos[8]
     for k in range(len(objects)):
         row[LOG_WIDTH + k] = objects[k]
 
 
 @njit(nogil=True, cache=True)
-def track_pose(step, model, data, pointers, rows, commands, widths, grasping, substeps, targets, speeds, started, log):
+def track_pose(step, model, data, pointers, rows, commands, widths, grasping, substeps, targets, started, log):
     """Tracks Cartesian commands for ``substeps`` physics steps in each of the simulations ``rows``.
 
     ``step`` is the address of ``mj_step``, ``model`` that of the shared mjModel, ``data`` [n] are those of the mjData
-    and ``pointers`` [n, 9] those of their arrays. ``commands`` [n, 7] are TCP positions (m) and quaternions, ``widths``
-    [n] finger targets (m), ``grasping`` [n] says whether the fingers press. Kept between calls: joint ``targets`` and
-    their ``speeds`` [n, 7], and ``started`` [n], False where the controller has not run since the reset. The first
-    substep is written into ``log`` [n, LOG_WIDTH + 7 free bodies].
+    and ``pointers`` [n, 6] those of their arrays. ``commands`` [n, 7] are TCP positions (m) and quaternions, ``widths``
+    [n] finger targets (m), ``grasping`` [n] says whether the fingers press. Kept between calls: joint ``targets``
+    [n, 7], and ``started`` [n], False where the controller has not run since the reset. The first substep is written
+    into ``log`` [n, LOG_WIDTH + 7 free bodies].
     """
-    target, q, v, a = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
+    target, q = np.empty(7), np.empty(7)
     for row in rows:
         qpos, qvel = _array(pointers[row, QPOS], 9), _array(pointers[row, QVEL], 9)
         ctrl, bias = _array(pointers[row, CTRL], 9), _array(pointers[row, BIAS], 9)
@@ -136,31 +116,25 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
             target[k] = commands[row, k] if k < 3 else commands[row, k] / norm
         for j in range(7):
             q[j] = targets[row, j] if started[row] else qpos[j]
-            v[j] = speeds[row, j] if started[row] else 0.0
         started[row] = True
         for substep in range(substeps):
             for j in range(7):
                 targets[row, j] = q[j]
-                speeds[row, j] = v[j]
             inverse_kinematics(target, q)
             for j in range(7):
-                v[j] = (q[j] - targets[row, j]) / TIMESTEP
-                a[j] = 0.4 * (v[j] - speeds[row, j]) / TIMESTEP  # logged by the original, used for nothing
-                ctrl[j] = KP[j] * (q[j] - qpos[j]) + KD[j] * (v[j] - qvel[j]) + bias[j]
+                speed = (q[j] - targets[row, j]) / TIMESTEP
+                ctrl[j] = KP[j] * (q[j] - qpos[j]) + KD[j] * (speed - qvel[j]) + bias[j]
             _finger_forces(qpos, qvel, widths[row], grasping[row], ctrl)
             _step_physics(step, model, data[row])
             if substep == 0:
-                tcp_now, quat_now = _array(pointers[row, TCP_POS], 3), _array(pointers[row, TCP_QUAT], 4)
-                _write_log(log[row], pointers[row], qpos, qvel, q, v, a, tcp_now, quat_now)
+                _write_log(log[row], pointers[row], qpos, q)
         for j in range(7):
             targets[row, j] = q[j]
-            speeds[row, j] = v[j]
 
 
 @njit(nogil=True, cache=True)
 def track_joints(step, model, data, pointers, rows, commands, widths, grasping, substeps, log):
     """Holds joints at ``commands`` [n, 7] (rad) for ``substeps`` physics steps; as :func:`track_pose` else."""
-    zero = np.zeros(7)
     for row in rows:
         qpos, qvel = _array(pointers[row, QPOS], 9), _array(pointers[row, QVEL], 9)
         ctrl, bias = _array(pointers[row, CTRL], 9), _array(pointers[row, BIAS], 9)
@@ -170,5 +144,4 @@ def track_joints(step, model, data, pointers, rows, commands, widths, grasping, 
             _finger_forces(qpos, qvel, widths[row], grasping[row], ctrl)
             _step_physics(step, model, data[row])
             if substep == 0:
-                tcp_now, quat_now = _array(pointers[row, TCP_POS], 3), _array(pointers[row, TCP_QUAT], 4)
-                _write_log(log[row], pointers[row], qpos, qvel, commands[row], zero, zero, tcp_now, quat_now)
+                _write_log(log[row], pointers[row], qpos, commands[row])

@@ -244,15 +244,15 @@ def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return positions, quaternions
 
 
-def follow_pose(joints: np.ndarray, poses: np.ndarray, substeps: int = 30) -> np.ndarray:
+def follow_pose(joints: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Computes the joint targets [n, 7] that the controller reaches when it tracks poses for one control step.
 
     D3IL's Stacking data were recorded so: a person commanded poses, policies learn the joint targets that followed.
-    ``joints`` are the present targets [n, 7] (rad), ``poses`` TCP positions (m) and unit quaternions [n, 7]. In
-    ``substeps`` of 30 ms positions some centimetres away are reached, and turns for about three quarters.
+    ``joints`` are the present targets [n, 7] (rad), ``poses`` TCP positions (m) and unit quaternions [n, 7]. Positions
+    some centimetres away are reached, and turns for about three quarters.
     """
     joints, poses = np.array(joints, dtype=np.float64), np.ascontiguousarray(poses, dtype=np.float64)
     for row, pose in zip(joints, poses, strict=True):
-        for _ in range(substeps):
+        for _ in range(30):  # ms of a control step of Stacking
             inverse_kinematics(pose, row)
     return joints

@@ -101,10 +101,11 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
 
-    def render(self, data: mujoco.MjData, camera: str = "cage") -> np.ndarray:
+    def render(self, data: mujoco.MjData, camera: str) -> np.ndarray:
         """Draws one simulation, uint8 [height, width, 3], by a camera; the arm's prefix may be left out of its name."""
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
-        self._camera.fixedcamid = self._camera_id(camera)
+        names = {self._model.camera(index).name.removeprefix("panda/"): index for index in range(self._model.ncam)}
+        self._camera.fixedcamid = lookup(names, camera.removeprefix("panda/"), "camera")
         self._context.make_current()
         perturbation, everything = mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, perturbation, self._camera, everything, self._scene)
@@ -114,13 +115,6 @@ class Renderer:
         mujoco.mjr_render(viewport, self._scene, self._gpu)
         mujoco.mjr_readPixels(picture, None, viewport, self._gpu)
         return np.ascontiguousarray(picture[::-1])  # OpenGL counts rows from below
-
-    def _camera_id(self, name: str) -> int:
-        names = [self._model.camera(index).name for index in range(self._model.ncam)]
-        for candidate in (name, f"panda/{name}"):
-            if candidate in names:
-                return names.index(candidate)
-        return lookup({known.removeprefix("panda/"): names.index(known) for known in names}, name, "camera")
 
     def close(self) -> None:
         """Frees the graphics memory; the renderer cannot be used afterwards."""

@@ -81,7 +81,7 @@ def mesh_folder() -> Path:
             " pip install 'gymnasium-robotics>=1.4'"
         )
     folder = Path(spec.origin).parent / "envs" / "assets" / "kitchen_franka" / "franka_assets" / "meshes" / "visual"
-    missing = [name for name in _MESHES if not _mesh(folder, name).exists()]
+    missing = [name for name in _MESHES if not (folder / f"{name}.stl").exists()]
     if missing:
         raise FileNotFoundError(
             f"the installed 'gymnasium-robotics' has no Panda mesh {missing[0]}.stl in {folder} (version 1.4.2 does)"
@@ -103,7 +103,7 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3
     root = mjcf.RootElement(model="panda")
     root.compiler.angle = "radian"
     for name in _MESHES:
-        root.asset.add("mesh", name=name, file=str(_mesh(folder, name)))
+        root.asset.add("mesh", name=name, file=str(folder / f"{name}.stl"))
     colour, dark = (0.95, 0.95, 0.95, alpha), (0.25, 0.25, 0.28, alpha)
     hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
 
@@ -145,10 +145,6 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3
     for motor, limit in motors:
         root.actuator.add("motor", name=motor, joint=motor, gear=(1,), forcelimited=True, forcerange=(-limit, limit))
     return root
-
-
-def _mesh(folder: Path, name: str) -> Path:
-    return folder / f"{name}.stl"
 
 
 def _add_rod(hand: mjcf.Element) -> None:

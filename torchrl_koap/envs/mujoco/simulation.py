@@ -81,21 +81,18 @@ class SimulationBatch(Simulations):
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
         super().__init__(model, num_sims, num_threads)
         self.joint_targets = np.zeros((num_sims, 7))
-        self.joint_speeds = np.zeros((num_sims, 7))
         self.started = np.zeros(num_sims, dtype=bool)
         self.widths = np.full(num_sims, controller.FINGER_RESET)
         self.grasping = np.zeros(num_sims, dtype=bool)
-        self._episode = {"joint_targets": self.joint_targets, "joint_speeds": self.joint_speeds}
-        self._episode |= {"started": self.started, "width": self.widths, "grasping": self.grasping}
-        self.log = np.zeros((num_sims, controller.LOG_WIDTH + model.nq - _NUM_JOINTS))
-        self.log_time = np.zeros(num_sims)
+        self._episode = {"joint_targets": self.joint_targets, "started": self.started}
+        self._episode |= {"width": self.widths, "grasping": self.grasping}
+        self._log = np.zeros((num_sims, controller.LOG_WIDTH + model.nq - _NUM_JOINTS))
 
         joint = model.joint(f"{PANDA}joint1")
         self._qpos_start, self._qvel_start = int(joint.qposadr[0]), int(joint.dofadr[0])
         if (self._qpos_start, self._qvel_start) != (model.nq - _NUM_JOINTS, model.nv - _NUM_JOINTS):
             raise ValueError("the arm's nine joints must come last in the state, after the free bodies of the task")
         self._tcp = model.body(f"{PANDA}tcp").id
-        self._joint = joint.id
         self._step = controller.step_address()
         self._data_addresses = np.array([data._address for data in self.data], dtype=np.int64)
         self._pointers = np.array([self._arrays(data) for data in self.data], dtype=np.int64)
@@ -106,9 +103,8 @@ class SimulationBatch(Simulations):
     def _arrays(self, data: mujoco.MjData) -> list[int]:
         """Addresses of what the controller reads and writes, in the order of its pointer table."""
         joints, speeds = data.qpos[self._qpos_start :], data.qvel[self._qvel_start :]
-        bias, tcp = data.qfrc_bias[self._qvel_start :], (data.xpos[self._tcp], data.xquat[self._tcp])
-        axes = (data.xanchor[self._joint :], data.xaxis[self._joint :])
-        return [array.ctypes.data for array in (joints, speeds, data.ctrl, bias, *tcp, *axes, data.qpos)]
+        bias, tcp = data.qfrc_bias[self._qvel_start :], data.xpos[self._tcp]
+        return [array.ctypes.data for array in (joints, speeds, data.ctrl, bias, tcp, data.qpos)]
 
     @property
     def tcp_position(self) -> np.ndarray:
@@ -161,27 +157,24 @@ class SimulationBatch(Simulations):
 
     def track_pose(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
         """Advances simulations by ``substeps`` while the TCP follows ``commands`` [n, 7] (position, quaternion)."""
-        state = (self.joint_targets, self.joint_speeds, self.started, self.log)
-        self._track(controller.track_pose, rows, commands, substeps, *state)
+        self._track(controller.track_pose, rows, commands, substeps, self.joint_targets, self.started)
 
     def track_joints(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
         """Advances simulations by ``substeps`` while the joints are held at ``commands`` [n, 7] (rad)."""
-        self._track(controller.track_joints, rows, commands, substeps, self.log)
+        self._track(controller.track_joints, rows, commands, substeps)
 
     def _track(self, kernel: Callable[..., None], rows, commands, substeps: int, *state: np.ndarray) -> None:
-        for row in rows:
-            self.log_time[row] = self.data[row].time + controller.TIMESTEP
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         fixed = (self._step, self.model._address, self._data_addresses, self._pointers)
-        arguments = (commands, self.widths, self.grasping, substeps, *state)
+        arguments = (commands, self.widths, self.grasping, substeps, *state, self._log)
         rows = np.ascontiguousarray(rows, dtype=np.int64)
         self._run(lambda piece: kernel(*fixed, piece, *arguments), rows, substeps)
 
     def get_state(self, row: int) -> dict[str, np.ndarray]:
         """Returns everything that decides the future of one simulation, controller included."""
         data = self.data[row]
-        tool = {"tcp_position": data.xpos[self._tcp].copy(), "tcp_quaternion": data.xquat[self._tcp].copy()}
-        return super().get_state(row) | {"bias": data.qfrc_bias.copy()} | tool
+        read = {"bias": data.qfrc_bias.copy(), "tcp_position": data.xpos[self._tcp].copy()}
+        return super().get_state(row) | read
 
     def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
         """Restores what :meth:`get_state` returned; the simulation then continues bit for bit."""
@@ -189,21 +182,15 @@ class SimulationBatch(Simulations):
         data = self.data[row]
         data.qfrc_bias[:] = state["bias"]
         data.xpos[self._tcp] = state["tcp_position"]
-        data.xquat[self._tcp] = state["tcp_quaternion"]
 
-    def logged(self) -> dict[str, np.ndarray]:
+    def logged(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Returns what D3IL's recorder logs for the last control step (docs/appendix/d3il.md, Recordings).
 
-        It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins. Joints in rad, velocities in
-        rad/s and m/s, ``time_stamp`` in s; an array ``[n, ...]`` each.
+        It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins. Joints are in rad; an array
+        ``[n, ...]`` each. Then come the poses of the free bodies [n, objects, 7] (m, quaternion).
         """
-        row = {name: self.log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
-        row["gripper_width"], row["time_stamp"] = row["gripper_width"][:, 0], self.log_time.copy()
-        return row | {"sim_step": np.rint(self.log_time / controller.TIMESTEP).astype(np.int64)}
-
-    def logged_poses(self) -> np.ndarray:
-        """Returns the logged poses of the free bodies [n, objects, 7] (m, quaternion)."""
-        return self.log[:, controller.LOG_WIDTH :].reshape(len(self), -1, 7).copy()
+        robot = {name: self._log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
+        return robot, self._log[:, controller.LOG_WIDTH :].reshape(len(self), -1, 7).copy()
 
     def contacts(self, row: int, geom: int, others: Sequence[int]) -> np.ndarray:
         """Returns which of the geoms ``others`` touched ``geom`` in the last substep, bool [len(others)]."""

@@ -15,12 +15,11 @@ from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.scooping.expert import SpoonKinematics, start_joints
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
+from torchrl_koap.tasks.scooping import CAMERA, EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
 from torchrl_koap.vision.encoder import FrozenImageEncoder, load_encoder, projection_of
 
 JOINT_SPEED = 2.5  # rad/s; targets that are further away are gone towards at this speed
 PIXELS = "pixels"
-_CAMERA = "third_person"
 
 
 class ScoopingEnv(ManipulationEnv):
@@ -65,7 +64,7 @@ class ScoopingEnv(ManipulationEnv):
         torch.Size([2, 3, 99])
     """
 
-    MAX_STEPS = 120
+    CAMERA = CAMERA
 
     def __init__(
         self,
@@ -120,7 +119,7 @@ class ScoopingEnv(ManipulationEnv):
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         embedding = np.zeros((len(rows), EMBEDDING_DIM))
         if self._camera is not None:
-            self._pixels[rows] = [self._camera.render(self.sims.data[row], _CAMERA) for row in rows]
+            self._pixels[rows] = [self._camera.render(self.sims.data[row], CAMERA) for row in rows]
             if self._encoder is not None:
                 embedding = self._encoder.embed(torch.from_numpy(self._pixels[rows])).double().numpy()
         seen = [embedding, self.sims.spoon_position[rows]]
@@ -150,10 +149,6 @@ class ScoopingEnv(ManipulationEnv):
         if self._hand_out:
             leaves.set(PIXELS, self._tensor(self._pixels))
         return leaves
-
-    def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = _CAMERA) -> np.ndarray:
-        """Draws one environment, see :meth:`ManipulationEnv.render`; cameras: ``"third_person"`` and ``"front"``."""
-        return super().render(index, width, height, camera)
 
     def close(self, **kwargs) -> None:
         """Frees graphics memory and threads."""

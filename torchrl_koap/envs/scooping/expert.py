@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, scooping_model
-from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks.scooping import FRAME_HZ, START_HEIGHT, STARTS
 
 
@@ -42,7 +41,7 @@ REST = np.array([0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785])  # rad; the pose that is
 _DAMPING, _PULL = 1e-4, 0.05
 
 
-def rotation_of(yaw: float, pitch: float, roll: float = 0.0) -> np.ndarray:
+def rotation_of(yaw: float, pitch: float, roll: float) -> np.ndarray:
     """Computes the axes of a spoon ``[3, 3]``, in columns.
 
     It is turned by yaw, then by pitch about the turned y, positive nose down, then by roll about the turned x (rad).
@@ -64,16 +63,6 @@ class SpoonKinematics:
         self.low, self.high = self._model.jnt_range.T + np.array([[0.02], [-0.02]])
         self._jacobian = np.zeros((6, 7))
 
-    def _forward(self, joints: np.ndarray) -> None:
-        self._data.qpos[:] = joints
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
-
-    def position(self, joints: np.ndarray) -> np.ndarray:
-        """Computes the position of the spoon ``[3]`` (m) with joints ``[7]`` (rad)."""
-        self._forward(joints)
-        return self._data.site_xpos[self._site].copy()
-
     def solve(
         self, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray | None = None, iterations: int = 40
     ) -> np.ndarray:
@@ -83,7 +72,9 @@ class SpoonKinematics:
         """
         joints = (REST if joints is None else joints).copy()
         for _ in range(iterations):
-            self._forward(joints)
+            self._data.qpos[:] = joints
+            mujoco.mj_kinematics(self._model, self._data)
+            mujoco.mj_comPos(self._model, self._data)
             now = self._data.site_xmat[self._site].reshape(3, 3)
             turn = 0.5 * np.cross(now.T, rotation.T).sum(0)
             error = np.concatenate([position - self._data.site_xpos[self._site], turn])
@@ -104,7 +95,7 @@ class ScoopingExpert:
 
     def __init__(self, sims: ScoopingSimulations, row: int, start: int, seed):
         self.sims, self.row = sims, row
-        self.habits = lookup(HABITS, sims.embodiment, "embodiment")
+        self.habits = HABITS[sims.embodiment]
         self._generator = np.random.default_rng(seed)
         self._arm = SpoonKinematics() if sims.embodiment == "robot" else None
         self._start, self.attempts, self._wander = start, 0, np.zeros(3)
@@ -168,7 +159,7 @@ class ScoopingExpert:
     def _next(self) -> bool:
         """Begins the way to the next way point; False where there is none left."""
         lifted = len(self._queue) == 1 and self.attempts < 4
-        if lifted and not self.sims.pieces_on_spoon([self.row])[0]:
+        if lifted and not self.sims.pieces_on_spoon(self.row):
             self._queue = []  # empty: once more
         if not self._queue:
             if self.attempts and (self.sims.success[self.row] or self.attempts >= 4):
@@ -181,7 +172,7 @@ class ScoopingExpert:
         return True
 
 
-def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics | None = None) -> np.ndarray:
+def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics) -> np.ndarray:
     """Returns the joints with which an episode begins: ``[7]`` (rad), of the hand ``[6]`` (m, rad).
 
     The first row of a context ``[bodies, 3]`` says where the spoon is, x, y (m).
@@ -189,4 +180,4 @@ def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics | No
     position = np.array([context[0, 0], context[0, 1], START_HEIGHT])
     if embodiment == "hand":
         return np.array([*position, 0.0, 0.0, 0.0])
-    return (arm or SpoonKinematics()).solve(position, np.eye(3), iterations=80)
+    return arm.solve(position, np.eye(3), iterations=80)

@@ -224,11 +224,9 @@ class ScoopingSimulations(Simulations):
         """Whether the spoon has left the bowl with a piece, bool ``[n]``."""
         return self.held >= HELD_TICKS
 
-    def pieces_on_spoon(self, rows=None) -> np.ndarray:
-        """Counts the pieces that lie on the spoon, int64 ``[len(rows)]``, of all simulations by default."""
-        return np.array([self._on_spoon(self.data[row]) for row in (range(len(self)) if rows is None else rows)])
-
-    def _on_spoon(self, data: mujoco.MjData) -> int:
+    def pieces_on_spoon(self, row: int) -> int:
+        """Counts the pieces that lie on the spoon of one simulation."""
+        data = self.data[row]
         local = (_positions(data) - data.site_xpos[self._site]) @ data.site_xmat[self._site].reshape(3, 3)
         inside = (np.abs(local[:, :2]) < np.array(SPOON_HALF) + 0.002).all(1)
         return int((inside & (local[:, 2] > 0) & (local[:, 2] < 4 * PIECE_RADIUS)).sum())
@@ -280,7 +278,7 @@ class ScoopingSimulations(Simulations):
         self.rim[row] |= over and height < OVER_RIM
         left = self.rim[row] and height > LEFT_BOWL
         if self.held[row] < HELD_TICKS:
-            self.held[row] = self.held[row] + 1 if left and self._on_spoon(data) else 0
+            self.held[row] = self.held[row] + 1 if left and self.pieces_on_spoon(row) else 0
 
 
 def _positions(data: mujoco.MjData) -> np.ndarray:
