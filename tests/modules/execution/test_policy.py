@@ -89,6 +89,21 @@ def test_longer_histories_reach_the_follower_shorter_ones_the_planner(kind):
     assert td["action"].tolist() == [[10.0, 13.0, 1013.0, 13.0]]
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_renamed_keys(kind):
+    policy = policy_of(kind, history_key=("agent", "frames"), action_key=("agent", "command"))
+    expected, observed = policy_of(kind), torch.rand(3, 2, 3)
+    renamed = TensorDict({"agent": {"frames": observed}, "is_init": torch.ones(3, 1, dtype=torch.bool)}, [3])
+    plain = step_input(observed)
+    for _ in range(6):
+        renamed, plain = policy(renamed), expected(plain)
+        assert torch.equal(renamed["agent", "command"], plain["action"])
+        assert set(policy.out_keys) <= set(renamed.keys(True))
+        for td in (renamed, plain):
+            td["is_init"] = torch.zeros(3, 1, dtype=torch.bool)
+    assert list(policy.in_keys) == [("agent", "frames"), "is_init"]
+
+
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match=r"replan_interval must be in 1..6 \(the horizon\), got 7"):
         policy_of(interval=7)

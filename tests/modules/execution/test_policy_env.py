@@ -123,3 +123,11 @@ def test_in_processes_of_a_collector(make_policy, copied_processes):
         assert episode["is_init"].flatten().tolist() == [True] + [False] * 5
     alone(make_policy, batch)
     assert not torch.equal(batch["observation"][0], batch["observation"][1])
+
+
+def test_the_environment_writes_what_a_policy_of_other_keys_reads():
+    policy = build(
+        small_planner(4, noise_key=None), make_koopman_inverse_dynamics(4, 2), state_of=range(4), history_key="frames"
+    )
+    start = PolicyEnv(reach(), policy).reset()
+    assert start["frames"].shape[-2:] == (5, 4) and "observation_history" not in start.keys()

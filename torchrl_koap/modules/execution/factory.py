@@ -51,7 +51,7 @@ def make_policy(
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
         follower (Follower, optional): follows plans in place of the controller.
-        **options: ``decoded``, ``max_steps``, ``control_hz``, ``observe`` and ``origins``.
+        **options: ``decoded``, ``max_steps``, ``control_hz``, ``observe``, ``origins`` and the keys.
 
     Returns:
         PlanningPolicy: the policy.

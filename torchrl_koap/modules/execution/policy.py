@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -57,9 +57,8 @@ class PlanningPolicy(TensorDictModuleBase):
             ``[*B, obs]`` (:class:`~torchrl_koap.vision.Observer`). Default: the robot gives observations.
         origins (tuple, optional): what the data lack of the numbers that the robot reports ``[obs]`` and takes
             ``[act]``; an :class:`~torchrl_koap.modules.Agent` and exported files subtract and add it.
-
-    It reads observations from ``"observation_history"`` (:func:`~torchrl_koap.modules.policy_transforms`) and writes
-    the action of the current step ``[*B, act]`` to ``"action"``.
+        history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
+        action_key (NestedKey): action of the current step ``[*B, act]``.
 
     Raises:
         ValueError: for an interval longer than the horizon, or a follower that cannot be executed so. At the first call
@@ -91,6 +90,8 @@ class PlanningPolicy(TensorDictModuleBase):
         control_hz: float | None = None,
         observe: Callable[[Mapping[str, Any]], Tensor] | None = None,
         origins: tuple[Sequence[float], Sequence[float]] | None = None,
+        history_key: NestedKey = OBSERVATION_HISTORY,
+        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         execution = Execution() if execution is None else execution
@@ -116,13 +117,13 @@ class PlanningPolicy(TensorDictModuleBase):
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
         self._decodes = follower is not None and execution.strategy != "open_loop"  # at every step
         chunk_key = PLAN if self._decodes else ACTION_CHUNK
-        self.in_keys, self.out_keys = [OBSERVATION_HISTORY, IS_INIT], [ACTION, chunk_key]
+        self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self._written: TensorDictBase | None = None
-        reads = [OBSERVATION_HISTORY] + ([] if planner.noise_key is None else [planner.noise_key])
+        reads = [history_key] + ([] if planner.noise_key is None else [planner.noise_key])
         self.receding = MultiStepActorWrapper(
             TensorDictModule(self.plan, in_keys=reads, out_keys=[chunk_key]),  # runs only when a plan is due
             replan_interval=execution.replan_interval,
-            action_keys=[PLANNED_STATE if self._decodes else ACTION],
+            action_keys=[PLANNED_STATE if self._decodes else action_key],
             chunk_keys=[chunk_key],
             init_key=IS_INIT,
         )

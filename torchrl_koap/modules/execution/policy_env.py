@@ -79,13 +79,15 @@ class NoiseTransform(Transform):
         return observation_spec
 
 
-def policy_transforms(history: int) -> Compose:
+def policy_transforms(
+    history: int, *, observation_key: NestedKey = OBSERVATION, history_key: NestedKey = OBSERVATION_HISTORY
+) -> Compose:
     """Environment transforms that the policies need: ``is_init`` and the last ``history`` observations.
 
     At the start of an episode the first observation is repeated.
 
     Returns:
-        Compose: writes ``"observation_history"`` ``[*B, history, obs]``, the present one last, of ``"observation"``.
+        Compose: writes ``history_key`` ``[*B, history, obs]``, the present one last, of ``observation_key``.
 
     Examples:
         >>> from torchrl_koap.modules import policy_transforms
@@ -94,8 +96,8 @@ def policy_transforms(history: int) -> Compose:
     """
     return Compose(
         InitTracker(init_key=IS_INIT),
-        UnsqueezeTransform(-2, in_keys=[OBSERVATION], out_keys=[OBSERVATION_HISTORY]),
-        CatFrames(N=history, dim=-2, in_keys=[OBSERVATION_HISTORY], out_keys=[OBSERVATION_HISTORY]),
+        UnsqueezeTransform(-2, in_keys=[observation_key], out_keys=[history_key]),
+        CatFrames(N=history, dim=-2, in_keys=[history_key], out_keys=[history_key]),
     )
 
 
@@ -109,6 +111,7 @@ class PolicyEnv(TransformedEnv):
     Args:
         env (EnvBase): the environment.
         policy (PlanningPolicy): the policy that is to act in it.
+        observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
 
     Raises:
         ValueError: if the data of the policy lack an origin, which only an Agent subtracts and adds.
@@ -125,12 +128,13 @@ class PolicyEnv(TransformedEnv):
         (torch.Size([2, 5, 4]), torch.Size([2, 14, 2]))
     """
 
-    def __init__(self, env: EnvBase, policy: PlanningPolicy):
+    def __init__(self, env: EnvBase, policy: PlanningPolicy, *, observation_key: NestedKey = OBSERVATION):
         if policy.origins is not None:
             raise ValueError("the data of this policy lack an origin, which an Agent subtracts and adds: act with one")
         key = policy.planner.noise_key  # None: the planner draws by itself
         noise = [] if key is None else [NoiseTransform(policy.noise_shape, block=policy.max_steps, noise_key=key)]
-        super().__init__(env, Compose(*(transform.clone() for transform in policy_transforms(policy.history)), *noise))
+        transforms = policy_transforms(policy.history, observation_key=observation_key, history_key=policy.in_keys[0])
+        super().__init__(env, Compose(*(transform.clone() for transform in transforms), *noise))
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seeds the environment and the noise; as in :class:`torchrl.envs.EnvBase`."""

@@ -15,6 +15,7 @@ from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule, LinearActionDecoder
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import RAW
+from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, RidgeFit, ridge, shared_filter
 from torchrl_koap.modules.windows import WindowReader
 
@@ -118,6 +119,11 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         super().__init__(latent_action, action_decoder, lifting, **kwargs)
         self.out_keys = [*latent_action.out_keys, self.out_key]
         self.operator, self.penalty = operator, penalty
+        sizes = {"state_normalizer": lifting.state_dim, "action_normalizer": action_decoder.linear.out_features}
+        for name, width in sizes.items():
+            normalizer = kwargs.get(name)
+            if isinstance(normalizer, Normalizer) and len(normalizer.scale) != width:
+                raise ValueError(f"{name} has {len(normalizer.scale)} columns, the model {width}")
 
     def decode(self, latent: Tensor) -> Tensor:
         """Decodes latent actions ``[*B, T, m]`` to actions ``[*B, T, act]`` in normalised units."""
