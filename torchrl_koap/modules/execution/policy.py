@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import MultiStepActorWrapper
@@ -119,9 +119,8 @@ class PlanningPolicy(TensorDictModuleBase):
         chunk_key = PLAN if self._decodes else ACTION_CHUNK
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self._written: TensorDictBase | None = None
-        reads = [history_key] + ([] if planner.noise_key is None else [planner.noise_key])
         self.receding = MultiStepActorWrapper(
-            TensorDictModule(self.plan, in_keys=reads, out_keys=[chunk_key]),  # runs only when a plan is due
+            _Chunk(self.plan, history_key, planner.noise_key, chunk_key),
             replan_interval=execution.replan_interval,
             action_keys=[PLANNED_STATE if self._decodes else action_key],
             chunk_keys=[chunk_key],
@@ -249,7 +248,8 @@ class PlanningPolicy(TensorDictModuleBase):
         if len(batch) == 1:
             tensordict = self._step(tensordict)
         else:  # the wrapper wants one batch dimension
-            flat = tensordict.select(*self.receding.in_keys, *kept, strict=False)
+            noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
+            flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
             flat = self._step(flat.reshape(-1) if batch else flat.unsqueeze(0))
             written = flat.select(*self.out_keys, *kept, *self.receding.action_keys)
             tensordict.update(written.reshape(batch) if batch else written[0])
@@ -261,6 +261,19 @@ class PlanningPolicy(TensorDictModuleBase):
         observed, plan = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[1])
         age = tensordict.get(self.receding.counter_key).squeeze(-1).long() - 1
         return tensordict.set(self.out_keys[0], self.act(observed, plan, age))
+
+
+class _Chunk(TensorDictModuleBase):
+    """The part that runs only when a plan is due; a TensorDictModule of a method of the policy cannot be pickled."""
+
+    def __init__(self, plan: Callable, history_key: NestedKey, noise_key: NestedKey | None, chunk_key: NestedKey):
+        super().__init__()
+        self.plan, self.noise_key = plan, noise_key
+        self.in_keys, self.out_keys = [history_key], [chunk_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
 
 
 class _Columns(nn.Module):
