@@ -1,11 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tries wheel and sdist as somebody who has no repository would: ``make dist`` calls this.
 
-    python tests/try_dist.py dist              # dependencies are those of this environment
-    python tests/try_dist.py dist --complete   # everything is installed anew (gigabytes)
-
-In a fresh environment, outside of the repository: the package is imported from the wheel, the command line runs, pages
-and contexts that are data files are found, and what belongs to the repository alone is refused in one line.
+In a fresh environment with the dependencies of this one, outside of the repository: the package is imported from the
+wheel, the command line runs, data files are found, and what belongs to the repository alone is refused in one line.
 """
 
 import subprocess
@@ -58,19 +55,18 @@ def check_files(dist: Path) -> Path:
     return wheel.resolve()
 
 
-def main(dist: Path, *, complete: bool) -> None:
+def main(dist: Path) -> None:
     """Installs the wheel and tries it."""
     wheel = check_files(dist)
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
         venv.create(home / "venv", with_pip=True)
         binary = home / "venv" / "bin"
-        if not complete:  # what is installed here counts as installed there, this repository does not
-            (site,) = (home / "venv" / "lib").glob("python*/site-packages")
-            here = [path for path in sys.path if path.endswith("site-packages")]
-            (site / "dependencies.pth").write_text("\n".join(here))
-        options = [] if complete else ["--no-deps", "--no-index"]
-        subprocess.run([binary / "python", "-m", "pip", "install", "--quiet", *options, wheel], check=True, cwd=home)
+        (site,) = (home / "venv" / "lib").glob("python*/site-packages")
+        # what is installed here counts as installed there, this repository does not
+        (site / "dependencies.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
+        words = ("-m", "pip", "install", "--quiet", "--no-deps", "--no-index", wheel)
+        subprocess.run([binary / "python", *words], check=True, cwd=home)
         version = call(home, binary / "python", "-c", SCRIPT)
         if version not in call(home, binary / "koap", "--version"):
             raise SystemExit("koap --version is another one than the package's")
@@ -93,4 +89,4 @@ def call(home: Path, *command: object) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), complete="--complete" in sys.argv)
+    main(Path(sys.argv[1]))

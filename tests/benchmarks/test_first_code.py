@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 import torch
-from small_controllers import plain_task
+from small_networks import plain_task
 
 from torchrl_koap.data import make_demonstrations
 from torchrl_koap.training import fit

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from filmed_data import write_filmed
+from camera_sets import write_filmed
 from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Trained, load_policy

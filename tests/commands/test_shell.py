@@ -13,7 +13,6 @@ import pytest
 from tiny_runs import TINY, write_demonstrations
 
 from torchrl_koap.commands import cli
-from torchrl_koap.commands.options import check_options
 from torchrl_koap.commands.shell import ending_like_ctrl_c
 
 COMMAND = (sys.executable, "-m", "torchrl_koap.commands.cli")
@@ -81,16 +80,6 @@ def test_a_warning_is_one_line(monkeypatch, capsys):
     assert cli.main(["doctor"]) == 0
     assert capsys.readouterr().out == "warning: a picture was left out\n"
     assert "somewhere.py" in warnings.formatwarning("outside", UserWarning, "somewhere.py", 3)
-
-
-def test_options_that_can_mean_nothing():
-    from torchrl_koap.commands.data_commands import Demos
-
-    check_options(Demos(out="somewhere/new"))
-    with pytest.raises(ValueError, match="--episodes must be at most"):
-        check_options(Demos(out="x", episodes=10**30))
-    with pytest.raises(ValueError, match="--out /dev/null/x cannot be made: /dev/null is no folder"):
-        check_options(Demos(out="/dev/null/x"))
 
 
 def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0):

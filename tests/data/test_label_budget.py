@@ -171,17 +171,6 @@ def test_commands_hide_with_the_actions():
     assert (hide_commands(data, COMMAND) == data).all()
 
 
-def test_labels_tell_their_commands_where_asked():
-    data, budget = demonstrations(), LabelBudget(count=5, unit="transition")
-    told, _ = budget.apply(data, command=COMMAND, tell_commands=True)
-    few, _ = LabelBudget(count=3, unit="transition").apply(told, command=COMMAND, tell_commands=True)
-    for labelled, number in ((told, 5), (few, 3)):
-        kept = labelled["has_action"].squeeze(-1)
-        same_bits(labelled["label_command"][kept], data["observation"][kept][:, COMMAND])
-        assert kept.sum() == number and labelled["label_command"][~kept].isnan().all()
-    assert "label_command" not in budget.apply(data, command=COMMAND)[0].keys()
-
-
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("amount", [1, 0.4])
 def test_nothing_outside_the_budget_leaks(unit, amount):

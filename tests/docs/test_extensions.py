@@ -45,12 +45,6 @@ def test_a_tutorial_that_is_not_listed_is_an_error(monkeypatch):
         tutorial_pages.write_tutorial_pages()
 
 
-def test_cells(tmp_path):
-    script = tmp_path / "story.py"
-    script.write_text('# licence\n"""\nA story.\n"""\n\n# %%\n# Head\n# ----\n# Words.\n\nx = 1\n\n# %%\n# More.\n')
-    assert tutorial_pages.cells(script) == [("text", "Head\n----\nWords."), ("code", "x = 1"), ("text", "More.")]
-
-
 def test_the_digest_is_that_of_the_code_not_of_the_text(tmp_path):
     digests = []
     for number, text in enumerate(("x = 1", "# a word\nx   = 1\n", "x = 2")):

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pages are short and plain: a budget of words, short sentences, none of the words that hide what is meant."""
+"""Pages are short and plain: a budget of words, short sentences, no words that are old or hide what is meant."""
 
 import ast
 import re
@@ -24,6 +24,10 @@ BANNED = re.compile(
     r"|a (tenth|hundredth|fiftieth|twentieth|third|quarter|fifth) of)\b",
     re.IGNORECASE,
 )
+OLD_NAMES = {
+    *("leash", "posture", "foresee", "foresight", "doubt", "doubts", "verdict", "joining", "exchange", "adopt"),
+    *("adopted", "whose", "regime", "dealt", "judge", "judged", "imagined", "recipe", "place", "places"),
+}
 
 
 def text_of(page: Path) -> str:
@@ -114,3 +118,18 @@ def test_words_of_docstrings_and_messages_are_plain(folder):
     texts = {file: texts_of(ast.parse(file.read_text())) for file in sorted((ROOT / folder).rglob("*.py"))}
     found = [(file.name, word) for file, each in texts.items() for text in each for word in banned(text)]
     assert texts and not found
+
+
+def test_old_words_are_no_public_names():
+    for file in sorted((ROOT / "torchrl_koap").rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+                arguments = (*node.args.args, *node.args.kwonlyargs) if isinstance(node, ast.FunctionDef) else ()
+                for name in (node.name, *(argument.arg for argument in arguments)):
+                    words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+", name)}
+                    assert not words & OLD_NAMES, f"{file}: {node.name}: {name}"
+
+
+def test_the_glossary_has_forty_terms_at_most_and_no_term_twice():
+    rows = re.findall(r"^\| ([^|]+) \|", (DOCS / "glossary.md").read_text(), re.M)[1:]
+    assert 20 <= len(rows) <= 40 and len({*rows}) == len(rows)

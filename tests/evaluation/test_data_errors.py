@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from small_controllers import controller_of
+from small_networks import controller_of
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 

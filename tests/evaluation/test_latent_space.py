@@ -13,7 +13,6 @@ from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
 from torchrl_koap.evaluation.findings import OUTSIDE_THE_BUDGET, describe_inspection
 from torchrl_koap.evaluation.latent_space import (
     analyse_latent,
-    explained,
     infer_steps,
     prediction_errors,
     probe,
@@ -152,12 +151,6 @@ def test_a_probe_finds_what_lies_linearly_in_the_latent_and_nothing_else():
     # what holds in one half and is the other way round in the other explains -3: 1 - (2 a)^2 / a^2
     sign = torch.where(groups < 20, 1.0, -1.0)[:, None]
     assert probe(latent, sign * (linear - 4), groups, groups < 20) == pytest.approx([-3, -3], abs=0.02)
-
-
-def test_explained_variance_by_hand():
-    true = torch.tensor([[0.0, 5.0], [2.0, 5.0]])
-    first, constant = explained(true + torch.tensor([[1.0, 0.0], [0.0, 0.0]]), true)
-    assert first == pytest.approx(0.5) and math.isnan(constant)
 
 
 def test_the_budget_is_in_the_fitted_half():

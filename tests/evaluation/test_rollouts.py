@@ -6,8 +6,15 @@ import math
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
-from toy_episodes import episode_of, number
-from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
+from toy_policies import (
+    CountingPlanner,
+    EchoController,
+    EpisodesOfRandomLength,
+    PlannedStep,
+    episode_of,
+    number,
+    wandering_planner,
+)
 
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.transforms import EndEffectorNoise

@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from toy_episodes import episode_of, number
+from toy_policies import episode_of, number
 
 from torchrl_koap.evaluation.scores import outcome_of, score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval, wilson_interval

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fault_damage import DAMAGE
+from fault_ledger import DAMAGE, Fault, Place, check, edit_json, meet, table
 from fault_ledger import EMBED as WORDS
-from fault_ledger import Fault, Place, check, edit_json, meet, table
 
 pytest.importorskip("pyarrow")
 

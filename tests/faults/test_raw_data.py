@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fault_damage import DAMAGE, flip
-from fault_ledger import Fault, Place, check, edit_json, meet, table
+from fault_ledger import DAMAGE, Fault, Place, check, edit_json, flip, meet, table
 
 from torchrl_koap.data.d3il.conversion import ROBOT_COLUMNS
 from torchrl_koap.files import sha256_of

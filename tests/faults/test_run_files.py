@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fault_damage import DAMAGE, flip
-from fault_ledger import Fault, Place, check, edit_json, meet, table
+from fault_ledger import DAMAGE, Fault, Place, check, edit_json, flip, meet, table
 from safetensors.torch import save_file
 
 from torchrl_koap.runs.weights import load_tensors, save_tensors

@@ -1,5 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Small LeRobot data sets that a camera saw."""
+"""Small LeRobot data sets that a camera saw, and recordings of one's own robot with cameras that see a square."""
+
+from pathlib import Path
 
 import numpy as np
 
@@ -25,3 +27,17 @@ def write_camera_set(folder, embodiment, count=2, first=0):
         frames, states, actions = episode(embodiment, 6 + seed, seed)
         writer.add(states, actions, frames=frames)
     return writer.close()
+
+
+def write_filmed(folder: Path, cameras=("top", "wrist"), trajectories=12, size=(16, 24), length=20) -> Path:
+    generator = np.random.default_rng(0)
+    for number in range(trajectories):
+        path = np.clip(generator.normal(size=(length, 2)).cumsum(0) / 4 + 6, 0, 11)
+        (folder / f"{number:02d}").mkdir(parents=True)
+        np.savez(folder / f"{number:02d}.npz", states=path, actions=np.diff(path, axis=0), control_hz=10.0)
+        for camera in cameras:
+            frames = np.zeros((len(path), *size, 3), np.uint8)
+            for frame, (x, y) in zip(frames, path.astype(int), strict=True):
+                frame[y : y + 4, x : x + 4, len(camera) % 3] = 255
+            np.save(folder / f"{number:02d}" / f"{camera}.npy", frames)
+    return folder

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from filmed_data import write_filmed
+from camera_sets import write_filmed
 from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, load_policy

@@ -11,7 +11,7 @@ import pytest
 import torch
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from small_controllers import plain_task
+from small_networks import plain_task
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.data.trajectories import trajectory_lengths

@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from small_controllers import controller_of
+from small_networks import controller_of
 
 from torchrl_koap.data import LabelBudget, cut_windows, flatten_trajectories, select_state
 from torchrl_koap.modules.ridge import INPUT_NOISE, ridge
@@ -83,16 +83,3 @@ def test_no_motion_decodes_to_no_action_only_where_zero_is_zero(preset, through_
     fit_closed_form(controller, labelled)
     bias = controller.action_decoder.linear.bias
     assert (bias == 0).all() == through_zero
-
-
-def test_keys_of_the_controller_and_no_normalizer_of_actions():
-    labelled, _ = LabelBudget(count=2).apply(numbered())
-    fits = []
-    for keys in ({}, {"state": "frames", "action": ("robot", "u")}):
-        torch.manual_seed(0)
-        controller = controller_of("koap", labelled)
-        controller.action_normalizer = None
-        controller.set_keys(**keys)
-        fit_closed_form(controller, labelled)
-        fits.append(controller.action_decoder.linear.weight)
-    assert torch.equal(*fits) and fits[0].any()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filmed_data import write_filmed
+from camera_sets import write_filmed
 from offline_runs import fit_walks
 from tiny_runs import koap
 

@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from small_controllers import controller_of, plain_task
+from small_networks import controller_of, plain_task
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
 from torchrl_koap.tasks import WINDOW

@@ -39,11 +39,7 @@ def train_tiny(out, demonstrations, planner, method, /, **options):
 
 
 def poisoned(data, budget, *, inside=False):
-    """Fully labelled data whose actions and commands outside the budget are senseless; or whose labels are others.
-
-    Of a trajectory with a hidden action all commands are, as their differences are its actions, but those that labels
-    tell.
-    """
+    """Fully labelled data whose actions and commands outside the budget are senseless; or whose labels are others."""
     labelled = budget.apply(data, command=TASK.command_columns)[0]
     data = data.clone()
     if inside:

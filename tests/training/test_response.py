@@ -5,8 +5,7 @@ import math
 
 import pytest
 import torch
-from small_controllers import controller_of
-from small_samplers import a_system
+from small_networks import a_system, controller_of
 from tensordict import TensorDict
 
 from torchrl_koap.data import flatten_trajectories, select_state

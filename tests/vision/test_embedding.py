@@ -4,9 +4,8 @@
 import numpy as np
 import pytest
 import torch
-from camera_sets import episode
+from camera_sets import episode, write_filmed
 from camera_sets import write_camera_set as write
-from filmed_data import write_filmed
 
 from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.ted import load_ted, read_about

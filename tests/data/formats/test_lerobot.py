@@ -23,12 +23,7 @@ FEATURES = {
 
 
 def write(root, *, actions="all", features=None, rows=6, change=None, version="v3.0", lacking=()):
-    """Two episodes of a seven-joint arm; ``actions`` is "all", "none", "missing" or a list of rows without one.
-
-    Its columns are lists of every kind.
-
-    In format 2.1 every episode has a file of its own; those ``lacking`` have no column of actions.
-    """
+    """Two episodes of a seven-joint arm; ``actions`` is "all", "none", "missing" or a list of rows without one."""
     state = np.linspace(0, 1, 2 * rows * 7).reshape(-1, 7)
     columns = {
         "observation.state": pa.array(state.tolist(), pa.list_(pa.float32(), 7)),
@@ -152,16 +147,6 @@ def test_faults_name_file_and_column(change, problem, tmp_path):
         read_lerobot(root)
     (found,) = caught.value.problems
     assert problem.replace("FILE", str(file)) in found
-
-
-def test_the_same_fault_of_several_files_is_said_once(tmp_path):
-    files = sorted((write(tmp_path, version="v2.1") / "data").rglob("*.parquet"))
-    for file in files:
-        pq.write_table(pq.read_table(file).drop_columns(["episode_index"]), file)
-    with pytest.raises(DataError) as caught:
-        read_lerobot(tmp_path)
-    (said,) = caught.value.problems
-    assert said.startswith(f"{files[0]}, {files[1]}: missing column 'episode_index'; it has")
 
 
 def test_actions_that_are_announced_and_absent_are_told(tmp_path):

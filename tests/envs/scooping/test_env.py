@@ -140,13 +140,6 @@ def test_who_demonstrates_has_to_be_said(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-def test_no_graphics_is_one_clear_error(tmp_path, monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "off")
-    with pytest.raises(RuntimeError, match="switched off by the environment variable MUJOCO_GL=off"):
-        Demos(out=tmp_path / "a", task="scooping", embodiment="hand", episodes=1)()
-    assert not (tmp_path / "a").exists()
-
-
 def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path, graphics):
     record, seen = functools.partial(record_videos, embodiment="robot", episodes=1), []
 

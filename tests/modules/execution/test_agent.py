@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 import torch
-from small_samplers import chunk_policy, small_planner
+from small_networks import chunk_policy, small_planner
 from torchrl.collectors import Collector
 from toy_gym import reach
 

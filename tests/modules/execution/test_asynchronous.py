@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 import torch
-from small_samplers import small_planner
+from small_networks import small_planner
 from toy_policies import CountingPlanner, EchoController
 
 from torchrl_koap.modules import (

@@ -12,7 +12,7 @@ from torchrl_koap.modules import (
     blend_plan,
     make_policy,
 )
-from torchrl_koap.modules.execution.followers import InverseDynamicsFollower, command_rest, remaining_plan
+from torchrl_koap.modules.execution.followers import InverseDynamicsFollower, command_rest
 from torchrl_koap.modules.windows import StateReader
 from torchrl_koap.tasks.action_rules import ActionRule
 
@@ -38,13 +38,6 @@ def test_a_plan_that_accelerates_from_the_present_state_is_left_as_it_is():
     parabola = torch.linalg.lstsq(time[:5] ** torch.arange(3), torch.tensor([[1.0], [0.0], [3.0], [0.0], [1.0]]))
     rough = torch.tensor([[1.0], [0.0], [3.0], [0.0], [1.0]])
     torch.testing.assert_close(blend_plan(parabola.solution[:1], rough, 0.5), rough)  # least squares, at present
-
-
-def test_what_is_left_of_plans_of_different_age():
-    plans = torch.arange(10.0).reshape(2, 5, 1)
-    left = remaining_plan(plans, torch.tensor([1, 4]))
-    assert left[..., 0].tolist() == [[1.0, 2.0, 3.0, 4.0, 4.0], [9.0] * 5]
-    assert torch.equal(left[0], remaining_plan(plans[0], 1))
 
 
 def test_the_last_word_on_actions_sees_the_whole_window():

@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from small_samplers import a_system
+from small_networks import a_system
 from tensordict import TensorDict
 
 from torchrl_koap.modules import MPC, Execution, MLPDenoiser, ResponseModel, StatePlanner, make_policy

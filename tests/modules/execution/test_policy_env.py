@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from small_samplers import chunk_policy, small_planner
+from small_networks import chunk_policy, small_planner
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, SerialEnv
