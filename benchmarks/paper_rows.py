@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -59,24 +59,9 @@ def paper_levels_table() -> str:
     return table(["task", *(f"level {level}" for level in range(1, 6))], body)
 
 
-def bench_table(name: str, beside: str = "", methods: Sequence[str] = ()) -> str:
-    """Cells of a comparison in the layout of the paper's tables, the paper's beside each.
-
-    Args:
-        name (str): file of cells without its ending.
-        beside (str): another comparison, whose cells with the same task, share and seed stand before them.
-        methods (sequence of str): of those, the methods that do.
-    """
-    rows = read_cells(name)
-    places = {_place(row) for row in rows}
-    others = (
-        [row for row in finished_cells(beside) if row["method"] in methods and _place(row) in places] if beside else []
-    )
-    return as_markdown(layout_rows(paper_entries([*others, *rows])))
-
-
-def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[part] for part in ("task", "labels", "seed", "label_unit"))
+def bench_table(name: str) -> str:
+    """Cells of a comparison, by their file's name, in the layout of the paper's tables, the paper's beside each."""
+    return as_markdown(layout_rows(paper_entries(read_cells(name))))
 
 
 def observation_table(name: str) -> str:

@@ -44,12 +44,10 @@ def test_the_planner_kept_is_the_moving_average(trained_run):
     assert any(not torch.equal(kept[name], state[f"loss.network_params.{name}"]) for name in weights)
 
 
-def test_the_same_seed_gives_the_same_run_another_seed_another(trained_run, demonstrations, tmp_path):
-    for seed in (0, 1):
-        assert koap("train", "--out", tmp_path / str(seed), "--dataset", demonstrations, *TINY, "--seed", seed) == 0
+def test_another_seed_gives_another_run(trained_run, demonstrations, tmp_path):
+    assert koap("train", "--out", tmp_path / "other", "--dataset", demonstrations, *TINY, "--seed", 1) == 0
     for name in WEIGHTS:
-        assert (tmp_path / "0" / name).read_bytes() == (trained_run / name).read_bytes()
-        assert (tmp_path / "1" / name).read_bytes() != (trained_run / name).read_bytes()
+        assert (tmp_path / "other" / name).read_bytes() != (trained_run / name).read_bytes()
 
 
 def test_a_planner_taken_over_changes_nothing_in_the_controller(trained_run, demonstrations, tmp_path):

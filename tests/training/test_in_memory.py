@@ -1,8 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Fitting in memory does what `koap train` does, on data that lack labels."""
 
-from dataclasses import replace
-
 import numpy as np
 import offline_runs
 import pytest
@@ -16,7 +14,7 @@ from torchrl_koap.files import DataError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.tasks import WINDOW, Action
+from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training import planner as planner_training
 
 NAMES = ["q1", "q2", "goal_1", "goal_2"]
@@ -130,25 +128,6 @@ def test_the_decoder_beats_a_ridge_on_a_lagging_robot():
     data, task = make_demonstrations(**few_labels(3))
     koap, ridge = (errors_of(method, task, data) for method in ("koap", "linear"))
     assert koap < 0.08 and koap < 0.75 * ridge, (koap, ridge)
-
-
-def test_a_guess_about_axes_is_dropped_where_it_predicts_worse():
-    """Action i likely moves column i, all by one filter; here the second is reversed and ten times as strong."""
-    gains = np.array([1.0, -10.0])
-    states, actions = record()
-    scaled = [steps * gains if index < 3 else None for index, steps in enumerate(actions)]
-    data, task = make_demonstrations(**few_labels(actions=scaled))
-    guessed = fit_controller(data, task, steps=0)
-    without = fit_controller(data, replace(task, env="none:at_all"), steps=0)
-    assert same_weights(guessed.controller, without.controller)
-    tied = fit_controller(
-        data, replace(task, actions={"x": Action("m", column=0), "y": Action("m", column=1)}), steps=0
-    )
-
-    def error(trained):
-        return trained.results["decoder_fit"]["held_out_error"]
-
-    assert error(tied) > error(guessed)
 
 
 def test_refusals():

@@ -195,11 +195,3 @@ def test_other_demonstrations_are_left_alone(whole, tmp_path, monkeypatch):
     with pytest.raises(FileExistsError, match="interrupted recording with seed 3, not 4, disturbance 0.0, not 0.5"):
         record_to_folder(tmp_path, TASK, COUNT, seed=4, disturbance=0.5)
     assert json.loads((tmp_path / "unfinished" / "request.json").read_text())["seed"] == 3
-
-
-def test_nothing_is_written_for_wrong_arguments(tmp_path):
-    with pytest.raises(ValueError, match="episodes must be an integer of at least 1, got 0"):
-        record_to_folder(tmp_path / "demos", TASK, 0)
-    with pytest.raises(ValueError, match="0 to 1, got 2"):
-        record_to_folder(tmp_path / "demos", TASK, 2, disturbance=2)
-    assert not (tmp_path / "demos").exists()

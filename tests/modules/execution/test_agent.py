@@ -155,8 +155,7 @@ def test_episodes_of_an_agent_differ_and_are_drawn_again_by_its_seed():
 
 
 @pytest.mark.parametrize("make", POLICIES, ids=["feedback", "open loop", "chunks"])
-@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
-def test_a_compiled_policy_makes_every_plan_that_is_due(make, backend):
+def test_a_compiled_policy_makes_every_plan_that_is_due(make):
     """Three plans and a step, in an agent, in a collector, and with the denoiser compiled in place."""
     policy = make()
     path = np.random.default_rng(0).normal(size=(STEPS, 2))
@@ -175,9 +174,9 @@ def test_a_compiled_policy_makes_every_plan_that_is_due(make, backend):
         return actions
 
     plain = acted(policy)
-    np.testing.assert_array_equal(acted(torch.compile(policy, backend=backend)), plain)
-    assert torch.equal(collected({"backend": backend}), collected(None))
-    policy.compile(backend=backend)
+    np.testing.assert_array_equal(acted(torch.compile(policy, backend="aot_eager")), plain)
+    assert torch.equal(collected({"backend": "aot_eager"}), collected(None))
+    policy.compile(backend="aot_eager")
     np.testing.assert_allclose(acted(policy), plain, rtol=1e-4, atol=1e-6)
 
 

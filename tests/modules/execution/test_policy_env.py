@@ -11,18 +11,12 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, SerialEnv
 from toy_gym import reach
 
-from torchrl_koap.modules import Execution, PolicyEnv, make_koopman_inverse_dynamics
+from torchrl_koap.modules import PolicyEnv, make_koopman_inverse_dynamics
 from torchrl_koap.modules import make_policy as build
 
 
-def feedback(**execution):
-    return build(
-        small_planner(4), make_koopman_inverse_dynamics(4, 2), state_of=range(4), execution=Execution(**execution)
-    )
-
-
-def open_loop():
-    return feedback(strategy="open_loop")
+def feedback():
+    return build(small_planner(4), make_koopman_inverse_dynamics(4, 2), state_of=range(4))
 
 
 def chunks():
@@ -64,9 +58,7 @@ def test_the_seed_fixes_everything(make_policy, layout):
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("make_policy", "collected"), [(feedback, False), (feedback, True), (open_loop, False), (chunks, True)]
-)
+@pytest.mark.parametrize(("make_policy", "collected"), [(feedback, False), (feedback, True), (chunks, True)])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout, collected):
     env = LAYOUTS[layout](make_policy)
