@@ -61,21 +61,6 @@ def test_save_refuses(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["work"]
 
 
-def test_a_full_disk_leaves_the_earlier_data_set(tmp_path, monkeypatch):
-    from torchrl_koap.data import ted
-
-    path = save_ted(recorded(), tmp_path / "demos", AVOIDING)
-
-    def full(tensors, file):
-        file.write_bytes(b"half of it")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(ted, "save_file", full)
-    with pytest.raises(OSError, match="No space left"):
-        save_ted(recorded((3,)), path, AVOIDING)
-    assert len(load_ted(path)[0]) == 11 and list(tmp_path.iterdir()) == [path]
-
-
 def change(path, **entries):
     about = json.loads((path / "about.json").read_text())
     (path / "about.json").write_text(json.dumps(about | entries))
@@ -115,10 +100,3 @@ def test_a_forged_checksum_does_not_let_anything_in(tmp_path):
         change(path, sha256=sha256_of(path / "steps.safetensors"), bytes=len(forged))
         with pytest.raises(DataError, match="steps.safetensors cannot be used"):
             load_ted(path)
-
-
-def test_a_task_that_nobody_registered(tmp_path):
-    path = save_ted(recorded(), tmp_path / "demos", AVOIDING)
-    change(path, task="avoidng")
-    with pytest.raises(ValueError, match="unknown task 'avoidng'; did you mean 'avoiding'"):
-        load_ted(path)

@@ -127,15 +127,6 @@ def test_suggest_from_the_shell(copied_run, capsys):
     assert "count must be in 1..6" in capsys.readouterr().err
 
 
-def test_demonstrations_that_were_moved_are_found_again(copied_run, demonstrations, capsys):
-    config = json.loads((copied_run / "config.json").read_text())
-    (copied_run / "config.json").write_text(json.dumps(config | {"dataset": "moved/away"}))
-    assert "say where it is with --dataset" in fails(capsys, "suggest", copied_run)
-    assert koap("suggest", copied_run, "--dataset", demonstrations) == 0
-    out = capsys.readouterr().out
-    assert f"--dataset {demonstrations} --labels.episodes" in out and len(out.splitlines()) == 6
-
-
 def test_unasked_no_more_are_suggested_than_are_left(copied_run, monkeypatch):
     monkeypatch.setattr(active_labelling, "_FEW", 10)
     assert len(suggest(copied_run)["suggestions"]) == 6

@@ -124,13 +124,6 @@ def test_a_policy_of_its_own_is_judged_by_its_first_actions(tmp_path, capsys):
     assert (run / "plots" / "action_errors.png").exists()
 
 
-def test_all_trajectories_labelled(tmp_path):
-    """Two are held out from the planner; their labels still count."""
-    arm = save_arm(tmp_path / "arm", labelled=10, joints=2)
-    result = evaluate(train_arm(tmp_path / "run", arm), FEW)  # every label there is
-    assert result["plan_errors"]["trajectories"] == 2 and result["action_errors"]["left_out"]["trajectories"] == 10
-
-
 def test_a_single_trajectory(tmp_path):
     arm = save_arm(tmp_path / "arm", count=1, labelled=1, joints=2)
     run = train_arm(tmp_path / "run", arm, labels=LabelConfig(fraction=1.0), method="linear")

@@ -18,35 +18,27 @@ from torchrl_koap.tasks import get_task
 
 TASK = get_task("avoiding")
 STEPS = 30
+HORIZON = 14
 
 
-def futures_of(start, speed, horizon=14):
-    """States on a line that leaves ``start`` with ``speed`` m per control step, as plans of every step."""
-    ramp = torch.cat([torch.linspace(0, 1, 6), torch.ones(STEPS + horizon)]).cumsum(0)
-    path = start + ramp[:, None] * torch.tensor(speed)
-    return torch.stack([path[step + 1 : step + 1 + horizon] for step in range(STEPS)])
+def small_planner():
+    return StatePlanner(MLPDenoiser(2, 4, horizon=HORIZON, width=8), state_dim=2)
 
 
-def policy_of(planner=None):
-    planner = planner or StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
+def policy_of(planner):
     follower = OracleFollower(TASK, blend=0.0)
     return make_policy(planner, state_of=TASK.state_of, follower=follower, execution=Execution(replan_interval=1))
 
 
-def follow(speeds):
-    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2))
-    policy = policy_of(planner)
-    start = AvoidingEnv(1).reset()["observation"][0, 2:]
-    futures = torch.stack([futures_of(start, speed) for speed in speeds])
-    seeds, given = list(range(len(speeds))), lambda part: hand_on(futures[part])
-    episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=STEPS, given=given)
-    return futures, episodes
-
-
 def test_the_tool_goes_where_the_plan_says():
-    futures, (episode,) = follow([(0.002, 0.006)])
+    start = AvoidingEnv(1).reset()["observation"][0, 2:]
+    ramp = torch.cat([torch.linspace(0, 1, 6), torch.ones(STEPS + HORIZON)]).cumsum(0)
+    path = start + ramp[:, None] * torch.tensor((0.002, 0.006))  # a line, with this way per control step
+    futures = torch.stack([path[step + 1 : step + 1 + HORIZON] for step in range(STEPS)])
+    policy = policy_of(RecordedPlanner(small_planner()))
+    (episode,) = roll_out(policy, AvoidingEnv, [0], max_steps=STEPS, given=lambda part: hand_on(futures[None][part]))
     seen = episode["next", "observation"][:, 2:]
-    planned = futures[0, :, 0]  # the next state, of every step
+    planned = futures[:, 0]  # the next state, of every step
     error = (seen - planned).norm(dim=-1)
     assert error[8:].max() < 1e-3  # it covers 19 cm
     assert (planned[-1] - planned[0]).norm() > 0.15
@@ -54,16 +46,16 @@ def test_the_tool_goes_where_the_plan_says():
 
 @torch.no_grad()
 def test_wrong_uses():
-    observed, plan = torch.zeros(1, 2, 4), torch.zeros(1, 14, 2)
+    observed, plan = torch.zeros(1, 2, 4), torch.zeros(1, HORIZON, 2)
     with pytest.raises(RuntimeError, match=r"call policy.attach\(env\)"):
-        policy_of().act(observed, plan, 0)
-    attached = policy_of()
+        policy_of(small_planner()).act(observed, plan, 0)
+    attached = policy_of(small_planner())
     attached.attach(AvoidingEnv(1))
     with pytest.raises(RuntimeError, match="decodes nothing ahead"):
         attached.follower(observed, observed[..., 2:], plan, 2)
     with pytest.raises(ValueError, match="task 'avoiding' has no environment"):
         OracleFollower(replace(TASK, env=None), blend=0.0)
-    policy = policy_of()
+    policy = policy_of(small_planner())
     with pytest.raises(ValueError, match="needs an environment that simulates actions, object does not"):
         policy.attach(object())
 

@@ -5,17 +5,12 @@ import time
 
 
 def wait_for(text, folder, seconds=30):
-    """Whether a file holds the text before long: wandb's process writes a little later than ``finish`` returns."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if any(path.is_file() and text in path.read_bytes() for path in folder.rglob("*")):
-            return True
-        time.sleep(0.2)
-    return False
+    """Waits until a file holds the text: wandb's process writes a little later than ``finish`` returns."""
+    wait_until(lambda: any(path.is_file() and text in path.read_bytes() for path in folder.rglob("*")), seconds)
 
 
 def wait_until(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
+        time.sleep(0.02)

@@ -27,8 +27,6 @@ from lerobot.policies.factory import make_policy, make_policy_config, make_pre_p
 from lerobot.processor import PolicyProcessorPipeline  # noqa: E402
 from lerobot.scripts.lerobot_eval import rollout  # noqa: E402
 from lerobot.utils.control_utils import predict_action  # noqa: E402
-from lerobot.utils.import_utils import register_third_party_plugins  # noqa: E402
-from lerobot_policy_koap import KoapConfig  # noqa: E402
 from lerobot_policy_koap.modeling_koap import KoapPolicy  # noqa: E402
 from lerobot_policy_koap.processor_koap import make_koap_pre_post_processors  # noqa: E402
 
@@ -101,11 +99,6 @@ class Points(gymnasium.Env):
     def step(self, action):
         self.at, self.left = self.at + action, self.left - 1
         return self.seen(), 0.0, False, self.left == 0, {"is_success": False}
-
-
-def test_lerobot_finds_the_policy_by_its_name():
-    register_third_party_plugins()
-    assert PreTrainedConfig.get_choice_class("koap") is KoapConfig
 
 
 def test_a_batch_of_environments_is_acted_in_as_by_an_agent(run, exported):

@@ -50,15 +50,6 @@ def test_actions_tell_the_error_and_what_they_are_read_for():
     assert figure.get_suptitle() == "49 steps of demonstrations outside the label budget, for evaluation only"
 
 
-def test_actions_in_two_units():
-    predicted = np.tile([0.002] * 7 + [0.08], (50, 1))
-    figure = draw_actions({"predicted": predicted, "true": np.zeros((50, 8))}, run_of("stacking"))
-    said, panels = titles(figure), figure.axes
-    assert said[0] == "joint 1: RMSE 2 mrad" and said[7] == "gripper: RMSE 80 mm"
-    assert panels[6].get_xlabel() == "recorded joint 7 (mrad per step)"
-    assert panels[7].get_xlabel() == "recorded gripper (mm)"
-
-
 def test_actions_of_another_robot():
     """Seven joint torques: names and units as given, nothing speaks of x, y or mm."""
     true = np.random.rand(30, 7)

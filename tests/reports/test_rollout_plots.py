@@ -109,13 +109,6 @@ def test_objects_get_a_panel(task):
     assert entries[2:-2] == list(dict.fromkeys(body.label for body in bodies))
 
 
-def test_plans_of_a_task_with_objects():
-    rollouts = make_object_rollouts("aligning")
-    lines = drawn_lines(draw_plans(rollouts, run_of("aligning")).axes[3])  # the two failures come first
-    outline = scenes.outlines(rollouts["context"][1, 0], (0.05, 0.05))
-    assert any(line.shape == (5, 2) and np.allclose(line, outline) for line in lines)
-
-
 def test_plans_lie_over_their_path():
     axes = draw_plans(ROLLOUTS, run_of("avoiding")).axes[3]
     assert axes.get_title(loc="left") == "episode 1: left, left, gap 2\noff the path: median 0.0, 95 % within 0.0 mm"

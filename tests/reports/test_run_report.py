@@ -183,12 +183,6 @@ def test_tiles_of_a_task_with_contexts(tmp_path):
     assert "two boxes" not in text
 
 
-def test_entropy_within_contexts(tmp_path):
-    write_object_run(tmp_path, "aligning", mode_entropy=0.5, pooled_mode_entropy=0.9)
-    text = Page(write_report(tmp_path, draw=False)).text
-    assert "mode entropy, base 2 0.50 2 of 2 modes; mean over contexts, 2 rollouts each" in text
-
-
 @pytest.mark.parametrize("task", ["aligning", "stacking"])
 def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
     """Every picture that the task has, no word of Avoiding, and one line where no film can be made."""

@@ -7,7 +7,6 @@ import shutil
 from dataclasses import replace
 
 import pytest
-import torch
 from offline_runs import save_arm
 
 from torchrl_koap import ControllerConfig, EvalConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
@@ -16,8 +15,6 @@ from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result
 from torchrl_koap.studies.paired_comparison import compare, compare_cells
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.table import CELL_COLUMNS, summarise
-from torchrl_koap.tasks import get_task
-from torchrl_koap.training import on_disk
 
 CELL = Cell("avoiding", "linear", 0.25, 1.0, 0)
 ROW = {"label_unit": "trajectory"}
@@ -64,24 +61,6 @@ def test_cells_have_folders_of_their_own():
     cells = [Cell(task, method, share, 1.0, 0) for task in "ab" for method in ("koap", "dp") for share in shares]
     assert len({cell.folder for cell in cells}) == len(cells)
     assert Cell("avoiding", "koap", 0.01, 1.0, 2).folder == "cells/avoiding/koap-0.01-1-seed2"
-
-
-def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypatch):
-    """Neither actions nor commands nor which steps have one."""
-    task, load = get_task("avoiding"), on_disk.open_dataset
-
-    def with_wild_actions(*arguments, **options):
-        data, _ = load(*arguments, **options)
-        data["action"] = torch.full_like(data["action"], 1e9)
-        data["observation"][:, task.observation[task.command]] = 1e9
-        data["next", "observation"][:, task.observation[task.command]] = 1e9
-        return data, task
-
-    monkeypatch.setattr(on_disk, "open_dataset", with_wild_actions)
-    make(tmp_path / "run", planner_config(tmp_path / "run", demonstrations))
-    name = "planner.safetensors"
-    assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()
-    assert read_result(tmp_path / "run")[0]["train_seconds"] > 0
 
 
 def test_a_row_says_what_a_cell_found(finished):

@@ -99,11 +99,6 @@ def test_jobs_run_in_the_order_of_their_needs(tmp_path):
     assert (tmp_path / "said").read_text().split() == ["first", "second", "third"]
 
 
-def test_one_worker_takes_jobs_as_they_come(tmp_path):
-    assert set(reasons(jobs_of(tmp_path, a=None, b=None, c=None), workers=1).values()) == {None}
-    assert (tmp_path / "said").read_text().split() == ["a", "b", "c"]
-
-
 def test_a_job_that_dies_takes_only_its_dependants_along_and_the_reason_says_how(tmp_path):
     after = {f"after_{name}": name for name in DEATHS}
     jobs = jobs_of(tmp_path, **dict.fromkeys(DEATHS), **after, last="after_killed", other=None)

@@ -32,9 +32,7 @@ def test_both_tables_are_whole():
     ("task", "method", "level", "share", "text"),
     [
         ("avoiding", "koap", 1, 0.02, "78.0 +- 8.6"),
-        ("po_sorting", "vae", 3, 0.05, "16.4 +- 1.9"),
         ("stacking_unobserved_joints", "koap", 4, 0.1, "37.0 +- 10.8"),
-        ("stacking_1", "koap", 4, 0.1, "37.0 +- 10.8"),
         ("avoiding", "relabel", 1, 0.02, "5.8 +- 11.0"),
     ],
 )

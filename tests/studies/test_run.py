@@ -217,19 +217,6 @@ def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations):
     assert {name: after[name] for name in before} == before and len(after) == 5
 
 
-def test_a_planner_that_fails_fails_the_cells_that_need_it_and_no_other(curve, demonstrations):
-    shutil.rmtree(curve / PLANNER)
-    shutil.rmtree(curve / LINEAR)
-    (curve / PLANNER).write_text("in the way")
-    counts = run(curve, demonstrations)
-    assert (counts["done"], counts["failed"]) == (1, 1)
-    assert rows_of(curve)[LINEAR]["reason"].startswith("1-seed0 failed: ")
-    assert rows_of(curve)[DP]["status"] == "done"
-    assert run(curve, demonstrations, methods=("dp",))["missing"] == 0  # what never began is not asked for now
-    (curve / PLANNER).unlink()
-    assert run(curve, demonstrations)["done"] == 2
-
-
 def test_a_damaged_study_json_is_named(curve, demonstrations, capsys):
     os.truncate(curve / "study.json", 20)
     assert f"{curve / 'study.json'} is damaged" in fails(capsys, *command_of(curve, demonstrations))

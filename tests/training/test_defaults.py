@@ -30,11 +30,10 @@ def test_nothing_is_left_open_and_a_second_pass_changes_nothing(task):
         assert resolve(config, get_task(task)) == config
 
 
-class TestTheTasksMethod:
-    def test_is_trained_unless_another_is_asked_for(self):
-        own = {"avoiding": "koap", "stacking": "mpc", "stacking_1": "mpc"}
-        for task, method in (own | {"stacking_unobserved_joints": "koap"}).items():
-            assert resolved(task).method == method and resolved(task, "linear").method == "linear"
+def test_the_tasks_method_is_trained_unless_another_is_asked_for():
+    own = {"avoiding": "koap", "stacking": "mpc", "stacking_1": "mpc"}
+    for task, method in (own | {"stacking_unobserved_joints": "koap"}).items():
+        assert resolved(task).method == method and resolved(task, "linear").method == "linear"
 
 
 class TestTheTasksPreset:

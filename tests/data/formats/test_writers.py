@@ -31,9 +31,3 @@ def test_a_data_set_of_format_3(tmp_path):
         assert rows["index"][0] == listed["dataset_from_index"][number]
         assert rows["action"][-1] == rows["action"][-2]  # nothing was done behind the last frame
     assert rows["timestamp"][:3] == pytest.approx([0.0, 0.08, 0.16])
-
-
-def test_nothing_is_overwritten(tmp_path):
-    (tmp_path / "notes.txt").touch()
-    with pytest.raises(FileExistsError, match="is not empty; choose another folder"):
-        LeRobotWriter(tmp_path, fps=10, state_names="x")
