@@ -20,8 +20,6 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
 
     It says why, and what would mend them.
     """
-    if all(len(frames) < 2 for frames in trajectories):
-        return []
     bound, usual = leap_bounds(trajectories)
     low, high = (end(np.concatenate(trajectories), axis=0) for end in (np.min, np.max))
     found: dict[str, list[str]] = {}
@@ -72,8 +70,6 @@ def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]
 
     A few changes inside of trajectories are leaps already.
     """
-    if all(len(frames) < 2 for frames in trajectories):
-        return
     bound, _ = leap_bounds(trajectories)
     for start in range(len(names) - 3):
         turns = [frames[:, start : start + 4] for frames in trajectories]

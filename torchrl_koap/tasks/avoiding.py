@@ -50,17 +50,11 @@ def mode_of_path(path: np.ndarray) -> int:
     return mode
 
 
-def _cylinders() -> tuple[Shape, ...]:
-    shapes = []
-    for _, x, y, radius, _ in OBSTACLES:
-        reach = radius + ROD_RADIUS
-        shapes += [
-            Shape("circle", (x, y), (reach, reach), "clearance"),
-            Shape("circle", (x, y), (radius, radius), "obstacle"),
-        ]
-    return tuple(shapes)
-
-
+_CYLINDERS = tuple(
+    Shape("circle", (x, y), (radius + around, radius + around), role)
+    for _, x, y, radius, _ in OBSTACLES
+    for around, role in ((ROD_RADIUS, "clearance"), (0.0, "obstacle"))
+)
 register_task(
     Task(
         name="avoiding",
@@ -83,7 +77,7 @@ register_task(
         env="torchrl_koap.envs.avoiding:AvoidingEnv",
         expert="torchrl_koap.envs.experts.avoiding:AvoidingExpert",
         scene=Scene(
-            shapes=(*_cylinders(), Shape("line", (0.5, FINISH_Y), (0.5, 0.0), "finish", label="finish")),
+            shapes=(*_CYLINDERS, Shape("line", (0.5, FINISH_Y), (0.5, 0.0), "finish", label="finish")),
             x=(0.215, 0.785),
             y=(-0.305, 0.405),
             caption=" Solid discs are the cylinders; the pale ring is where the rod touches. Hue tells the gap taken in"

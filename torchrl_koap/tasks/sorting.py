@@ -70,12 +70,11 @@ def arrival_orders(num_boxes: int) -> tuple[tuple[int, ...], ...]:
     return tuple(sorted(set(itertools.permutations(box_colours(num_boxes)))))
 
 
-def _walls() -> tuple[Shape, ...]:
-    return tuple(
-        Shape("rectangle", (x + across, BIN_Y + along), (width, depth), "wall", color)
-        for color, x in zip(COLOURS, BIN_X, strict=True)
-        for across, along, width, depth in BIN_WALLS
-    )
+_WALLS = tuple(
+    Shape("rectangle", (x + across, BIN_Y + along), (width, depth), "wall", color)
+    for color, x in zip(COLOURS, BIN_X, strict=True)
+    for across, along, width, depth in BIN_WALLS
+)
 
 
 def _sorting(num_boxes: int) -> Task:
@@ -103,7 +102,7 @@ def _sorting(num_boxes: int) -> Task:
         env_options={"num_boxes": num_boxes},
         expert="torchrl_koap.envs.experts.sorting:SortingExpert",
         scene=Scene(
-            shapes=(Shape.over((PLATFORM_X, PLATFORM_Y), "platform"), *_walls()),
+            shapes=(Shape.over((PLATFORM_X, PLATFORM_Y), "platform"), *_WALLS),
             bodies=tuple(
                 Body(
                     box, f"{box}_xy", f"{box}_tan_yaw", label=f"{colour} boxes", color=colour, half=(BOX_HALF, BOX_HALF)
