@@ -73,9 +73,8 @@ class Method:
     """A way to get from few labels to a policy, with its own defaults.
 
     Its network maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the planner
-    that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`. With ``closed_form`` it also has
-    ``fit_decoder(windows, mask, groups=)``, called once after all updates with windows of which frame ``num_past``
-    counts where ``mask`` is True; it returns numbers for the summary, or a :class:`~torchrl_koap.modules.RidgeFit`.
+    that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`. With ``closed_form`` its
+    :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` is called once after all updates.
 
     A method that does not plan samples actions: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
 

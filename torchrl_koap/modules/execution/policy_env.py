@@ -86,8 +86,13 @@ def policy_transforms(
 
     At the start of an episode the first observation is repeated.
 
+    Args:
+        history (int): observed frames, the present one included.
+        observation_key (NestedKey): entry of the observation ``[*B, obs]``.
+        history_key (NestedKey): entry that the policy reads, its ``in_keys[0]``.
+
     Returns:
-        Compose: writes ``history_key`` ``[*B, history, obs]``, the present one last, of ``observation_key``.
+        Compose: writes the history ``[*B, history, obs]``, the present one last.
 
     Examples:
         >>> from torchrl_koap.modules import policy_transforms
