@@ -119,7 +119,7 @@ def draw_bench_average(name: str, path: Path) -> Path:
     return draw_average([entry for entry in entries if entry.task not in gaps], path)
 
 
-def few_labels_table(name: str, all_labels: str) -> str:
+def few_labels_table(name: str, all_labels: str, human: str) -> str:
     """A row per task: success with the fewest labels of KOAP and what it is compared with, all seeds together.
 
     The last column is Diffusion Policy with all labels.
@@ -127,13 +127,16 @@ def few_labels_table(name: str, all_labels: str) -> str:
     Args:
         name (str): file of cells without its ending.
         all_labels (str): that of Diffusion Policy with all labels.
+        human (str): that of the last row, human recordings of Avoiding of which one is labelled.
     """
-    body = []
+    methods, body = ("koap", "koap_untrained", "linear_steps", "dd", "dp"), []
     for task in PAPER_TASKS:
         fewest = label_shares(name, task)[0]
-        text = [_pooled(name, task, method) for method in ("koap", "koap_untrained", "linear_steps", "dd", "dp")]
+        text = [_pooled(name, task, method) for method in methods]
         called = task.replace("po_", "partially observed ").replace("_unobserved_joints", ", joints hidden")
         body.append([called.capitalize(), share(fewest), *text, _pooled(all_labels, task, "dp", 1.0)])
+    text = [_pooled(human, "avoiding", method) for method in methods]
+    body.append(["Avoiding, human recordings", "1 recording", *text, "not run"])
     head = ["task", "labelled", "KOAP", "random features", "ridge regression", "Decision Diffuser", "Diffusion Policy"]
     return table([*head, "Diffusion Policy, all labels"], body)
 
