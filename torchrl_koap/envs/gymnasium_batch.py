@@ -176,7 +176,7 @@ class GymnasiumBatch(EnvBase):
         finally:
             first.close()
         self.max_steps = max_steps or self.own_limit or task.max_steps
-        options = {"max_steps": self.max_steps, "success_key": success_key}
+        options: dict[str, Any] = {"max_steps": self.max_steps, "success_key": success_key}
         vector = partial(AsyncVectorEnv, context=_FORK) if processes else SyncVectorEnv
         episodes = [lambda index=index: GymnasiumEpisode(make(), index, **options) for index in range(num_envs)]
         self._env = vector(episodes, copy=False)

@@ -211,7 +211,7 @@ class _Film:
 
     def sample(self, held_out: bool) -> Tensor:
         """Features of up to so many frames, spread evenly."""
-        rows = range(len(self.clips))
+        rows = [*range(len(self.clips))]
         if len(rows) >= HELD_OUT:
             rows = [index for index in rows if (index % HELD_OUT == HELD_OUT - 1) == held_out]
         every = max(1, -(-sum(len(self.clips[index]) for index in rows) // MOST))
