@@ -17,6 +17,7 @@ from torchrl_koap.modules import (
     LatentActionMLP,
     LinearActionDecoder,
 )
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 
 
 def flat(lengths=(3, 1, 4), dtype=torch.float32):
@@ -121,6 +122,7 @@ def test_blanked_commands():
     ("part", "entry"),
     [
         (KoopmanLifting(2, 4), "state"),
+        (CompactLifting(2, 2), "state"),
         (KoopmanOperator(4), "lifted_state"),
         (LatentActionMLP(2, 4), "state"),
         (LinearActionDecoder(4, 2), "latent_action"),
@@ -137,6 +139,7 @@ def test_every_part_names_the_entry_that_it_lacks(part, entry):
     ("kind", "sizes"),
     [
         (KoopmanLifting, (2, 4)),
+        (CompactLifting, (24, 2)),
         *((kind, (2, 6)) for kind in (LatentActionMLP, LatentActionLSTM, LatentActionFourier)),
         (LinearActionDecoder, (6, 2)),
     ],

@@ -27,6 +27,9 @@ from torchrl_koap.tasks import get_task
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
 
 
+KEYS = ({}, {"history_key": "frames"})
+
+
 def toy_rollouts(seeds, batch_size=None, **options):
     policy = make_policy(wandering_planner(), PlannedStep(), state_of=(2, 3))
     return roll_out(policy, AvoidingEnv, seeds, max_steps=90, batch_size=batch_size, **options)
@@ -93,6 +96,20 @@ def test_one_episode_per_environment_even_if_some_end_early():
     for episode in episodes:  # from its beginning on, no reset inside
         assert episode["observation"][:, 1].diff().tolist() == [1.0] * (len(episode) - 1)
     assert not episodes[3]["next", "done"].any()
+
+
+@pytest.mark.parametrize(("seeds", "size"), [([], None), ([1], 0), ([1], -2)])
+def test_nothing_to_roll_out_is_refused(seeds, size):
+    with pytest.raises(ValueError, match="at least one seed and a batch size >= 1"):
+        toy_rollouts(seeds, batch_size=size)
+
+
+def test_a_policy_may_read_its_history_from_another_entry():
+    policies = [make_policy(CountingPlanner(), EchoController(), state_of=(1, 2), **keys) for keys in KEYS]
+    first, second = (
+        roll_out(policy, lambda n: EpisodesOfRandomLength(n, ((5,),)), [0], max_steps=6)[0] for policy in policies
+    )
+    assert torch.equal(first["action"], second["action"]) and len(first) == 5
 
 
 def test_pictures_get_padded_paths_and_the_plans_that_were_made():

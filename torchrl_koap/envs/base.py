@@ -51,8 +51,7 @@ class ManipulationEnv(EnvBase):
     Args:
         num_envs (int): number of environments, the batch size.
         num_threads (int): threads that advance them; results do not depend on it.
-        max_steps (int, optional): control steps after which an episode is truncated. Default: those of the
-            task.
+        max_steps (int, optional): control steps after which an episode is truncated. Default: the task's.
         seed (int, optional): seed of the random contexts.
         device (torch.device, optional): device of the tensors handed out; the physics runs on the CPU.
         dtype (torch.dtype): floating type of observation, action and reward.
@@ -342,10 +341,9 @@ class ManipulationEnv(EnvBase):
         super().close(**kwargs)
 
     def raw_log(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Returns what D3IL's recorder logs for the last control step.
+        """Returns what D3IL's recorder logs for the last control step: of the robot ``[n, ...]``, and of the objects.
 
-        Arrays ``[n, ...]`` of the robot, the command ``des_c_pos`` (m) among them, and the poses of the task's
-        objects ``[n, objects, 7]`` (m, quaternion).
+        The command ``des_c_pos`` (m) is among the first; poses are ``[n, objects, 7]`` (m, quaternion).
         """
         robot, poses = self.sims.logged()
         pose = {"des_c_pos": self.commands[:, :3]} if self.COMMAND_DIM == 7 else {}  # joints are in the log already

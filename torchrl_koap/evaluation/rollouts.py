@@ -42,14 +42,21 @@ def roll_out(
     default :data:`AT_ONCE`); outcomes do not depend on it. ``contexts`` are those ``[objects, 3]`` of every episode.
     ``given(episodes)`` writes what the planner reads in those episodes in place of start noise. ``progress`` is called
     with the number of episodes finished.
+
+    Raises:
+        ValueError: without seeds, for a batch size below 1, or for another number of contexts than of seeds.
     """
+    if not len(seeds) or (batch_size is not None and batch_size < 1):
+        raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
+    if contexts is not None and len(contexts) != len(seeds):
+        raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
     noise_key, episodes = policy.planner.noise_key or NOISE, []
     size = batch_size or min(len(seeds), AT_ONCE)
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
         _seed_episodes(env, part)
-        transforms = policy_transforms(policy.history)
+        transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
         if given is not None:
             noise = given(slice(begin, begin + len(part)))

@@ -20,6 +20,8 @@ def test_states_are_the_first_observables():
 def test_bad_liftings_are_refused():
     with pytest.raises(ValueError, match="include_state needs latent_dim >= state_dim, got 2 < 3"):
         KoopmanLifting(3, 2, include_state=True)
+    with pytest.raises(ValueError, match="linear_skip is for a learned lifting"):
+        KoopmanLifting(3, 5, include_state=True, linear_skip=True)
     with pytest.raises(ValueError, match=r"expected states with 3 columns, got shape \[6, 2\]"):
         KoopmanLifting(3, 5).encode(torch.randn(6, 2))
 

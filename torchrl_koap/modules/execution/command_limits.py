@@ -42,7 +42,7 @@ class CommandLimits(nn.Module):
             same.
 
     Raises:
-        ValueError: for a gain or lead where no action is a change of a command.
+        ValueError: for a gain or lead where no action is a change of a command, or columns that differ in number.
     """
 
     def __init__(
@@ -61,6 +61,11 @@ class CommandLimits(nn.Module):
             raise ValueError(f"gain {gain:g} and lead {lead:g} were given, but no action is a change of a command")
         if lead and not (commands or positions):
             raise ValueError(f"lead {lead:g} was given, but the observation repeats no command that actions change")
+        if lead and not len(commands) == len(positions) == len(actions):
+            raise ValueError(
+                "as many commands, positions and actions are needed, got"
+                f" {len(commands)}, {len(positions)} and {len(actions)} columns"
+            )
         self.gain, self.lead, self.state_of = gain, lead, state_of
         self.register_buffer("ends", None if ranges is None else ends_of(ranges), persistent=False)
         for name, columns in {"actions": actions, "commands": commands, "positions": positions}.items():

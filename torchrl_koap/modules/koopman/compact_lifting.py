@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
@@ -175,9 +175,17 @@ class CompactLifting(TensorDictModuleBase):
     kept: Tensor
     keeps_state = False  # the state is no part of the lifted state
 
-    def __init__(self, state_dim: int, coordinates: int, *, hidden_dims: Sequence[int] = (128, 128)):
+    def __init__(
+        self,
+        state_dim: int,
+        coordinates: int,
+        *,
+        hidden_dims: Sequence[int] = (128, 128),
+        in_key: NestedKey = STATE,
+        out_key: NestedKey = LIFTED_STATE,
+    ):
         super().__init__()
-        self.in_keys, self.out_keys = [STATE], [LIFTED_STATE]
+        self.in_keys, self.out_keys = [in_key], [out_key]
         self.state_dim, self.coordinates, self.latent_dim = state_dim, coordinates, 3 * coordinates
         self.components = NoiseAdjustedComponents(state_dim, min(COMPONENTS, state_dim))
         count = len(self.components.weights)
@@ -263,4 +271,4 @@ class CompactLifting(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the lifted states."""
-        return tensordict.set(LIFTED_STATE, self.encode(read_entry(self, tensordict, STATE, "rename_key_()")))
+        return tensordict.set(self.out_keys[0], self.encode(read_entry(self, tensordict, self.in_keys[0])))

@@ -35,7 +35,7 @@ class KoopmanLifting(TensorDictModuleBase):
         in_key, out_key (NestedKey): states ``[*B, T, d]`` and lifted states ``[*B, T, m]``.
 
     Raises:
-        ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim``.
+        ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim`` or together with ``linear_skip``.
 
     Examples:
         >>> import torch
@@ -61,6 +61,8 @@ class KoopmanLifting(TensorDictModuleBase):
         super().__init__()
         if include_state and latent_dim < state_dim:
             raise ValueError(f"include_state needs latent_dim >= state_dim, got {latent_dim} < {state_dim}")
+        if linear_skip and include_state:
+            raise ValueError("linear_skip is for a learned lifting, not include_state")
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.state_dim, self.latent_dim, self.include_state = state_dim, latent_dim, include_state
         learned = latent_dim - state_dim if include_state else latent_dim
