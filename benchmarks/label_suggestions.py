@@ -30,7 +30,7 @@ from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.tasks import WINDOW, Task, get_task
-from torchrl_koap.training.closed_form import axes_of, fit_closed_form
+from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 from torchrl_koap.training.loop import train_phase
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller
@@ -66,7 +66,7 @@ def error_of(
     """Action error on the steps ``test`` (:func:`infer_steps`) of a decoder fitted to labelled data."""
     normalizer = Normalizer.fit(labelled["action"], mode=mode, mask=labelled["has_action"])
     controller.action_normalizer.load_state_dict(normalizer.state_dict())
-    fit_closed_form(controller, labelled, **axes_of(task, task.controller_columns("robot")))
+    fit_closed_form(controller, labelled, **action_facts(task, task.controller_columns("robot")))
     with torch.no_grad():
         decoded = controller.raw_action(controller.decode(test["latent_action"]), test["state"])
         return 1e3 * (decoded - test["action"]).square().mean().sqrt().item()

@@ -41,7 +41,7 @@ from torchrl_koap.modules import Execution, InverseDynamics, Normalizer, blend_p
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import thousandths
-from torchrl_koap.training.closed_form import axes_of, fit_closed_form
+from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 
 RESULTS = Path(__file__).parent / "results"
 KEYS = ("dataset", "regime", "labels", "seed", "method")
@@ -102,7 +102,7 @@ def refit(controller: InverseDynamics, data: TensorDictBase, task: Task) -> tupl
     controller = copy.deepcopy(controller)
     mode = Normalizer.fit(data["action"], mode="rms", mask=data["has_action"])
     controller.action_normalizer.load_state_dict(mode.state_dict())
-    return controller, fit_closed_form(controller, data, **axes_of(task, task.controller_columns("robot")))
+    return controller, fit_closed_form(controller, data, **action_facts(task, task.controller_columns("robot")))
 
 
 def choice_of(controller: InverseDynamics, found: dict) -> str:

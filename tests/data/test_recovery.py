@@ -38,6 +38,16 @@ def test_size_of_the_shift():
     assert td["state"][:, 0].square().mean().sqrt().item() == pytest.approx(0.004 * math.sqrt(4 / 3), rel=0.02)
 
 
+def test_every_column_may_have_its_own_shift():
+    torch.manual_seed(0)
+    state = torch.zeros(40_000, 3, 3, dtype=torch.float64)
+    found = RecoveryAugmentation(torch.tensor([5.0, 0.01, 0.0]))(TensorDict({"state": state}, [40_000]))["state"][:, 0]
+    wanted = math.sqrt(4 / 3) * torch.tensor([5.0, 0.01, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(found.square().mean(0).sqrt(), wanted, rtol=0.02, atol=0)
+    with pytest.raises(ValueError, match="sigma must be >= 0"):
+        RecoveryAugmentation(torch.tensor([1.0, -1.0]))
+
+
 def test_shifted_columns_may_be_chosen():
     state = torch.zeros(50, 16, 4)
     found = RecoveryAugmentation(0.01, columns=(0, 2))(TensorDict({"state": state}, [50]))["state"]

@@ -129,6 +129,18 @@ def test_a_ridge_around_a_prior_is_a_ridge_around_zero_on_the_rest():
     torch.testing.assert_close(around.weight.float(), prior, rtol=1e-4, atol=1e-4)
 
 
+def test_targets_that_are_not_alike_have_a_penalty_each():
+    latent, action = make_data(60, 20)
+    action[:, 1] = np.random.default_rng(1).normal(size=60)  # noise: a large penalty is best
+    together, apart = (fit(latent, action, alike=alike) for alike in (True, False))
+    alone = [fit(latent, action[:, [column]]) for column in (0, 1)]
+    assert alone[0].penalty < together.penalty < alone[1].penalty
+    torch.testing.assert_close(apart.weight, torch.cat([each.weight for each in alone]))
+    torch.testing.assert_close(apart.bias, torch.cat([each.bias for each in alone]))
+    assert apart.error == pytest.approx(np.sqrt(np.mean([each.error**2 for each in alone])))
+    assert apart.error < together.error == together.errors[together.penalty]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

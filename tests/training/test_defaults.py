@@ -102,6 +102,12 @@ class TestThePlanner:
 
 
 class TestExecution:
+    @pytest.mark.parametrize(("rate", "steps"), [(5, 4), (30, 4), (50, 5), (80, 8), (100, 10), (1000, 10)])
+    def test_follows_a_plan_for_a_tenth_of_a_second(self, rate, steps):
+        task = replace(get_task("avoiding"), control_hz=rate)
+        for method in ("koap", "dp", "dd"):
+            assert resolve(TrainConfig(out="run", method=method), task).execution.replan_interval == steps
+
     def test_of_a_method_goes_before_the_tasks(self):
         def execution(*names, **asked):
             return resolved(*names, execution=ExecutionConfig(**asked)).execution.on(Execution())
@@ -122,6 +128,8 @@ class TestExecution:
             return resolve(config, task).execution.on(Execution())
 
         assert execution(task) == Execution(temperature=0.7) != execution(get_task("avoiding")) == Execution()
+        fast = replace(task, control_hz=100)
+        assert execution(fast).replan_interval == 10 and execution(fast, replan_interval=3).replan_interval == 3
         assert execution(task, temperature=0.2).temperature == 0.2 and execution(task, "koap_paper").temperature == 1.0
         own = replace(task, defaults=replace(task.defaults, execution={"temperature": 0.9}))
         assert execution(own).temperature == 0.9

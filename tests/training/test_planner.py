@@ -1,14 +1,17 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a planner's training decides by itself: how often it is scored, and what its columns count."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_koap import PlannerConfig, fit, make_demonstrations
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import planner as planner_file
-from torchrl_koap.training.planner import check_interval, column_weights
+from torchrl_koap.training.planner import augmentation, check_interval, column_weights
 
 
 @pytest.mark.parametrize(("steps", "batch_size", "every"), [(20_000, 512, 500), (4000, 256, 134), (100, 64, 100)])
@@ -46,3 +49,20 @@ def test_a_planner_learns_with_these_weights(monkeypatch):
     assert torch.equal(with_them, weights_of_a_planner())
     monkeypatch.setattr(planner_file, "column_weights", lambda task: None)
     assert not torch.equal(with_them, weights_of_a_planner())
+
+
+def test_the_robot_is_shifted_by_its_usual_step_in_any_unit_unless_the_task_says_how_far():
+    windows = torch.from_numpy(np.random.default_rng(0).normal(size=(500, 16, 3))).cumsum(1)
+    _, task = make_demonstrations([path.numpy() for path in windows[:3]], control_hz=10, action_dim=1, robot=(0, 2))
+
+    def shift(task, unit):
+        torch.manual_seed(0)
+        states = windows * unit
+        return (augmentation(task, states)(TensorDict({"state": states}, [500]))["state"] - states)[:, 1] / unit
+
+    in_mm, in_m = shift(task, torch.tensor([1e3, 1.0, 50.0])), shift(task, torch.ones(3))
+    torch.testing.assert_close(in_mm, in_m)
+    assert 0.9 < in_m[:, 0].square().mean().sqrt() < 1.4 and (in_m[:, 1] == 0).all()
+    told = replace(task, defaults=replace(task.defaults, recovery=0.004))
+    assert 0.004 < shift(told, torch.ones(3))[:, 0].square().mean().sqrt() < 0.006
+    assert get_task("avoiding").defaults.recovery == 0.004  # m: the cylinders stand close

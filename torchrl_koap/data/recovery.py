@@ -43,7 +43,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
     by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`.
 
     Args:
-        sigma (float): typical size of the shift, in the units of the state; with ``tool`` that of the tool (m).
+        sigma (float or Tensor): typical size of the shift, in the units of the state, or of every column, ``[d]``; with
+            ``tool`` that of the tool (m).
 
     Keyword Args:
         history (int): observed frames of the window. Defaults to ``2``.
@@ -74,7 +75,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
 
     def __init__(
         self,
-        sigma: float,
+        sigma: float | Tensor,
         *,
         history: int = 2,
         decay: float = 0.7,
@@ -87,7 +88,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         super().__init__()
         if tool is not None and (columns is None or kinematics is None):
             raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
-        if sigma < 0 or not 0 <= decay < 1 or (under_way and not decay):
+        if bool(torch.as_tensor(sigma < 0).any()) or not 0 <= decay < 1 or (under_way and not decay):
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), 0 without under_way, got {sigma} and {decay}")
         self.in_keys = self.out_keys = [STATE] if moved_by is None else [STATE, ACTION]
         self.moved_by = None if moved_by is None else list(moved_by)
@@ -101,7 +102,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
         state = tensordict.get(STATE)
         size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
         shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
-        shift = 2 * self.sigma * size * self._of_joints(shift, state)
+        sigma = self.sigma.to(state) if isinstance(self.sigma, Tensor) else self.sigma
+        shift = self._of_joints(2 * sigma * size * shift, state)
         if self.columns is not None:
             keep = torch.zeros_like(shift)
             keep[..., self.columns] = 1
@@ -112,14 +114,14 @@ class RecoveryAugmentation(TensorDictModuleBase):
             following = _remaining(state, self.history, self.decay, ahead=1, under_way=self.under_way)
             back = shift[..., self.moved_by] * (following - remaining)
             tensordict.set(ACTION, tensordict.get(ACTION) + back)
-        if self.tool is not None and self.sigma:
+        if self.tool is not None:
             moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
             shifted[..., self.tool] = shifted[..., self.tool] + moved
         return tensordict.set(STATE, shifted)
 
     def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
         """Shifts ``[*B, 1, d]`` whose joints move the tool, if there is one, by its own columns, with least motion."""
-        if self.tool is None or not self.sigma:
+        if self.tool is None:
             return shift
         joints = state[..., self.history - 1, self.columns]
         aside = _DIFFERENCE * torch.eye(joints.shape[-1], dtype=joints.dtype, device=joints.device)

@@ -26,7 +26,7 @@ from torchrl_koap.modules.planning.energy_score import energy_score, relative_sc
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import unit_groups
-from torchrl_koap.training.closed_form import axes_of, fit_closed_form
+from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 
 SAMPLES = 16  # plans in each situation
 SITUATIONS = 500  # that are looked at, at most
@@ -184,7 +184,7 @@ def errors_left_out(
         fold["has_action"] = labelled["has_action"] & ~hidden.unsqueeze(-1)
         fold["action"] = torch.where(fold["has_action"], labelled["action"], math.nan)
         again = copy.deepcopy(controller)
-        fit_closed_form(again, fold, **axes_of(task, columns))
+        fit_closed_form(again, fold, **action_facts(task, columns))
         predicted, true, episode = first_actions(again, labelled, [int(number)])
         if len(true):  # else its labels lie too near its end
             folds.append((_beside(predicted, true, fold, labelled, [int(number)], task), true, episode))

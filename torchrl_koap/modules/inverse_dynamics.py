@@ -141,7 +141,13 @@ class InverseDynamics(TensorDictModuleBase):
         """Fits after training, to raw states ``[*B, T, d]`` without labels, what is fitted then: here nothing."""
 
     def fit_labels(
-        self, windows: TensorDictBase, mask: Tensor, *, axes: Sequence[int] = (), guessed: bool = False
+        self,
+        windows: TensorDictBase,
+        mask: Tensor,
+        *,
+        axes: Sequence[int] = (),
+        guessed: bool = False,
+        alike: bool = True,
     ) -> dict[str, Any]:
         """Fits a decoder in closed form on the labelled frames of windows; a subclass that has one says how.
 
@@ -155,6 +161,7 @@ class InverseDynamics(TensorDictModuleBase):
         Keyword Args:
             axes (sequence of int): the state column, of those read, that each action entry moves.
             guessed (bool): the axes are only likely.
+            alike (bool): the action entries are of one kind: one penalty serves all of them.
 
         Returns:
             dict: numbers for the summary (:meth:`~torchrl_koap.modules.ridge.RidgeFit.summary`).

@@ -28,8 +28,10 @@ class RidgeFit:
     Args:
         weight (Tensor): ``[act, m]``, float64.
         bias (Tensor): ``[act]``, float64.
-        penalty (float): the ridge, in units of the mean square norm of the inputs.
+        penalty (float): the best ridge for all targets, in units of the mean square norm of the inputs.
         errors (dict): root of the mean squared held-out error of every candidate, in the units of the targets.
+        error (float): the same with what was chosen, for all targets or for each; infinite where a single row leaves
+            nothing to fit the mean to.
         num_labels (int): rows used.
     """
 
@@ -37,12 +39,8 @@ class RidgeFit:
     bias: Tensor
     penalty: float
     errors: dict[float, float]
+    error: float
     num_labels: int
-
-    @property
-    def error(self) -> float:
-        """Held-out error at the penalty chosen; infinite where a single row leaves nothing to fit the mean to."""
-        return self.errors[self.penalty]
 
     def predict(self, inputs: Tensor) -> Tensor:
         """Predicts targets ``[*B, act]`` of inputs ``[*B, m]``, in their floating type."""
@@ -69,6 +67,7 @@ def ridge(
     input_noise: float = 0.0,
     bias: bool = True,
     prior: Tensor | None = None,
+    alike: bool = True,
 ) -> RidgeFit:
     r"""Fits ``targets ~ D inputs + b``, in float64.
 
@@ -88,6 +87,7 @@ def ridge(
         input_noise (float): :math:`s^2`, in units of the mean square norm of the inputs. Defaults to 0.
         bias (bool): fit ``b``; otherwise it is 0. Defaults to ``True``.
         prior (Tensor, optional): ``[act, m]``, what ``D`` is shrunk towards. Defaults to 0.
+        alike (bool): all targets share one penalty; otherwise each has its own. Defaults to ``True``.
 
     Returns:
         RidgeFit: weights, the penalty chosen and its held-out errors.
@@ -139,8 +139,11 @@ def ridge(
     squares = held_out_errors(left, shrinks, target, groups, centred=bias)
     errors = dict(zip(tried, squares.mean(-1).sqrt().tolist(), strict=True))
     best = min(errors, key=errors.get)
-    weight = (right.mT * (singular / (singular.square() + best * unit))) @ projected  # [m, act]
-    return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, best, errors, len(x))
+    each = squares.mean(-1).argmin().expand(y.shape[-1]) if alike else squares.argmin(0)
+    own = singular.new_tensor(tried)[each]
+    weight = right.mT @ (singular[:, None] / (singular.square()[:, None] + own * unit) * projected)  # [m, act]
+    error = float(squares.gather(0, each[None]).mean().sqrt())
+    return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, best, errors, error, len(x))
 
 
 def shared_filter(steps: Tensor, action: Tensor) -> Tensor:

@@ -78,6 +78,7 @@ register_task(
             disturbance=0.5,
             planner={"steps": 8000, "network": "mlp", "frames": 1},
             execution={"lead": COMMAND_LEAD},
+            recovery=0.004,
         ),
     )
 )

@@ -120,6 +120,7 @@ def _sorting(num_boxes: int) -> Task:
             demonstrations=1000,
             planner={"steps": 24000, "network": "mlp", "frames": 1},
             execution={"lead": COMMAND_LEAD},
+            recovery=0.004,
         ),
     )
 

@@ -104,6 +104,7 @@ _STACKING = register_task(
             method="mpc",
             demonstrations=1000,
             planner={"steps": 18000, "network": "mlp"},
+            recovery=0.004,
             commands=True,  # joints follow their commands alike, wherever they are
         ),
     )

@@ -38,7 +38,8 @@ class Defaults:
         demonstrations (int): number of scripted demonstrations to record.
         disturbance (float): share of them in which the expert is disturbed.
         relative (bool): plans are displacements from the present state.
-        recovery (float): typical shift of the recovery augmentation, in the units of the robot's columns.
+        recovery (float, optional): typical shift of the recovery augmentation, in the units of the robot's columns.
+            Default: of every column what it usually changes in a control step.
         neighbor_recovery (float): farthest share of the way to the nearest other window that windows are moved, where
             no column is a position that could be shifted.
         planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
@@ -53,7 +54,7 @@ class Defaults:
     demonstrations: int = 200
     disturbance: float = 0.0
     relative: bool = True
-    recovery: float = 0.004
+    recovery: float | None = None
     neighbor_recovery: float = 0.0
     planner: Mapping[str, Any] = field(default_factory=dict)
     controller: Mapping[str, Any] = field(default_factory=dict)

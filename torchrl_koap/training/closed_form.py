@@ -13,13 +13,11 @@ from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.tasks import Task
 
 
-def fit_closed_form(
-    controller: InverseDynamics, data: TensorDictBase, *, axes: Sequence[int] = (), guessed: bool = False
-) -> dict[str, Any]:
+def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: Any) -> dict[str, Any]:
     """Fits a controller's decoder on every labelled step that sees its whole look-ahead, each used once.
 
-    The data are flat ``[N]``, after the label budget was applied; ``axes`` and ``guessed`` are those of
-    :func:`axes_of`. Returns what :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
+    The data are flat ``[N]``, after the label budget was applied; what is ``known`` of the actions is that of
+    :func:`action_facts`. Returns what :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
     """
     keys = ["state", "action", "has_action", "episode"]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
@@ -29,18 +27,20 @@ def fit_closed_form(
     for name, own in (("state", controller.in_key), ("action", controller.out_key)):
         if own != name:
             windows.rename_key_(name, own)
-    return controller.fit_labels(windows, mask, axes=axes, guessed=guessed)
+    return controller.fit_labels(windows, mask, **known)
 
 
-def axes_of(task: Task, columns: Sequence[int]) -> dict[str, Any]:
+def action_facts(task: Task, columns: Sequence[int]) -> dict[str, Any]:
     """Finds the column of those read that each action moves; for a robot that came with data alone, the likely one.
 
-    ``axes`` are empty where nothing is known or likely; ``guessed`` tells a likely one from a known one.
+    ``axes`` are empty where nothing is known or likely; ``guessed`` tells a likely one from a known one. Actions are
+    ``alike`` where none is raw.
     """
+    alike = all(action.kind != "raw" for action in task.actions.values())
     known = task.moved_columns()
     if known:
-        return {"axes": list(known), "guessed": False}
+        return {"axes": list(known), "guessed": False, "alike": alike}
     moved = task.targets or (task.robot if task.delta_actions else ())
     if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
         moved = ()
-    return {"axes": [list(columns).index(column) for column in moved], "guessed": True}
+    return {"axes": [list(columns).index(column) for column in moved], "guessed": True, "alike": alike}

@@ -18,7 +18,7 @@ from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.tasks.action_rules import shift_actions
-from torchrl_koap.training.closed_form import axes_of, fit_closed_form
+from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
@@ -98,7 +98,9 @@ def _train_network(
     fit: dict[str, Any] = {}
     controller.finish(states)
     if method.closed_form:
-        fit = fit_closed_form(controller, data, **axes_of(task, task.controller_columns(config.controller.columns)))
+        fit = fit_closed_form(
+            controller, data, **action_facts(task, task.controller_columns(config.controller.columns))
+        )
     return controller, fit, losses
 
 
@@ -124,7 +126,7 @@ def _train_sampler(
         labelled_share=BATCHES[phase.windows].labelled_share,
     )
     loss = phase.loss(sampler, dtype=DTYPES[config.run.precision])
-    augment = augmentation(task, actions=True)
+    augment = augmentation(task, states, actions=True)
     num_steps = max(round(section.steps * phase.share), 1)
     losses = loop(
         phase.name,

@@ -14,7 +14,7 @@ from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, TrainConfi
 from torchrl_koap.runs.config_files import read_config
 from torchrl_koap.runs.device import default_threads, find_precision
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.tasks import HISTORY, Task
+from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, Task
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import NETWORKS
@@ -25,6 +25,8 @@ PLACES = "absolute"  # the default preset where decoded actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.7  # of plans where no figure counts the modes
+PLAN_SECONDS = 0.1  # that a plan is followed at least: new ones every few ms begin where the robot lags behind the last
+MOST_FOLLOWED = 10  # frames of a plan: actions of later ones would need frames beyond its end
 Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 
 
@@ -111,7 +113,9 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
 
 
 def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionConfig:
-    own = ({"temperature": OWN_TEMPERATURE} if task.env is None else {}) | dict(task.defaults.execution)
+    followed = min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), MOST_FOLLOWED)
+    own: dict[str, Any] = {"replan_interval": followed} | ({"temperature": OWN_TEMPERATURE} if task.env is None else {})
+    own |= task.defaults.execution
     if asked.strategy == "oracle":
         raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
     if not method.plans:

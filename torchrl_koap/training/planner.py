@@ -70,9 +70,10 @@ def learn_planner(
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
     extended = extrapolate_ends(data, planner.horizon - 1)
-    planner.fit_normalizers(cut_windows(extended, length, select=["state"], pad_before=1)["state"][:, unseen:])
+    windows = cut_windows(extended, length, select=["state"], pad_before=1)["state"]
+    planner.fit_normalizers(windows[:, unseen:])
     planner.to(config.run.device)
-    augment = augmentation(task)
+    augment = augmentation(task, windows)
     buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
     def draw() -> TensorDictBase:
@@ -99,6 +100,11 @@ def learn_planner(
         planner.load_state_dict(best.network.state_dict())
         values["held_out_seconds"] = best.seconds
     return planner, values
+
+
+def usual_step(windows: Tensor) -> Tensor:
+    """Root mean square ``[d]`` of what columns change in a control step, of the first one of windows ``[N, T, d]``."""
+    return (windows[:, 1] - windows[:, 0]).square().mean(0).sqrt()
 
 
 def column_weights(task: Task) -> Tensor | None:
@@ -139,11 +145,11 @@ def plan_score(planner: StatePlanner, data: TensorDictBase, task: Task) -> Calla
     return score
 
 
-def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:
+def augmentation(task: Task, windows: Tensor, *, actions: bool = False) -> TensorDictSequential:
     """Makes what windows undergo before a planner, or a network that samples actions, learns from them.
 
-    ``actions`` of the windows have to fit the states afterwards. Scenes are then moved, and the robot displaced, only
-    where every action names the state column that it moves.
+    Raw states are windows ``[N, T, d]``. ``actions`` of the windows have to fit the states afterwards. Scenes are then
+    moved, and the robot displaced, only where every action names the state column that it moves.
     """
     moved_by = list(task.moved_columns()) if actions else None
     steps = []
@@ -156,9 +162,10 @@ def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         tool: dict[str, Any] = {"tool": task.tool_columns, "kinematics": task.tool_position}
+        sigma = task.defaults.recovery
         steps.append(
             RecoveryAugmentation(
-                task.defaults.recovery,
+                usual_step(windows) if sigma is None else sigma,
                 history=HISTORY,
                 under_way=task.env is None,
                 columns=arm,

@@ -53,13 +53,13 @@ class LinearInverseDynamics(InverseDynamics):
         return self.decoder.linear(self.inputs(self._read(state, frames)))
 
     @torch.no_grad()
-    def fit_labels(self, windows: TensorDictBase, mask: Tensor, **_: Any) -> dict[str, Any]:
+    def fit_labels(self, windows: TensorDictBase, mask: Tensor, *, alike: bool = True, **_: Any) -> dict[str, Any]:
         """Fits the regression on the labelled frames."""
         inputs, action, groups = self.labelled_frames(self._read, windows, mask)
         spread = inputs.std(0, correction=0)
         self.inputs.offset.copy_(inputs.mean(0))
         self.inputs.scale.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
-        fit = ridge(self.inputs(inputs), action, groups=groups, input_noise=INPUT_NOISE)
+        fit = ridge(self.inputs(inputs), action, groups=groups, input_noise=INPUT_NOISE, alike=alike)
         self.decoder.assign(fit)
         return fit.summary()
 
@@ -126,12 +126,13 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         self.basis.zero_()[: len(found)] = found.to(self.basis)
 
     @torch.no_grad()
-    def fit_labels(self, windows: TensorDictBase, mask: Tensor, **_: Any) -> dict[str, Any]:
+    def fit_labels(self, windows: TensorDictBase, mask: Tensor, *, alike: bool = True, **_: Any) -> dict[str, Any]:
         """Fits the ridge for every number of components and keeps the one with the smallest held-out error."""
         self.gate.fill_(1.0)
         latent, action, groups = self.labelled_frames(self.infer, windows, mask)
         numbers = torch.arange(len(self.gate), device=self.gate.device)
-        options = {"groups": groups, "default_penalty": DEFAULT_PENALTY, "input_noise": INPUT_NOISE, "bias": False}
+        options = {"groups": groups, "default_penalty": DEFAULT_PENALTY, "input_noise": INPUT_NOISE}
+        options |= {"bias": False, "alike": alike}
         fits = {count: ridge(latent * (numbers < count), action, **options) for count in self._counts}
         best = min(fits, key=lambda count: fits[count].error)
         self.gate.copy_(numbers < best)

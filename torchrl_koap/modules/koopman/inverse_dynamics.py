@@ -154,7 +154,13 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
 
     @torch.no_grad()
     def fit_labels(
-        self, windows: TensorDictBase, mask: Tensor, *, axes: Sequence[int] = (), guessed: bool = False
+        self,
+        windows: TensorDictBase,
+        mask: Tensor,
+        *,
+        axes: Sequence[int] = (),
+        guessed: bool = False,
+        alike: bool = True,
     ) -> dict[str, Any]:
         """Fits the decoder in closed form, and chooses the block that a latent action with several reads.
 
@@ -167,6 +173,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
             "default_penalty": self.penalty,
             "input_noise": INPUT_NOISE,
             "bias": normalizer is not None and bool(normalizer.offset.any()),
+            "alike": alike,
         }
         was_training, fits = self.training, {}
         self.eval()
