@@ -88,7 +88,7 @@ for name, angle in COUNTED.items():
     GROUNDS[name] = Ground(
         write,
         "success",
-        (5,),
+        (5, 25),
         100,
         env=env_id,
         max_steps=STEPS,

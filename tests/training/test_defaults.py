@@ -103,10 +103,11 @@ class TestThePlanner:
 
 class TestExecution:
     @pytest.mark.parametrize(("rate", "steps"), [(5, 4), (30, 4), (50, 5), (80, 8), (100, 10), (1000, 10)])
-    def test_follows_a_plan_for_a_tenth_of_a_second(self, rate, steps):
+    def test_with_feedback_follows_a_plan_for_a_tenth_of_a_second(self, rate, steps):
         task = replace(get_task("avoiding"), control_hz=rate)
-        for method in ("koap", "dp", "dd"):
-            assert resolve(TrainConfig(out="run", method=method), task).execution.replan_interval == steps
+        for method in ("koap", "lapo", "dp", "dd"):
+            found = resolve(TrainConfig(out="run", method=method), task).execution
+            assert found.replan_interval == (steps if found.strategy == "feedback" else 4), method
 
     def test_of_a_method_goes_before_the_tasks(self):
         def execution(*names, **asked):

@@ -34,9 +34,9 @@ def action_facts(task: Task, columns: Sequence[int]) -> dict[str, Any]:
     """Finds the column of those read that each action moves; for a robot that came with data alone, the likely one.
 
     ``axes`` are empty where nothing is known or likely; ``guessed`` tells a likely one from a known one. Actions are
-    ``alike`` where none is raw.
+    ``alike`` unless all are raw.
     """
-    alike = all(action.kind != "raw" for action in task.actions.values())
+    alike = any(action.kind != "raw" for action in task.actions.values())
     known = task.moved_columns()
     if known:
         return {"axes": list(known), "guessed": False, "alike": alike}

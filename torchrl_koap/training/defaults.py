@@ -25,7 +25,7 @@ PLACES = "absolute"  # the default preset where decoded actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.7  # of plans where no figure counts the modes
-PLAN_SECONDS = 0.1  # that a plan is followed at least: new ones every few ms begin where the robot lags behind the last
+PLAN_SECONDS = 0.1  # with feedback, at least: plans made anew every few ms begin where the robot lags behind the last
 MOST_FOLLOWED = 10  # frames of a plan: actions of later ones would need frames beyond its end
 Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 
@@ -113,9 +113,7 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
 
 
 def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionConfig:
-    followed = min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), MOST_FOLLOWED)
-    own: dict[str, Any] = {"replan_interval": followed} | ({"temperature": OWN_TEMPERATURE} if task.env is None else {})
-    own |= task.defaults.execution
+    own = ({"temperature": OWN_TEMPERATURE} if task.env is None else {}) | dict(task.defaults.execution)
     if asked.strategy == "oracle":
         raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
     if not method.plans:
@@ -126,6 +124,9 @@ def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionC
             )
         own["strategy"] = "open_loop"
     filled = Execution().replaced(**own).replaced(**method.execution)
+    if asked.on(filled).strategy == "feedback" and "replan_interval" not in own | dict(method.execution):
+        interval = min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), MOST_FOLLOWED)
+        filled = filled.replaced(replan_interval=interval)
     return ExecutionConfig(**vars(asked.on(filled)))
 
 
