@@ -76,6 +76,11 @@ def test_every_mode_has_its_color(task):
     assert len(mode_colors(Modes())) == 1
 
 
+def test_modes_that_are_called_by_colors_have_them():
+    red, green, blue = mode_colors(get_task("stacking_1").modes)
+    assert red.argmax() == 0 and green.argmax() == 1 and blue.argmax() == 2
+
+
 ROLLOUTS = make_rollouts()
 
 

@@ -92,7 +92,7 @@ def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, t
         if index + across >= len(drawn):
             axes.set_xlabel("time (s)")
         tidy(axes)
-    rest = f"; {len(columns) - len(drawn)} further columns are not drawn" if len(drawn) < len(columns) else ""
+    rest = f"; columns that are not drawn: {len(columns) - len(drawn)}" if len(drawn) < len(columns) else ""
     figure.suptitle(head + rest, fontsize=9.5, x=0.01, ha="left")
     figure.legend(handles=_HANDLES, fontsize=8.5, loc="outside lower center", ncols=2, frameon=False)
     return figure

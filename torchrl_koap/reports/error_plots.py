@@ -98,7 +98,7 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
                     f"; last: {y[-1]:.3g}" if y[-1] > y[best] else ""
                 )
             axes.plot(x, y, color=BLUE, alpha=0.25, linewidth=0.7)
-            axes.plot(x, smooth, color=BLUE, linewidth=1.6)
+            axes.plot(x, smooth, color=BLUE, linewidth=1.6, marker="o" if len(x) == 1 else "")
             axes.set_yscale("log")
             low, high = np.nanmin(y), np.nanmax(y)
             widen = max(1.0, 4 * low / high) ** 0.5  # a flat curve looks flat
@@ -106,9 +106,9 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
             axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
             axes.annotate(note, (1, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize=9, color=BLUE)
         else:
-            axes.text(
-                0.5, 0.5, "0 throughout: no label entered this loss", transform=axes.transAxes, ha="center", color=MUTED
-            )
+            fitted = name == "loss_action" and "decoder_fit" in run.summary
+            why = "it is fitted in closed form\nafter the last update" if fitted else "no label entered this loss"
+            axes.text(0.5, 0.5, f"0 throughout: {why}", transform=axes.transAxes, ha="center", color=MUTED)
             axes.set_yticks([])
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=_ROUND))
         tidy(axes)

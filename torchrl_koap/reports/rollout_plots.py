@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
-from matplotlib.colors import hsv_to_rgb, to_rgb
+from matplotlib.colors import CSS4_COLORS, hsv_to_rgb, rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
@@ -123,12 +123,19 @@ def recorded_modes(demonstrations: Path, modes: Modes) -> np.ndarray:
 
 
 def mode_colors(modes: Modes) -> np.ndarray:
-    """Returns an sRGB colour in 0..1 for each mode: hue tells the last choice apart, lightness all before it."""
+    """Returns an sRGB colour in 0..1 for each mode: hue tells the last choice apart, lightness all before it.
+
+    Choices that are called by colours have their hues.
+    """
     if modes.number < 2:
         return np.array([to_rgb(BLUE)])
-    hues = len(modes.choices[-1][1])
+    names = modes.choices[-1][1]
+    hues = len(names)
     shades = modes.number // hues
-    hue = np.tile((0.6 - np.arange(hues) * min(0.27, 1 / hues)) % 1, shades)
+    if all(name in CSS4_COLORS for name in names):
+        hue = np.tile(rgb_to_hsv([to_rgb(name) for name in names])[:, 0], shades)
+    else:
+        hue = np.tile((0.6 - np.arange(hues) * min(0.27, 1 / hues)) % 1, shades)
     if shades > 1:
         lightness = np.repeat(np.linspace(0.42, 1.3, shades), hues)
     else:  # neighbours among many hues need another lightness too
