@@ -8,7 +8,7 @@ import functools
 import importlib
 import importlib.metadata
 import importlib.util
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,10 +30,15 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
     """
     if isinstance(name, str) and name in table:
         return table[name] if isinstance(table, Mapping) else name
-    lowered = {known.lower(): known for known in table}
-    near = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5) if isinstance(name, str) else []
-    hint = f"did you mean {lowered[near[0]]!r}?" if near else f"known: {', '.join(table)}"
+    near = nearest(table, name) if isinstance(name, str) else None
+    hint = f"known: {', '.join(table)}" if near is None else f"did you mean {near!r}?"
     raise ValueError(f"unknown {what} {name!r}; {hint}")
+
+
+def nearest(known: Iterable[str], name: str) -> str | None:
+    """Finds the known name that is most like another one; None where none is."""
+    lowered = {each.lower(): each for each in known}
+    return next((lowered[near] for near in difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)), None)
 
 
 def resolve(reference: Any, what: str) -> Any:

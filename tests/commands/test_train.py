@@ -2,12 +2,15 @@
 """``koap train``: what it writes, what the seed fixes, planners that are taken over, finished runs."""
 
 import json
+import shutil
 import sys
+from unittest.mock import Mock
 
 import torch
 from command_calls import contents
 from tiny_runs import TINY, koap
 
+from torchrl_koap.commands import run_commands
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training import Trained
@@ -58,6 +61,20 @@ def test_a_planner_taken_over_changes_nothing_in_the_controller(trained_run, dem
         assert mine.keys() == its.keys() and all(torch.equal(mine[key], its[key]) for key in mine)
     assert json.loads((out / "config.json").read_text())["planner"]["source"] == str(trained_run)
     assert {row["phase"] for row in RunDirectory(out).read_metrics()} == {"controller"}
+
+
+def test_an_interrupted_training_says_how_to_go_on(copied_run, monkeypatch, capsys):
+    monkeypatch.setattr(run_commands, "train", Mock(side_effect=KeyboardInterrupt))
+
+    def said(out):
+        assert koap("train", "--out", out) == 130
+        return capsys.readouterr().err
+
+    resume = f"koap: interrupted; `koap train --out {copied_run} --resume` "
+    assert said(copied_run) == f"{resume}goes on from its last checkpoint\n"
+    shutil.rmtree(copied_run / "checkpoints")
+    assert said(copied_run) == f"{resume}begins again, there is no checkpoint yet\n"
+    assert said(copied_run / "new") == "koap: interrupted; nothing is trained yet: train again\n"
 
 
 def test_a_finished_run_may_be_resumed_and_stays_what_it_is(copied_run, monkeypatch):

@@ -66,8 +66,8 @@ def test_changes(scale):
     steps = [scale * step for step in DELTAS]
     assert not warnings(PATHS, steps)
     assert not warnings(PATHS, steps, acting=JOINTS[:2])
-    said = warnings(PATHS, steps, action_kind="absolute", targets=JOINTS[:2])
-    assert len(said) == 2 and all("convert again with --action-kind delta" in each for each in said)
+    (said,) = warnings(PATHS, steps, action_kind="absolute", targets=JOINTS[:2])
+    assert said.endswith("convert again with --action-kind delta")
 
 
 def test_velocities_that_are_also_in_the_state_are_no_targets():
@@ -110,11 +110,22 @@ def test_normalised_targets_are_raw():
 
 def test_targets_in_other_units_than_their_columns_are_raw():
     degrees = [57.3 * steps for steps in TARGETS]
-    said = warnings(PATHS, degrees, action_kind="absolute", targets=JOINTS[:2])
-    assert len(said) == 2 and all(each.endswith("or convert again with --action-kind raw") for each in said)
-    assert "away from its target 'shoulder.pos' on average, which spreads by" in said[0]
+    (said,) = warnings(PATHS, degrees, action_kind="absolute", targets=JOINTS[:2])
+    assert "from 'shoulder.pos', 'b' by" in said and said.endswith("convert again with --action-kind raw")
     offset = [steps + 90 for steps in TARGETS]
     assert not warnings(PATHS, offset, action_kind="absolute", targets=JOINTS[:2])
+
+
+def test_normalised_targets_of_columns_in_degrees_are_raw_however_they_are_declared():
+    """They are small, so they lie nearer to the changes than to the columns."""
+    paths = [40 * path + 90 for path in PATHS]
+    steps = [path[1:, :2] / 400 for path in paths]
+    (said,) = warnings(paths, steps, action_kind="absolute", targets=JOINTS[:2])
+    assert said.endswith("convert again with --action-kind raw")
+    assert [said[-3:] for said in warnings(paths, steps)] == ["raw"]
+    assert not warnings(paths, steps, action_kind="raw")
+    (said,) = warnings(PATHS, TARGETS, action_kind="absolute", targets=JOINTS[1::-1])
+    assert said.endswith("--action-kind absolute and other --targets")
 
 
 def test_raw_actions_that_are_something_better():

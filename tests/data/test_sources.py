@@ -74,6 +74,10 @@ def test_demonstrations_of_po_sorting_are_as_noisy_as_its_rollouts(tmp_path):
 def test_what_cannot_be_opened(tmp_path):
     with pytest.raises(FileNotFoundError, match="dataset '.*nowhere' is no folder of"):
         open_dataset(tmp_path / "nowhere")
+    (tmp_path / "b_raw").mkdir()
+    with pytest.raises(FileNotFoundError, match="did you mean '.*/b_raw'. `koap convert DATA --out DIR` makes one"):
+        open_dataset(tmp_path / "b_rwa")
+    (tmp_path / "b_raw").rmdir()
     with pytest.raises(FileNotFoundError, match="no demonstrations"):
         open_dataset(tmp_path)
     folder = save_demonstrations(tmp_path / "arm", [np.zeros((9, 3))], control_hz=30, action_dim=2)

@@ -27,7 +27,7 @@ def test_a_training_in_five_rows():
         "labels": "20 of 40 steps; in 1 of 2 recordings",
         "planner": "500 updates in 22 s; kept update 500, with plan error 0.263 on held-out recordings"
         " (standing still: 1)",
-        "training ended": "with its last update; still improving: --steps 1000 may help",
+        "training ended": "with its last update; still improving: train again with --steps 1000",
         "controller": "koap, 500 updates in 11 s; fitted to 18 labels",
     }
 
@@ -37,7 +37,7 @@ def test_a_training_in_five_rows():
     [
         (300, 100, "by itself before update 500; plans stopped improving at update 100"),
         (500, 350, "with its last update; plans stopped improving at update 350"),
-        (500, 450, "with its last update; still improving: --steps 1000 may help"),
+        (500, 450, "with its last update; still improving: train again with --steps 1000"),
     ],
 )
 def test_why_a_training_ended(updates, kept, said):

@@ -36,6 +36,14 @@ def test_what_is_left_out_is_as_it_was(run):
     assert begun_with(run, fresh) is fresh
 
 
+def test_a_folder_without_a_run_is_not_resumed(tmp_path):
+    nowhere = RunDirectory(tmp_path / "arm3")
+    with pytest.raises(RunDirectoryError, match="arm3 holds no run to resume"):
+        begun_with(nowhere, TrainConfig(out=nowhere.path, run=RESUME))
+    fresh = TrainConfig(dataset="arm", out=nowhere.path, run=RESUME)
+    assert begun_with(nowhere, fresh) is fresh
+
+
 def test_other_places_and_threads_will_do(run):
     check_resume(run, replace(SAVED, dataset="/moved", run=replace(SAVED.run, resume=True, threads=1)))
     built_on = replace(SAVED, planner=PlannerConfig(source="/no/longer/there"))  # as where a curve's folder was moved

@@ -130,6 +130,14 @@ def test_the_decoder_beats_a_ridge_on_a_lagging_robot():
     assert koap < 0.08 and koap < 0.75 * ridge, (koap, ridge)
 
 
+def test_a_short_recording_is_refused_before_the_planner_is_trained(monkeypatch):
+    monkeypatch.setattr("torchrl_koap.training.in_memory.learn_planner", pytest.fail)
+    states, actions = record()
+    data, task = make_demonstrations(**few_labels(states=[states[0][:9], *states[1:]], actions=[None, *actions[1:]]))
+    with pytest.raises(ValueError, match=r"1 of 6 trajectories are shorter than a window .*: 0 \(8 steps\)"):
+        fit(data, task)
+
+
 def test_refusals():
     data, task = make_demonstrations(**few_labels())
     with pytest.raises(ValueError, match="unknown option of PlannerConfig 'widht'; did you mean 'width'"):

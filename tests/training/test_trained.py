@@ -11,6 +11,7 @@ from offline_runs import fit_walks
 from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, load_policy
+from torchrl_koap.runs.run_directory import RunDirectoryError, copy_run
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
 PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
@@ -49,6 +50,16 @@ def test_a_run_as_one_file(trained_run, tmp_path):
     assert loaded.execution == Execution("open_loop", replan_interval=2) and not loaded.training
     np.testing.assert_array_equal(actions(loaded), expected)
     assert load_policy(str(path)).execution == Execution()
+
+
+def test_an_unfinished_training_is_told_from_a_damaged_one(trained_run, tmp_path):
+    run = copy_run(trained_run, tmp_path / "run")
+    (run / "planner.safetensors").unlink()
+    with pytest.raises(CheckpointError, match="planner.safetensors is missing"):
+        Trained.load(run)
+    (run / "summary.json").unlink()
+    with pytest.raises(RunDirectoryError, match="run is not finished: go on with `koap train --out .*run --resume`"):
+        Trained.load(run)
 
 
 def test_a_policy_follows_plans_as_it_was_trained_for_unless_asked(own):

@@ -43,9 +43,22 @@ class Train(Command):
 
     def __call__(self) -> dict[str, str]:
         """Trains."""
-        train(self.config, command=" ".join(["koap", *sys.argv[1:]]))
         out = str(self.config.out)
+        try:
+            train(self.config, command=" ".join(["koap", *sys.argv[1:]]))
+        except KeyboardInterrupt as interrupt:
+            interrupt.args = (_how_to_go_on(self.config.out),)
+            raise
         return {**as_text(training_rows(RunFacts.read(out))), "run": out, "next": f"koap eval {shlex.quote(out)}"}
+
+
+def _how_to_go_on(out: Path) -> str:
+    """What to do after a training was interrupted."""
+    if not (out / "config.json").exists():
+        return "nothing is trained yet: train again"
+    kept = any((out / "checkpoints").glob("*.safetensors"))
+    begins = "goes on from its last checkpoint" if kept else "begins again, there is no checkpoint yet"
+    return f"`koap train --out {shlex.quote(str(out))} --resume` {begins}"
 
 
 @dataclass(kw_only=True)

@@ -16,7 +16,7 @@ from types import FrameType
 # SIGHUP: the terminal was closed; other systems than Unix do not know it
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 _LEAST_COLUMNS = 40  # the help of a terminal with a single column never ends
-KEPT = "`koap train --resume` goes on from its last checkpoint, `koap demos` and `koap curve` when called again"
+KEPT = "`koap demos`, `koap embed` and `koap curve` go on when called again"
 
 
 class ReadEnough(Exception):
@@ -28,14 +28,17 @@ class Interrupted(KeyboardInterrupt):
 
     def __init__(self, number: int):
         self.number = number
-        super().__init__(number)
+        super().__init__()
 
 
 def describe_interrupt(error: KeyboardInterrupt) -> tuple[str, int]:
-    """Returns what to say of an interrupt, and the exit status that shells expect of it."""
+    """Returns what to say of an interrupt, and the exit status that shells expect of it.
+
+    Its argument, if it has one, says how to go on.
+    """
     number = error.number if isinstance(error, Interrupted) else signal.SIGINT
     by = "" if number == signal.SIGINT else f" by {signal.Signals(number).name}"
-    return f"interrupted{by}; {KEPT}", 128 + number
+    return f"interrupted{by}; {error.args[0] if error.args else KEPT}", 128 + number
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,18 +62,17 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     labels = _labels(data, task)
     if labels is None:
         return
-    yield from _targets_far_away(labels, task)
     likely = _likely(labels, task)
+    yield from _targets_far_away(labels, task, likely)
     kinds = {name: action.kind for name, action in task.actions.items()}
     aimed = {name for name, each in likely.items() if each.kind == "absolute"}
     wrong = {name for name in aimed if kinds[name] == "delta"}
     wrong |= aimed if len(aimed) == task.action_dim and set(kinds.values()) == {"raw"} else set()
     if wrong:
         reached = [labels.names[likely[name].column] for name in kinds if name in wrong]
-        asked = " ".join("absolute" if name in wrong else kind for name, kind in kinds.items())
-        if len(wrong) == task.action_dim:
-            usual = [likely[name].column for name in kinds] == list(task.robot)
-            asked = "absolute" if usual else f"absolute --targets {shlex.join(reached)}"
+        asked = _asked(task, dict.fromkeys(wrong, "absolute"))
+        if len(wrong) == task.action_dim and [likely[name].column for name in kinds] != list(task.robot):
+            asked += f" --targets {shlex.join(reached)}"
         yield (
             f"actions lie within {max(likely[name].distance for name in wrong):.2g} of {some(reached)} on average: they"
             f" look like absolute targets; convert again with --action-kind {asked}"
@@ -81,10 +80,9 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
     switches = [name for name, kind in kinds.items() if kind == "delta" and levels[name] == 2]
     if switches:
-        asked = " ".join("raw" if name in switches else kind for name, kind in kinds.items())
         yield (
             f"{some(switches)}: an action of two values, such as a gripper's that opens and closes: convert again with"
-            f" --action-kind {asked}"
+            f" --action-kind {_asked(task, dict.fromkeys(switches, 'raw'))}"
         )
     wrong.update(switches)
     changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
@@ -145,24 +143,29 @@ def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
     return found
 
 
-def _targets_far_away(labels: _Labels, task: Task) -> Iterator[str]:
+def _asked(task: Task, likely: Mapping[str, ActionKind]) -> str:
+    """What ``--action-kind`` should say where some actions are of another kind."""
+    kinds = [likely.get(name, action.kind) for name, action in task.actions.items()]
+    return kinds[0] if len(set(kinds)) == 1 else " ".join(kinds)
+
+
+def _targets_far_away(labels: _Labels, task: Task, likely: Mapping[str, LikelyKind]) -> Iterator[str]:
     """Absolute actions that are nearer to the change of their column, or farther from it than the column moves."""
+    far: dict[str, str] = {}
     for (name, action), steps in zip(task.actions.items(), labels.actions.T, strict=True):
-        if action.kind != "absolute" or action.column is None:
+        if action.kind != "absolute" or action.column is None or name not in likely:
             continue
         level, target = labels.level[:, action.column], labels.names[action.column]
         away, *others = (np.abs(steps - there[:, action.column]).mean() for there in _readings(labels, task))
-        if NEARER * min(others) < away:
-            yield (
-                f"absolute action {name!r} is {away:.2g} away from its target {target!r} on average and"
-                f" {min(others):.2g} from its change: it looks like a change or a velocity; convert again with"
-                " --action-kind delta"
-            )
-        elif min(away, (steps - level).std()) > NAMED * level.std() and np.ptp(steps):
-            yield (
-                f"absolute action {name!r} is {away:.2g} away from its target {target!r} on average, which spreads by"
-                f" {level.std():.2g}: name another in --targets, or convert again with --action-kind raw"
-            )
+        if NEARER * min(others) < away or min(away, (steps - level).std()) > NAMED * level.std():
+            far[name] = f"{name!r} by {away:.2g} from {target!r}"
+    if far:
+        kinds = {name: likely[name].kind for name in far}
+        targets = " and other --targets" if "absolute" in kinds.values() else ""
+        yield (
+            f"absolute actions lie away from their targets on average, {some([*far.values()])}: convert again with"
+            f" --action-kind {_asked(task, kinds)}{targets}"
+        )
 
 
 def _readings(labels: _Labels, task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

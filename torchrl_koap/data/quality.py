@@ -106,7 +106,7 @@ def _short(lengths: Sequence[int], called: Sequence[str]) -> Iterator[str]:
     if short:
         yield (
             f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
-            f" refuse them: {some(short)}; leave them out (`koap convert --drop-short`)"
+            f" refuse them: {some(short)}; leave them out of the lists, or with `koap convert --drop-short`"
         )
 
 

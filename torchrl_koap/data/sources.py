@@ -15,6 +15,7 @@ from torchrl_koap.data.formats import FORMATS, find_format
 from torchrl_koap.data.ted import read_about, read_steps, stored_folder, stored_task
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state, trajectory_lengths
 from torchrl_koap.files import DataError
+from torchrl_koap.lookup import nearest
 from torchrl_koap.tasks import Task, get_task
 
 DEFAULT_TASK = "avoiding"  # what D3IL's pickles are of if nobody says so
@@ -111,8 +112,12 @@ def _find_stored(source: str | Path) -> Path | None:
             f" `koap convert {shlex.quote(str(source))} --out {out}`, then `--dataset {out}`",
         )
     if not Path(source).is_dir():
+        path = Path(source)
+        near = nearest([other.name for other in path.parent.glob("*") if other.is_dir()], path.name)
+        hint = "" if near is None else f"did you mean {str(path.with_name(near))!r}? "
         raise FileNotFoundError(
-            f"dataset {str(source)!r} is no folder of {Path.cwd()}; `koap demos --out DIR` records one"
+            f"dataset {str(source)!r} is no folder of {Path.cwd()}; {hint}`koap convert DATA --out DIR` makes one of"
+            " your own data, `koap demos --out DIR` records one"
         )
     return None
 

@@ -80,7 +80,7 @@ def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
         return f"by itself before update {most:,.0f}", f"plans stopped improving at update {kept:,.0f}"
     if kept < _LATE * updates:
         return "with its last update", f"plans stopped improving at update {kept:,.0f}"
-    return "with its last update", f"still improving: --steps {2 * updates:.0f} may help"
+    return "with its last update", f"still improving: train again with --steps {2 * updates:.0f}"
 
 
 def _controller(run: RunFacts) -> Row | None:

@@ -21,7 +21,10 @@ _ONE_OF = ("fraction", "count", "episodes")
 
 def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
     """Returns the options of a run, which may be new: of a resumed one what is not asked for otherwise is as it was."""
-    if not (asked.run.resume and (run.path / "config.json").exists()):
+    begun = (run.path / "config.json").exists()
+    if asked.run.resume and asked.dataset is None and not begun:
+        raise RunDirectoryError(f"{run.path} holds no run to resume: it has no config.json")
+    if not (asked.run.resume and begun):
         return asked
     saved = read_config(run)
     if any(vars(asked.labels)[name] for name in _ONE_OF):

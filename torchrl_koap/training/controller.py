@@ -60,6 +60,16 @@ def learn_controller(
     }
 
 
+def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None:
+    """Refuses flat data ``[N]`` of which a trajectory is shorter than a window, before anything is trained."""
+    method, window, past = get_method(config.method), WINDOW, 1
+    if method.plans and method.fit is None:
+        with torch.random.fork_rng(devices=[]):
+            controller = build_controller(task, method, config.controller)
+        window, past = max(WINDOW, controller.num_window_frames), controller.num_past
+    WindowTable.build(data, window, pad_before=past)
+
+
 def _train_network(
     task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:

@@ -24,7 +24,7 @@ from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.runs.progress import without_progress_bars
 from torchrl_koap.tasks import Action, Task
-from torchrl_koap.training.controller import learn_controller
+from torchrl_koap.training.controller import check_lengths, learn_controller
 from torchrl_koap.training.datasets import choose_held_out, split_held_out
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.loop import Phases
@@ -117,6 +117,7 @@ def fit(
     held_out = choose_held_out(data, config.planner.held_out, seed=seed)
     if not data[keys.HAS_ACTION].any():
         raise ValueError(f"none of the {len(data)} steps has an action: there are no labels to learn from")
+    check_lengths(task, config, data)
     seen, unseen, data = split_held_out(data.to(device), held_out)
     results = dict[str, Any]()
     plans = get_method(config.method).plans

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import WindowTable, open_dataset
+from torchrl_koap.data import open_dataset
 from torchrl_koap.data.label_budget import LabelReport, subsample_trajectories
 from torchrl_koap.data.quality import plan_coverage
 from torchrl_koap.data.sources import find_task_of
@@ -26,9 +26,9 @@ from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, p
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
 from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory
 from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
-from torchrl_koap.tasks import WINDOW, Task
+from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
-from torchrl_koap.training.controller import learn_controller
+from torchrl_koap.training.controller import check_lengths, learn_controller
 from torchrl_koap.training.datasets import (
     choose_held_out,
     fingerprint,
@@ -92,7 +92,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         check_logger(config.run.logger)
         set_up_torch(config.run.threads, config.run.device)
         check_resume(run, config)
-        frames = _frames(task, config)
+        _check_networks(task, config)
         used, held_out, report = _read_data(task, config, planner_only)
         content = to_json(config) | {"data": fingerprint(used), "versions": versions()}
         check_data(run, content)
@@ -100,8 +100,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             content["task_definition"] = definition
         if held_out:
             content["held_out_episodes"] = held_out
-        if not planner_only:  # trajectories that are too short are found now rather than after the planner was trained
-            WindowTable.build(used, frames[0], pad_before=frames[1])
+        if not planner_only:
+            check_lengths(task, config, used)
         for_planner, unseen, data = split_held_out(used, held_out)
         if not mine:
             held.enter_context(run.locked("koap train"))
@@ -144,21 +144,17 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
     return Trained(task, config, planner, controller, summary, tuple(held_out), run.path, cameras)
 
 
-def _frames(task: Task, config: TrainConfig) -> tuple[int, int]:
-    """Length of a window of the controller, and frames that may be repeated before an episode.
-
-    Finds networks that cannot read the task's state, and weights to take over that do not fit, before any work.
-    """
+def _check_networks(task: Task, config: TrainConfig) -> None:
+    """Finds networks that cannot read the task's state, and weights to take over that do not fit, before any work."""
     with torch.random.fork_rng(devices=[]):
-        planner, module = build_networks(task, config)
-    if planner is None:
-        return WINDOW, 1
+        planner, _ = build_networks(task, config)
     source = config.planner.source
-    if source is not None and not (config.run.resume and (config.out / "planner.safetensors").exists()):
+    if (
+        planner is not None
+        and source is not None
+        and not (config.run.resume and (config.out / "planner.safetensors").exists())
+    ):
         load_weights(source / "planner.safetensors", planner, _facts_of_source(task, config))
-    if get_method(config.method).fit is not None:
-        return WINDOW, 1
-    return max(WINDOW, module.num_window_frames), module.num_past
 
 
 def _facts_of_source(task: Task, config: TrainConfig) -> dict[str, Any]:

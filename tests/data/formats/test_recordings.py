@@ -86,6 +86,8 @@ def with_nan(array):
         ([torch.ones(5, 3).to_sparse()], None, {"action_dim": 1}, "states are no table of numbers, got Tensor"),
         ([{"q": FRAMES}], None, {"action_dim": 1}, "states are no table of numbers, got dict"),
         ("recordings", None, {"action_dim": 1}, r"sequence of arrays \[T, d\], .* got str: files are read by read_rec"),
+        (FRAMES, [FRAMES], {}, r"states must be a list of recordings \[T, d\], got one array \[5, 3\]"),
+        ([FRAMES], torch.ones(4, 2), {}, r"actions must be a list of .*\[T - 1, a\], got one array \[4, 2\]"),
         (3.0, None, {"action_dim": 1}, "got float"),
         ([FRAMES, FRAMES], [np.ones((9, 1))] * 2, {}, "used: trajectory 0, trajectory 1: 9 actions for 5 frames"),
     ],

@@ -48,6 +48,24 @@ def test_named_action_columns_and_episodes(tmp_path):
     assert [steps.shape for steps in recordings.actions] == [(2, 1), (2, 1)]
 
 
+def test_files_without_the_action_columns_have_no_actions(tmp_path):
+    write_csv(tmp_path / "a.csv", columns_of())
+    write_csv(tmp_path / "b.csv", columns_of(motor_1=[1.0] * 6, motor_2=[2.0] * 6))
+    motors = ["motor_1", "motor_2"]
+    recordings = read_tables(tmp_path, action_columns=motors)
+    assert recordings.state_names == ("x", "y") and recordings.action_names == ("motor_1", "motor_2")
+    assert recordings.num_labels == 5 and np.isnan(recordings.actions[0]).all()
+    with pytest.raises(
+        DataError, match=r"b.csv: .* has motor_1, motor_2 besides; say in action_columns \(--action-col"
+    ):
+        read_tables(tmp_path)
+    with pytest.raises(DataError, match="'motor_3'; did you mean 'motor_2'"):
+        read_tables(tmp_path, action_columns=[*motors, "motor_3"])
+    write_csv(tmp_path / "c.csv", columns_of(motor_1=[1.0] * 6))
+    with pytest.raises(DataError, match=r": c.csv: lacks motor_2 of action_columns \(--action-columns\)$"):
+        read_tables(tmp_path, action_columns=motors)
+
+
 def test_archives_have_no_columns_to_name(tmp_path):
     np.savez(tmp_path / "a.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)), control_hz=30.0)
     with pytest.raises(

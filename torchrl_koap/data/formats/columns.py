@@ -288,6 +288,8 @@ def _even(pieces: Sequence[Piece]) -> set[str]:
 
 
 def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
+    acting = any(piece.actions for piece in pieces)
+    hint = "" if acting else f"; say in {option('action_columns')} which columns of a table are actions"
     for kind in ("state", "action"):
         named = [(piece.name, piece.states if kind == "state" else piece.actions) for piece in pieces]
         found = [(name, columns) for name, columns in named if columns is not None]
@@ -298,7 +300,7 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
             )
             if missing or more:
                 said = [f"lacks {missing}"] * bool(missing) + [f"has {more} besides"] * bool(more)
-                yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}"
+                yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}{hint}"
 
 
 def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:

@@ -193,6 +193,8 @@ def wrong_rate(value: Any, name: str) -> list[str]:
 
 
 def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
+    if isinstance(values, (np.ndarray, torch.Tensor)) and values.ndim == 2:
+        raise DataError(source, f"{what} must be a list of recordings {wanted}, got one array {list(values.shape)}")
     with contextlib.suppress(TypeError, RuntimeError):  # what is no sequence; nested tensors
         if not isinstance(values, (str, Path, Mapping)):
             return list(values)

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN
-from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.columns import Piece, assemble, unknown
 from torchrl_koap.data.formats.frames import clips_beside
 from torchrl_koap.data.formats.kinds import (
     as_numbers,
@@ -41,8 +41,7 @@ from torchrl_koap.data.formats.kinds import (
     numbers,
 )
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
-from torchrl_koap.files import DataError, gathered, option, refuse
-from torchrl_koap.lookup import lookup
+from torchrl_koap.files import DataError, gathered, option, refuse, some
 
 # what readers of damaged files raise
 _DAMAGED = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
@@ -61,8 +60,8 @@ def table_files(folder: str | Path) -> list[Path]:
 def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = None, **options: Any) -> Recordings:
     """Reads a folder of tables, or a single one, in the order of their names.
 
-    In NumPy archives actions are an entry and no ``action_columns``. The options are those of
-    :func:`~torchrl_koap.data.formats.columns.assemble`.
+    A table with none of the ``action_columns`` has no actions. In NumPy archives actions are an entry. The options are
+    those of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     folder, files = Path(folder), table_files(folder)
     if not files:
@@ -81,7 +80,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
             tables.append((_with_cameras(piece, file), rate, unread))
         except (ValueError, OSError) as error:
             faults.append((str(file), str(error)))
-    refuse(folder, gathered(faults))
+    refuse(folder, gathered(faults) or _lacking([piece for piece, *_ in tables], action_columns or ()))
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
         if "resample" not in options or len(rates) < len(tables):
@@ -99,6 +98,17 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
         skipped=[*(name for _, _, names in tables for name in names), *unread],
         **options,
     )
+
+
+def _lacking(pieces: Sequence[Piece], action_columns: Sequence[str]) -> list[str]:
+    """Faults of files with some of the action columns and not all, and of columns that no file has."""
+    every = dict.fromkeys(name for piece in pieces for name in (*piece.states, *(piece.actions or ())))
+    lacking = [
+        (piece.name, f"lacks {some(missing)} of {option('action_columns')}")
+        for piece in pieces
+        if piece.actions and (missing := [name for name in action_columns if name not in piece.actions])
+    ]
+    return unknown(action_columns, [*every], f"column in {option('action_columns')}:") or gathered(lacking)
 
 
 def _with_cameras(piece: Piece, file: Path) -> Piece:
@@ -298,11 +308,7 @@ def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns:
     """States and actions of a table with named columns, None where they hold no numbers."""
     acting = [name for name in columns if is_action(name)]
     if action_columns is not None:
-        acting = [
-            name
-            for name in action_columns
-            if lookup(columns, name, f"column in {option('action_columns')}:") is not None
-        ]
+        acting = [name for name in action_columns if name in columns]  # none: a recording without actions
     unread = [name for name, values in columns.items() if values is None]
     for name in unread:
         what = "an action" if name in acting else _NEEDED.get(kind_of(name)[0])
