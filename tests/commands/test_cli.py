@@ -88,6 +88,12 @@ def test_twelve_options_of_a_training_come_first_and_all_on_request(capsys):
         assert f"--{name}" in every
 
 
+def test_a_curve_takes_the_environment_as_an_evaluation_does():
+    words = ["--env", "X-v0", "--env-kwargs", "a=1", "--num-envs", "2", "--success-key", "won", "--episodes", "3"]
+    asked = parse(Subcommand, ["curve", "--out", "x", *words]).config.evaluation
+    assert asked == parse(Subcommand, ["eval", "x", *words]).config
+
+
 @pytest.mark.parametrize("command", [kind.__name__.lower() for group in GROUPS.values() for kind in group])
 def test_every_default_is_shown_once_and_where_it_says_something(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")

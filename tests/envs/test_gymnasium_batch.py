@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
-from toy_gym import NAMES, Breaks, Reach
+from toy_gym import NAMES, Breaks, Reach, Seen
 
 from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch, GymnasiumEpisode
 from torchrl_koap.tasks import Action, Task
@@ -126,7 +126,7 @@ def test_pictures_go_through_the_policy_s_own_transform(cameras):
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match="environment 'NoSuch-v0' cannot be made: Environment `NoSuch`"):
+    with pytest.raises(ValueError, match="environment 'NoSuch-v0' cannot be made: NameNotFound: Environment `NoSuch`"):
         GymnasiumBatch("NoSuch-v0", TASK)
     with pytest.raises(ValueError, match="environment 'no_such_package:Reach-v0' cannot be made: "):
         GymnasiumBatch("no_such_package:Reach-v0", TASK)
@@ -143,6 +143,36 @@ def test_refusals():
         GymnasiumBatch("ToyReach-v0", TASK, success_key="arrived")  # before any episode
     with pytest.raises(ValueError, match="cannot be made: .*unexpected keyword argument 'wide'"):
         GymnasiumBatch("ToyReach-v0", TASK, env_kwargs={"wide": 3})
+
+
+def test_an_environment_that_cannot_be_made_is_named_with_any_error(monkeypatch):
+    monkeypatch.setattr(Reach, "__init__", lambda env, key: env.robot)
+    with pytest.raises(ValueError, match="^environment 'ToyReach-v0' cannot be made: AttributeError: 'Reach' object"):
+        GymnasiumBatch("ToyReach-v0", TASK)
+
+
+def test_a_success_key_may_come_with_the_end_of_an_episode(monkeypatch):
+    step = Reach.step
+
+    def late(env, action):
+        *others, truncated, _ = step(env, action)
+        return *others, truncated, {"arrived": True, "time": 6.0} if truncated else {"power": 1.0}
+
+    monkeypatch.setattr(Reach, "step", late)
+    env = GymnasiumBatch("ToyReach-v0", TASK, success_key="arrived")
+    assert env.success_key == "arrived" and run(env, 6)["success"].flatten().tolist() == [False] * 5 + [True]
+    with pytest.raises(ValueError, match="info of env.* 'ToyReach-v0' has no 'won', it has arrived, power, time$"):
+        GymnasiumBatch("ToyReach-v0", TASK, success_key="won")
+
+
+def test_a_wrong_first_observation_is_refused(monkeypatch):
+    reset = Reach.reset
+    monkeypatch.setattr(Reach, "reset", lambda env, **options: reset(env, **options)[0])
+    with pytest.raises(ValueError, match=r"^environment 'ToyReach-v0': reset\(\) must return .* info, got ndarray$"):
+        GymnasiumBatch("ToyReach-v0", TASK)
+    monkeypatch.setattr(Reach, "reset", lambda env, **options: (np.zeros(5), {}))
+    with pytest.raises(ValueError, match=r"^environment 'ToyReach-v0': observation has shape \(5,\), wanted \(4,\)$"):
+        GymnasiumBatch("ToyReach-v0", TASK)
 
 
 def test_arguments_of_the_environment():
@@ -164,8 +194,45 @@ def test_errors_and_clipped_actions_are_recorded_and_the_others_go_on():
     assert (record.actions, record.clipped) == (5, 3)
     assert record.faults() == [
         "3 of 5 actions left the environment's box and were clipped to it",
-        "1 episodes failed because the environment raised an error: seed 11, step 1: RuntimeError: no place",
+        "1 episodes failed by an error of the environment: seed 11, step 1: RuntimeError: no place",
     ]
+
+
+@pytest.mark.parametrize(
+    ("seen", "said"),
+    [
+        ([0, np.nan, 0, 0], "observation is NaN in column 1 (q2)"),
+        ([0, 0, 0, -np.inf], "observation is infinite in column 3 (goal_2)"),
+        ([0] * 5, "observation has shape (5,), wanted (4,)"),
+    ],
+)
+@pytest.mark.parametrize("at", [0, 2])
+def test_a_wrong_observation_fails_its_episode_and_the_others_go_on(seen, said, at, monkeypatch):
+    observe = Reach._observe
+    spoilt = lambda env: env.time == at and env.np_random_seed == 11  # noqa: E731
+    monkeypatch.setattr(Reach, "_observe", lambda env: np.array(seen, float) if spoilt(env) else observe(env))
+    record = EpisodeRecord()
+    rollout = run(GymnasiumBatch("ToyReach-v0", TASK, 3, record=record), 6, [10, 11, 12])
+    step = max(at, 1)  # an error of a reset is told with the first step
+    assert record.errors == [{"seed": 11, "step": step, "error": f"ObservationError: {said}"}]
+    assert rollout["done"].sum(1).flatten().tolist() == [1, 7 - step, 1]
+    assert rollout["failed"].any(1).flatten().tolist() == [False, True, False]
+    assert rollout["success"].any(1).flatten().tolist() == [True, False, True]
+    assert rollout["observation"].isfinite().all()
+
+
+def test_a_picture_s_environment_names_the_entry_that_is_wrong():
+    env = Seen()
+    episode = GymnasiumEpisode(env, 0, max_steps=9)
+    episode.reset(seed=0)
+    good, wrong = env._give(), iter(({"agent_pos": np.array([1.0, np.nan])}, {"agent_pos": np.zeros(3)}))
+    env._give = lambda: good | next(wrong)
+    assert episode.step(ACTION)[-1]["error"] == "ObservationError: observation is NaN in column 1 (agent_pos)"
+    env._give = lambda: good
+    episode.reset(seed=0)
+    env._give = lambda: good | next(wrong)
+    said = "ObservationError: observation 'agent_pos' has shape (3,), wanted (2,)"
+    assert episode.step(ACTION)[-1]["error"] == said
 
 
 ACTION = np.full(2, PUSH, dtype=np.float32)

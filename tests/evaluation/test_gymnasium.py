@@ -9,7 +9,7 @@ from tiny_runs import koap
 from toy_gym import NAMES
 
 from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, save_demonstrations, train
-from torchrl_koap.evaluation import InspectConfig, inspect
+from torchrl_koap.evaluation import InspectConfig, closed_loop, inspect
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.reports.inspection_plots import draw_experiments
 from torchrl_koap.reports.run_facts import RunFacts
@@ -59,7 +59,28 @@ def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
     found = evaluate(arm_run, EvalConfig(episodes=3, seed=10, env="toy_gym:ToyBreaks-v0", threads=1))
     assert [row["outcome"] for row in found["episode"]] == ["success", "error", "success"]
     assert found["errors"] == [{"seed": 11, "step": 1, "error": "RuntimeError: no place"}]
-    assert any("failed because the environment raised an error: seed 11, step 1" in fault for fault in found["faults"])
+    assert any("failed by an error of the environment: seed 11, step 1" in fault for fault in found["faults"])
+
+
+def test_limited_commands_are_those_of_the_rollouts(arm_run, monkeypatch):
+    counted = []
+    monkeypatch.setattr(closed_loop, "limited_commands", lambda policy: counted.append(policy.limited.tolist()) or {})
+    found = evaluate(arm_run, EvalConfig(episodes=2, env="toy_gym:ToyReach-v0", threads=1))
+    assert [commands for _, commands in counted] == [sum(row["steps"] for row in found["episode"])] == [12]
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"env": "toy_gym:ToyReach-v0", "success_key": "no"}, "has no 'no'"),
+        ({"env": "toy_gym:ToyReach-v0", "dataset": "anywhere"}, "the data set 'anywhere'"),
+        ({"dataset": "anywhere"}, "the data set 'anywhere'"),
+    ],
+)
+def test_a_refused_evaluation_copies_nothing(asked, said, arm_run, tmp_path):
+    with pytest.raises(ValueError, match=said):
+        evaluate(arm_run, EvalConfig(out=tmp_path / "copy", threads=1, **asked))
+    assert not (tmp_path / "copy").exists()
 
 
 def test_the_closed_loop_is_inspected_there(arm_run):

@@ -162,7 +162,8 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
         short = {(sections[path.split(".")[0]], path.split(".")[1]): option for option, path in SHORT.items()}
         arguments = ["train", *expand(arguments[1:])]
     elif arguments[:1] in (["curve"], ["bench"]):
-        short = {(EvalConfig, name): f"--{name.replace('_', '-')}" for name in ("env", "env_kwargs", "num_envs")}
+        names = ("env", "env_kwargs", "num_envs", "success_key", "episodes")
+        short = {(EvalConfig, name): f"--{name.replace('_', '-')}" for name in names}
     registry = ConstructorRegistry()
     registry.struct_rule(partial(_described, short, []))
     return tyro.cli(kind, args=arguments, registry=registry, **({"prog": "koap"} | how))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -26,6 +26,11 @@ from torchrl_koap.vision.observer import STATE, Observer
 
 SUCCESS_KEYS = ("is_success", "success")
 _ROUNDING = 1e-6  # share of an action that float32 may put it beyond its box
+_LONGEST_PROBE = 1000  # steps in which a success key that was asked for must come
+
+
+class ObservationError(ValueError):
+    """An environment gives no observation, or one of another shape than its space, or with NaN or infinity."""
 
 
 class GymnasiumEpisode(gymnasium.Wrapper):
@@ -33,15 +38,24 @@ class GymnasiumEpisode(gymnasium.Wrapper):
 
     A vector environment therefore never resets it; ``index`` is its place there. ``info`` holds ``terminated``,
     ``truncated`` and ``over``; whether the step was ``played`` and its action ``clipped`` to the box; ``success``; and
-    as ``error`` what the environment raised in this step or at the reset, which truncates the episode.
+    as ``error`` what the environment raised in this step or at the reset, which truncates the episode. A wrong
+    observation (:class:`ObservationError`), whose columns have ``names``, is such an error.
 
     Success is what the entry ``success_key`` of the environment's ``info`` says, by default ``is_success`` or
     ``success`` where there is one, else an episode that terminates with a positive reward.
     """
 
-    def __init__(self, env: gymnasium.Env, index: int, *, max_steps: int, success_key: str | None = None):
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        index: int,
+        *,
+        max_steps: int,
+        success_key: str | None = None,
+        names: Sequence[str] = (),
+    ):
         super().__init__(env)
-        self.index, self.max_steps, self.success_key = index, max_steps, success_key
+        self.index, self.max_steps, self.success_key, self.names = index, max_steps, success_key, names
         self._last = create_zero_array(env.observation_space)
         self._error, self._steps, self._over, self._success = "", 0, True, False
 
@@ -50,7 +64,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         if options is None or options["begin"][self.index]:
             self._error, self._steps, self._over, self._success = "", 0, False, False
             try:
-                self._last = self.env.reset(seed=seed)[0]
+                self._take(_begin(self.env, seed))
             except Exception as error:  # told with the first step: an episode without a step has no outcome
                 self._error = _said(error)
         return self._last, {}
@@ -70,7 +84,8 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         terminated, truncated, reward = False, True, 0.0
         if not self._error:
             try:
-                self._last, given, terminated, truncated, info = self.env.step(inside)
+                seen, given, terminated, truncated, info = self.env.step(inside)
+                self._take(seen)
                 reward = float(given)
                 self._success |= self._succeeded(info, reward, bool(terminated))
             except Exception as error:  # the episode has failed, the others go on
@@ -84,6 +99,15 @@ class GymnasiumEpisode(gymnasium.Wrapper):
             "error": self._error,
         }
 
+    def _take(self, seen: Any) -> None:
+        _check_shape(seen, self._last)
+        for entry, values in _entries(seen):
+            for column in np.flatnonzero(~np.isfinite(values)):
+                said = "NaN" if np.isnan(np.ravel(values)[column]) else "infinite"
+                name = self.names[column] if self.names else entry
+                raise ObservationError(f"observation is {said} in column {column} ({name})")
+        self._last = seen
+
     def _succeeded(self, info: Mapping[str, Any], reward: float, terminated: bool) -> bool:
         found = success_entry(info, self.success_key)
         if found is None:
@@ -92,7 +116,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         return said.strip().lower() in ("true", "1") if isinstance(said, str) else bool(np.any(said))
 
 
-def success_entry(info: Mapping[str, Any], success_key: str | None) -> str | None:
+def success_entry(info: Container[str], success_key: str | None) -> str | None:
     """Returns the entry of ``info`` that says whether the task is done, None where there is none."""
     return next((key for key in (SUCCESS_KEYS if success_key is None else (success_key,)) if key in info), None)
 
@@ -117,7 +141,7 @@ class EpisodeRecord:
             found.append(f"{self.clipped} of {self.actions} actions left the environment's box and were clipped to it")
         if self.errors:
             said = some([f"seed {each['seed']}, step {each['step']}: {each['error']}" for each in self.errors])
-            found.append(f"{len(self.errors)} episodes failed because the environment raised an error: {said}")
+            found.append(f"{len(self.errors)} episodes failed by an error of the environment: {said}")
         return found
 
 
@@ -125,7 +149,8 @@ class GymnasiumBatch(EnvBase):
     """Environments of one Gymnasium id side by side; one whose episode is over waits for the others.
 
     ``success`` stays True from the step on in which it is reported (:class:`GymnasiumEpisode`). Actions are clipped to
-    the environment's box. An environment that raises an error ends its episode as failed (``failed``).
+    the environment's box. An environment that raises an error, or gives a wrong observation, ends its episode as failed
+    (``failed``).
 
     Observations and actions are those of the data: the task's ``origins`` are subtracted from what environments report
     and added to what they are told.
@@ -140,7 +165,7 @@ class GymnasiumBatch(EnvBase):
 
     Raises:
         ValueError: if there is no such environment, its observations or actions are no flat boxes of the task's
-            widths, or ``info`` of a first step has no such success key.
+            widths, or ``info`` has no such success key in a whole episode, of which 1,000 steps are tried.
     """
 
     def __init__(
@@ -163,8 +188,8 @@ class GymnasiumBatch(EnvBase):
         make = partial(gymnasium.make, env_id, **(env_kwargs or {}))
         try:
             first = make()
-        except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: an argument that it does not take
-            raise ValueError(f"environment {env_id!r} cannot be made: {error}") from error
+        except Exception as error:
+            raise ValueError(f"environment {env_id!r} cannot be made: {_said(error)}") from error
         try:
             if observe is None:
                 _check_box(env_id, "observation", first.observation_space, task.name, task.observation_dim)
@@ -176,7 +201,8 @@ class GymnasiumBatch(EnvBase):
         finally:
             first.close()
         self.max_steps = max_steps or self.own_limit or task.max_steps
-        options: dict[str, Any] = {"max_steps": self.max_steps, "success_key": success_key}
+        names = task.observation_names if observe is None else ()
+        options: dict[str, Any] = {"max_steps": self.max_steps, "success_key": success_key, "names": names}
         vector = partial(AsyncVectorEnv, context=_FORK) if processes else SyncVectorEnv
         episodes = [lambda index=index: GymnasiumEpisode(make(), index, **options) for index in range(num_envs)]
         self._env = vector(episodes, copy=False)
@@ -256,18 +282,46 @@ _FORK = "fork" if sys.platform == "linux" else None
 
 
 def _probe(env_id: str, env: gymnasium.Env, success_key: str | None) -> str | None:
-    """The entry of ``info`` of a first step that says whether the task is done, None where none does."""
+    """The entry of ``info`` that says whether the task is done, None where none of a first step does.
+
+    The one that was asked for may come as late as the end of an episode.
+    """
     space: Any = env.action_space
+    action = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
+    shapes, entries = create_zero_array(env.observation_space), set[str]()
     try:
-        env.reset(seed=0)
-        info = env.step(np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype))[-1]
+        _check_shape(_begin(env, seed=0), shapes)
+        for _ in range(1 if success_key is None else _LONGEST_PROBE):
+            seen, _, terminated, truncated, info = env.step(action)
+            _check_shape(seen, shapes)
+            entries |= set(info)
+            if terminated or truncated or success_entry(entries, success_key):
+                break
+    except ObservationError as error:
+        raise ValueError(f"environment {env_id!r}: {error}") from error
     except Exception:  # the episodes tell
         return success_key
-    found = success_entry(info, success_key)
+    found = success_entry(entries, success_key)
     if found is None and success_key is not None:
-        has = ", ".join(sorted(map(str, info))) or "nothing"
+        has = ", ".join(sorted(map(str, entries))) or "nothing"
         raise ValueError(f"info of environment {env_id!r} has no {success_key!r}, it has {has}")
     return found
+
+
+def _begin(env: gymnasium.Env, seed: int | None) -> Any:
+    """The first observation of an episode."""
+    given: Any = env.reset(seed=seed)
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise ObservationError(f"reset() must return an observation and an info, got {type(given).__name__}")
+    return given[0]
+
+
+def _check_shape(seen: Any, wanted: Any) -> None:
+    found = dict(_entries(seen))
+    for entry, values in _entries(wanted):
+        shape, name = np.shape(found.get(entry)), f" {entry!r}" if isinstance(wanted, Mapping) else ""
+        if shape != np.shape(values):
+            raise ObservationError(f"observation{name} has shape {shape}, wanted {np.shape(values)}")
 
 
 def _entries(observation: Any, name: str = "pixels") -> Iterator[tuple[str, Any]]:

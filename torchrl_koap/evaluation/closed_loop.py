@@ -67,16 +67,17 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     config = EvalConfig() if config is None else config
     check_options(config)
     set_up_torch(config.threads, config.device)
-    trained = Trained.load(writable_folder(run, config.out), plugins=config.plugins)
-    directory, task = RunDirectory(trained.folder), trained.task
+    trained = Trained.load(run, plugins=config.plugins)
+    task = trained.task
     if task.env is None and config.env is None:
-        return _judge_offline(trained, config)
+        return _judge_offline(run, trained, config)
     if config.execution.strategy == "oracle" and config.env is not None:
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = find_environment(task, config, Observer.of(task, trained.cameras))
     errors, actions = evaluate_actions(trained, config.dataset)
+    directory = RunDirectory(writable_folder(run, config.out))  # a refused call copies nothing
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
@@ -99,9 +100,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.env is None:
         result = task_scores(task, result, episodes, where.numbers)
     rows = result.pop("episode")
+    result |= errors | limited_commands(policy)  # of the rollouts alone: what is timed next counts too
     timed = trained.policy().to(config.device) if policy.execution.strategy == "oracle" else policy
     result |= measure_latency(timed, task.observation_dim)
-    result |= errors | limited_commands(policy) | {"execution": to_json(policy.execution), "episode": rows}
+    result |= {"execution": to_json(policy.execution), "episode": rows}
     result |= where.facts
     if where.record is not None:
         result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
@@ -125,16 +127,17 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     return result
 
 
-def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
+def _judge_offline(run: str | Path, trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, config)  # refuses what has no meaning
     policy = trained_policy(trained, config.execution)
     result, actions = evaluate_offline(trained, config)
+    directory = RunDirectory(writable_folder(run, config.out))
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
     result |= {"seed": config.seed, "execution": to_json(policy.execution)}
     if actions:
-        save_tensors(trained.folder / "actions.safetensors", actions)
-    RunDirectory(trained.folder).write_json("eval.json", result)
+        save_tensors(directory.path / "actions.safetensors", actions)
+    directory.write_json("eval.json", result)
     return result
 
 
