@@ -154,6 +154,7 @@ def _with_columns(
             observation_units=(task.observation_units or ("",) * task.observation_dim) + ("",) * sum(further.values()),
             state={**task.state, **dict.fromkeys(further, "plain")} if task.state else {},
             robot=task.robot or tuple(range(task.state_dim)),
+            defaults=replace(task.defaults, recovery=0.0),  # pictures show the robot where it was
         )
     own = {name: part.stop - part.start for name, part in task.observation.items() if name not in embedded}
     if sum(own.values()) != recordings.states[0].shape[1]:
