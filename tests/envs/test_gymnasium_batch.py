@@ -12,7 +12,8 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from toy_gym import NAMES, Breaks, Reach, Seen
 
-from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch, GymnasiumEpisode
+from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
+from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, load_backbone
 from torchrl_koap.vision.backbones import MEAN, STD

@@ -1,0 +1,164 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""One episode of an environment of Gymnasium: what it gives is checked, and its errors end it alone."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.wrappers.utils import create_zero_array
+
+SUCCESS_KEYS = ("is_success", "success")
+_ROUNDING = 1e-6  # share of an action that float32 may put it beyond its box
+_LONGEST_PROBE = 1000  # steps in which a success key that was asked for must come
+
+
+class ObservationError(ValueError):
+    """An environment gives no observation, or one of another shape than its space, or with NaN or infinity."""
+
+
+class GymnasiumEpisode(gymnasium.Wrapper):
+    """Plays one episode of an environment after each reset, then repeats its last observation.
+
+    A vector environment therefore never resets it; ``index`` is its place there. ``info`` holds ``terminated``,
+    ``truncated`` and ``over``; whether the step was ``played`` and its action ``clipped`` to the box; ``success``; and
+    as ``error`` what the environment raised in this step or at the reset, which truncates the episode. A wrong
+    observation (:class:`ObservationError`), whose columns have ``names``, is such an error.
+
+    Success is what the entry ``success_key`` of the environment's ``info`` says, by default ``is_success`` or
+    ``success`` where there is one, else an episode that terminates with a positive reward.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        index: int,
+        *,
+        max_steps: int,
+        success_key: str | None = None,
+        names: Sequence[str] = (),
+    ):
+        super().__init__(env)
+        self.index, self.max_steps, self.success_key, self.names = index, max_steps, success_key, names
+        self._last = create_zero_array(env.observation_space)
+        self._error, self._steps, self._over, self._success = "", 0, True, False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode, unless ``options["begin"]``, a bool for each environment, says otherwise."""
+        if options is None or options["begin"][self.index]:
+            self._error, self._steps, self._over, self._success = "", 0, False, False
+            try:
+                self._take(_begin(self.env, seed))
+            except Exception as error:  # told with the first step: an episode without a step has no outcome
+                self._error = say(error)
+        return self._last, {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Plays a step, if the episode is not over; its ends are told in ``info`` alone."""
+        told = {"played": not self._over, "clipped": False, "terminated": False, "truncated": self._over, "error": ""}
+        reward = 0.0
+        if not self._over:
+            reward, ends = self._play(action)
+            told |= ends
+        return self._last, reward, False, False, told | {"over": self._over, "success": self._success}
+
+    def _play(self, action: np.ndarray) -> tuple[float, dict[str, Any]]:
+        space: Any = self.env.action_space
+        inside = np.clip(action, space.low, space.high).astype(space.dtype)
+        terminated, truncated, reward = False, True, 0.0
+        if not self._error:
+            try:
+                seen, given, terminated, truncated, info = self.env.step(inside)
+                self._take(seen)
+                reward = float(given)
+                self._success |= self._succeeded(info, reward, bool(terminated))
+            except Exception as error:  # the episode has failed, the others go on
+                self._error, terminated, truncated = say(error), False, True
+        self._steps += 1
+        self._over = bool(terminated or truncated or self._steps >= self.max_steps)
+        return reward, {
+            "clipped": not np.allclose(inside, action, rtol=_ROUNDING, atol=_ROUNDING),
+            "terminated": bool(terminated),
+            "truncated": self._over and not terminated,
+            "error": self._error,
+        }
+
+    def _take(self, seen: Any) -> None:
+        _check_shape(seen, self._last)
+        for entry, values in entries_of(seen):
+            for column in np.flatnonzero(~np.isfinite(values)):
+                said = "NaN" if np.isnan(np.ravel(values)[column]) else "infinite"
+                name = self.names[column] if self.names else entry
+                raise ObservationError(f"observation is {said} in column {column} ({name})")
+        self._last = seen
+
+    def _succeeded(self, info: Mapping[str, Any], reward: float, terminated: bool) -> bool:
+        found = success_entry(info, self.success_key)
+        if found is None:
+            return self.success_key is None and terminated and reward > 0
+        said = info[found]
+        return said.strip().lower() in ("true", "1") if isinstance(said, str) else bool(np.any(said))
+
+
+def success_entry(info: Container[str], success_key: str | None) -> str | None:
+    """Returns the entry of ``info`` that says whether the task is done, None where there is none."""
+    return next((key for key in (SUCCESS_KEYS if success_key is None else (success_key,)) if key in info), None)
+
+
+def say(error: Exception) -> str:
+    """What an error says, in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def find_success_key(env_id: str, env: gymnasium.Env, success_key: str | None) -> str | None:
+    """The entry of ``info`` that says whether the task is done, None where none of a first step does.
+
+    The one that was asked for may come as late as the end of an episode.
+    """
+    space: Any = env.action_space
+    action = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
+    shapes, entries = create_zero_array(env.observation_space), set[str]()
+    try:
+        _check_shape(_begin(env, seed=0), shapes)
+        for _ in range(1 if success_key is None else _LONGEST_PROBE):
+            seen, _, terminated, truncated, info = env.step(action)
+            _check_shape(seen, shapes)
+            entries |= set(info)
+            if terminated or truncated or success_entry(entries, success_key):
+                break
+    except ObservationError as error:
+        raise ValueError(f"environment {env_id!r}: {error}") from error
+    except Exception:  # the episodes tell
+        return success_key
+    found = success_entry(entries, success_key)
+    if found is None and success_key is not None:
+        has = ", ".join(sorted(map(str, entries))) or "nothing"
+        raise ValueError(f"info of environment {env_id!r} has no {success_key!r}, it has {has}")
+    return found
+
+
+def _begin(env: gymnasium.Env, seed: int | None) -> Any:
+    """The first observation of an episode."""
+    given: Any = env.reset(seed=seed)
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise ObservationError(f"reset() must return an observation and an info, got {type(given).__name__}")
+    return given[0]
+
+
+def _check_shape(seen: Any, wanted: Any) -> None:
+    found = dict(entries_of(seen))
+    for entry, values in entries_of(wanted):
+        shape, name = np.shape(found.get(entry)), f" {entry!r}" if isinstance(wanted, Mapping) else ""
+        if shape != np.shape(values):
+            raise ObservationError(f"observation{name} has shape {shape}, wanted {np.shape(values)}")
+
+
+def entries_of(observation: Any, name: str = "pixels") -> Iterator[tuple[str, Any]]:
+    """Entries of a dictionary in dictionaries by the name of the innermost."""
+    if isinstance(observation, Mapping):
+        for inner, value in observation.items():
+            yield from entries_of(value, inner)
+    else:
+        yield name, observation
