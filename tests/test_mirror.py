@@ -14,6 +14,7 @@ COVERED_BY = {
     "commands/run_commands.py": "commands/test_eval.py",
     "commands/subcommands.py": "commands/test_cli.py",
     "envs/experts/push_planning.py": "envs/experts/test_aligning.py",
+    "envs/gymnasium_episode.py": "envs/test_gymnasium_batch.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
     "envs/experts/sorting_decision.py": "envs/experts/test_sorting.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",

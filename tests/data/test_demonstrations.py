@@ -19,7 +19,7 @@ from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training import TrainConfig
-from torchrl_koap.training.closed_form import axes_of
+from torchrl_koap.training.closed_form import action_facts
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.policy_facts import command_ranges, commanded_columns
 
@@ -80,7 +80,10 @@ def test_raw_actions_are_about_no_column():
     data, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="raw", robot=[0, 1], command=[2, 3])
     assert {(action.kind, action.column) for action in task.actions.values()} == {("raw", None)}
     assert not task.targets and not task.delta_actions and task.action_rule is None
-    assert axes_of(task, (0, 1)) == {"axes": [], "guessed": True} and commanded_columns(task) is None
+    assert action_facts(task, (0, 1)) == {"axes": [], "guessed": True, "alike": False}
+    assert commanded_columns(task) is None
+    _, mixed = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=["delta", "raw"], robot=[0, 1])
+    assert action_facts(mixed, (0, 1))["alike"]
     assert resolve(TrainConfig(out="run"), task).controller.preset == "absolute"  # centred, read off the present frame
     labels = data["action"][data["has_action"].squeeze(-1)]
     assert command_ranges(task, data) == [[float(x.min()), float(x.max())] for x in labels.T]

@@ -24,6 +24,11 @@ TASK = Task(
 PUSH = 0.1
 
 
+def registered():
+    """The class that is made: a test of plugins may have registered it anew."""
+    return gymnasium.spec("ToyReach-v0").entry_point
+
+
 def run(env, steps, seeds=None):
     if seeds is not None:
         env.seed_episodes(seeds)
@@ -147,19 +152,19 @@ def test_refusals():
 
 
 def test_an_environment_that_cannot_be_made_is_named_with_any_error(monkeypatch):
-    monkeypatch.setattr(Reach, "__init__", lambda env, key: env.robot)
+    monkeypatch.setattr(registered(), "__init__", lambda env, key: env.robot)
     with pytest.raises(ValueError, match="^environment 'ToyReach-v0' cannot be made: AttributeError: 'Reach' object"):
         GymnasiumBatch("ToyReach-v0", TASK)
 
 
 def test_a_success_key_may_come_with_the_end_of_an_episode(monkeypatch):
-    step = Reach.step
+    step = registered().step
 
     def late(env, action):
         *others, truncated, _ = step(env, action)
         return *others, truncated, {"arrived": True, "time": 6.0} if truncated else {"power": 1.0}
 
-    monkeypatch.setattr(Reach, "step", late)
+    monkeypatch.setattr(registered(), "step", late)
     env = GymnasiumBatch("ToyReach-v0", TASK, success_key="arrived")
     assert env.success_key == "arrived" and run(env, 6)["success"].flatten().tolist() == [False] * 5 + [True]
     with pytest.raises(ValueError, match="info of env.* 'ToyReach-v0' has no 'won', it has arrived, power, time$"):
@@ -167,11 +172,11 @@ def test_a_success_key_may_come_with_the_end_of_an_episode(monkeypatch):
 
 
 def test_a_wrong_first_observation_is_refused(monkeypatch):
-    reset = Reach.reset
-    monkeypatch.setattr(Reach, "reset", lambda env, **options: reset(env, **options)[0])
+    reset = registered().reset
+    monkeypatch.setattr(registered(), "reset", lambda env, **options: reset(env, **options)[0])
     with pytest.raises(ValueError, match=r"^environment 'ToyReach-v0': reset\(\) must return .* info, got ndarray$"):
         GymnasiumBatch("ToyReach-v0", TASK)
-    monkeypatch.setattr(Reach, "reset", lambda env, **options: (np.zeros(5), {}))
+    monkeypatch.setattr(registered(), "reset", lambda env, **options: (np.zeros(5), {}))
     with pytest.raises(ValueError, match=r"^environment 'ToyReach-v0': observation has shape \(5,\), wanted \(4,\)$"):
         GymnasiumBatch("ToyReach-v0", TASK)
 
@@ -209,9 +214,9 @@ def test_errors_and_clipped_actions_are_recorded_and_the_others_go_on():
 )
 @pytest.mark.parametrize("at", [0, 2])
 def test_a_wrong_observation_fails_its_episode_and_the_others_go_on(seen, said, at, monkeypatch):
-    observe = Reach._observe
+    observe = registered()._observe
     spoilt = lambda env: env.time == at and env.np_random_seed == 11  # noqa: E731
-    monkeypatch.setattr(Reach, "_observe", lambda env: np.array(seen, float) if spoilt(env) else observe(env))
+    monkeypatch.setattr(registered(), "_observe", lambda env: np.array(seen, float) if spoilt(env) else observe(env))
     record = EpisodeRecord()
     rollout = run(GymnasiumBatch("ToyReach-v0", TASK, 3, record=record), 6, [10, 11, 12])
     step = max(at, 1)  # an error of a reset is told with the first step
