@@ -74,7 +74,7 @@ class ExecutionConfig:
     Attributes:
         strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (the simulator's own
             inverse map, which takes the tool where the plan says: what fails then is the planner's).
-        replan_interval: control steps per plan.
+        replan_interval: control steps per plan; with feedback by default those of 0.1 s, at least 4 and at most 10.
         blend: share of the distance between robot and plan that remains after each step; 0: plans as they are.
         lead: farthest that the command may be ahead of the robot along each axis, in the units of the actions; 0: any
             distance.
