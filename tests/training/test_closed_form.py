@@ -74,6 +74,23 @@ def test_no_penalty_is_below_that_of_the_errors_of_plans(fits, method):
     assert all(min(fit.errors) == pytest.approx(INPUT_NOISE * report["labels_used"]) for *_, fit in fits)
 
 
+@pytest.mark.parametrize("method", ["koap", "linear", "pca"])
+def test_actions_that_are_not_alike_have_a_penalty_each(monkeypatch, method):
+    asked = []
+
+    def noted(*args, alike, **options):
+        asked.append(alike)
+        return ridge(*args, alike=alike, **options)
+
+    for module in ("koopman.inverse_dynamics", "baselines.regression"):
+        monkeypatch.setattr(f"torchrl_koap.modules.{module}.ridge", noted)
+    controller = controller_of(method, numbered())
+    for alike in (True, False):
+        asked.clear()
+        fit_closed_form(controller, numbered(), alike=alike)
+        assert set(asked) == {alike}
+
+
 @pytest.mark.parametrize(("preset", "through_zero"), [("default", True), ("paper", False)])
 def test_no_motion_decodes_to_no_action_only_where_zero_is_zero(preset, through_zero):
     """With actions normalised by their root mean square, a bias would be an action out of nothing."""
