@@ -88,7 +88,9 @@ class GymnasiumEpisode(gymnasium.Wrapper):
     def _take(self, seen: Any) -> None:
         _check_shape(seen, self._last)
         for entry, values in entries_of(seen):
-            for column in np.flatnonzero(~np.isfinite(values)):
+            wrong = np.flatnonzero(~np.isfinite(values))
+            if len(wrong):
+                column = wrong[0]
                 said = "NaN" if np.isnan(np.ravel(values)[column]) else "infinite"
                 name = self.names[column] if self.names else entry
                 raise ObservationError(f"observation is {said} in column {column} ({name})")

@@ -138,12 +138,12 @@ def ridge(
     shrinks = torch.stack([singular.square() / (singular.square() + penalty * unit) for penalty in tried])
     squares = held_out_errors(left, shrinks, target, groups, centred=bias)
     errors = dict(zip(tried, squares.mean(-1).sqrt().tolist(), strict=True))
-    best = min(errors, key=errors.get)
-    each = squares.mean(-1).argmin().expand(y.shape[-1]) if alike else squares.argmin(0)
+    best = squares.mean(-1).argmin()
+    each = best.expand(y.shape[-1]) if alike else squares.argmin(0)
     own = singular.new_tensor(tried)[each]
     weight = right.mT @ (singular[:, None] / (singular.square()[:, None] + own * unit) * projected)  # [m, act]
     error = float(squares.gather(0, each[None]).mean().sqrt())
-    return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, best, errors, error, len(x))
+    return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
 
 
 def shared_filter(steps: Tensor, action: Tensor) -> Tensor:

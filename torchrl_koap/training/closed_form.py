@@ -36,11 +36,11 @@ def action_facts(task: Task, columns: Sequence[int]) -> dict[str, Any]:
     ``axes`` are empty where nothing is known or likely; ``guessed`` tells a likely one from a known one. Actions are
     ``alike`` unless all are raw.
     """
+    axes = list(task.moved_columns())
+    guessed = not axes
+    if guessed:
+        moved = task.targets or (task.robot if task.delta_actions else ())
+        if task.env is None and len(moved) == task.action_dim and set(moved) <= set(columns):
+            axes = [list(columns).index(column) for column in moved]
     alike = any(action.kind != "raw" for action in task.actions.values())
-    known = task.moved_columns()
-    if known:
-        return {"axes": list(known), "guessed": False, "alike": alike}
-    moved = task.targets or (task.robot if task.delta_actions else ())
-    if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
-        moved = ()
-    return {"axes": [list(columns).index(column) for column in moved], "guessed": True, "alike": alike}
+    return {"axes": axes, "guessed": guessed, "alike": alike}

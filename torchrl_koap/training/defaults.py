@@ -123,11 +123,10 @@ def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionC
                 " executes chunks of them: there is no plan to follow"
             )
         own["strategy"] = "open_loop"
-    filled = Execution().replaced(**own).replaced(**method.execution)
-    if asked.on(filled).strategy == "feedback" and "replan_interval" not in own | dict(method.execution):
-        interval = min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), MOST_FOLLOWED)
-        filled = filled.replaced(replan_interval=interval)
-    return ExecutionConfig(**vars(asked.on(filled)))
+    own |= method.execution
+    if asked.on(Execution().replaced(**own)).strategy == "feedback":
+        own = {"replan_interval": min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), MOST_FOLLOWED)} | own
+    return ExecutionConfig(**vars(asked.on(Execution().replaced(**own))))
 
 
 def _filled(asked: Section, *layers: Mapping[str, Any]) -> Section:

@@ -74,6 +74,7 @@ def learn_planner(
     planner.fit_normalizers(windows[:, unseen:])
     planner.to(config.run.device)
     augment = augmentation(task, windows)
+    del windows  # as large as the data many times over
     buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
     def draw() -> TensorDictBase:
