@@ -14,7 +14,7 @@ from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_weights
 from torchrl_koap.training import loop as loop_file
-from torchrl_koap.training.loop import SETTLED, DivergedError, limit_outlier, train_phase, warmup_cosine
+from torchrl_koap.training.loop import SETTLED, DivergedError, OutlierLimit, moving_average, train_phase, warmup_cosine
 
 
 class Interrupt(KeyboardInterrupt):
@@ -291,19 +291,49 @@ def test_a_single_batch_does_not_undo_a_training(monkeypatch):
     monkeypatch.setattr(loop_file, "warmup_cosine", lambda step, num_steps, warmup: min(1.0, (step + 1) / warmup))
     spoiled, untouched = trained(batches(poison_at=150), 160), trained(batches(), 160)
     assert error(spoiled) < 1.5 * error(untouched)
-    monkeypatch.setattr(loop_file, "limit_outlier", lambda optimizer: None)
+    monkeypatch.setattr(loop_file, "TIMES", math.inf)
     assert error(trained(batches(poison_at=150), 160)) > 2 * error(untouched)
 
 
-def test_it_waits_until_there_is_something_to_compare_with():
-    x = nn.Parameter(torch.zeros(1))
-    optimizer = torch.optim.AdamW([x], lr=1e-3)
+def test_a_gradient_far_longer_than_those_before_is_shortened():
+    x = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    limit = OutlierLimit([x], decay=0.9)
     for update in range(SETTLED):
-        x.grad = torch.ones(1)
-        assert limit_outlier(optimizer) is None, update
-        optimizer.step()
-    x.grad = torch.zeros(1)
-    assert limit_outlier(optimizer).item() == 1.0
-    x.grad = torch.full((1,), torch.nan)
-    limit_outlier(optimizer)
+        x.grad = torch.full_like(x, 30.0 if update == 0 else -3.0)
+        assert limit().item() == 1.0, update
+    x.grad = torch.full_like(x, 60.0)
+    assert limit().item() == pytest.approx(15 / 60, rel=1e-3)
+    assert x.grad.item() == pytest.approx(15.0, rel=1e-3)
+    assert limit.mean_square.item() == pytest.approx(0.9 * 9 + 0.1 * 15**2, rel=1e-3)
+    x.grad = torch.zeros(1, dtype=torch.float64)
+    assert limit().item() == 1.0
+    x.grad = torch.full_like(x, torch.nan)
+    limit()
     assert x.grad.isnan().all()  # the loop tells of it
+
+
+@pytest.mark.parametrize("updates, averaged", [(8, [4, 8]), (6, [4, 6]), (1, [1])])
+def test_the_average_is_stepped_every_fourth_update_and_at_the_end(updates, averaged):
+    class Average:
+        def __init__(self):
+            self.seen = []
+
+        def step(self):
+            self.seen.append(len(drawn))
+
+    drawn, average = [], Average()
+    train_phase(
+        "x",
+        Quadratic(),
+        lambda: drawn.append(1) or constant()(),
+        num_steps=updates,
+        learning_rate=0.1,
+        target_update=average,
+    )
+    assert average.seen == averaged
+
+
+def test_four_updates_weigh_as_much_as_ever():
+    module = Planner().loss
+    assert moving_average(module, 90).eps == pytest.approx(0.9**4)
+    assert moving_average(module, 10**6).eps == pytest.approx(0.998**4)

@@ -7,7 +7,7 @@ import contextlib
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,8 @@ from torchrl_koap.training.checkpoints import load_training_state, save_training
 
 CHECKPOINT_EVERY = 500
 TIMES = 5.0  # lengths of mini-batch gradients vary by a factor of two or so about their mean square
-SETTLED = 100  # updates before which the second moment says little
+SETTLED = 100  # updates before which their mean says little
+AVERAGE_EVERY = 4  # updates between two steps of the average: each reads and writes every weight
 
 
 def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
@@ -34,11 +35,11 @@ def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
 
 
 def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
-    """The average of a loss's ``target_*_params`` that is used after training, to be stepped after every update.
+    """The average of a loss's ``target_*_params`` that is used after training, for :func:`train_phase` to step.
 
-    Its memory is a share of a short training: the decay is ``1 - 10 / (num_steps + 10)``, at most 0.998.
+    Its memory is a share of a short training: the decay per update is ``1 - 10 / (num_steps + 10)``, at most 0.998.
     """
-    return SoftUpdate(loss_module, eps=min(0.998, 1 - 10 / (num_steps + 10)))
+    return SoftUpdate(loss_module, eps=min(0.998, 1 - 10 / (num_steps + 10)) ** AVERAGE_EVERY)
 
 
 class DivergedError(RuntimeError):
@@ -67,7 +68,7 @@ def train_phase(
     """Minimises the sum of all ``loss_*`` entries of a TorchRL ``LossModule`` with AdamW, in ``num_steps`` updates.
 
     The rate is that of :func:`warmup_cosine`, and a gradient far longer than those before it is shortened
-    (:func:`limit_outlier`). ``target_update`` is stepped after every update; ``best`` scores the averages, keeps good
+    (:class:`OutlierLimit`). ``target_update`` is stepped every fourth update; ``best`` scores the averages, keeps good
     ones and ends the training early. ``sample`` returns a batch, by torch's global generator. ``run``, ``logger`` and
     ``resume`` are as of :class:`Phases`: on a CPU a training goes on bit for bit. ``replay`` records an update once as
     a CUDA graph: the loss must take the same path for every batch, as denoising losses do. ``progress`` is called with
@@ -91,7 +92,8 @@ def train_phase(
         loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True, capturable=replay
     )
     checkpoint = None if run is None else run.path / "checkpoints" / f"{phase}.safetensors"
-    state = nn.ModuleDict({"loss": loss_module} if best is None else {"loss": loss_module, "best": best})
+    limit = OutlierLimit(loss_module.parameters(), decay=optimizer.param_groups[0]["betas"][1]).to(device)
+    state = nn.ModuleDict({"loss": loss_module, "limit": limit} | ({} if best is None else {"best": best}))
     start = 0
     if resume and checkpoint is not None:
         if checkpoint.exists():
@@ -106,11 +108,9 @@ def train_phase(
         losses = loss_module(batch)
         terms = losses.select(*(key for key in losses.keys() if key.startswith("loss_")))
         sum(terms.values()).backward()
-        limit_outlier(optimizer)
+        limit()
         optimizer.step()
         optimizer.zero_grad()
-        if target_update is not None:
-            target_update.step()
         return terms.detach()
 
     if replay:
@@ -129,6 +129,8 @@ def train_phase(
             terms = update(sample())
 
         done = step + 1
+        if target_update is not None and (done % AVERAGE_EVERY == 0 or done == num_steps):
+            target_update.step()
         scored = best is not None and (done % best.every == 0 or done == num_steps)
         scores = {} if best is None else best.check(done) if scored else best.kept()
         if scored or done % log_every == 0 or done == num_steps:
@@ -191,8 +193,7 @@ def _interrupts_let_through() -> Iterator[None]:
         raise
 
 
-@torch.no_grad()
-def limit_outlier(optimizer: torch.optim.AdamW) -> Tensor | None:
+class OutlierLimit(nn.Module):
     """Shortens the gradient to five times the root mean square length of earlier ones, where it is longer.
 
     Where gradients have become short, so has the second moment that AdamW divides by. One that is several times as long
@@ -201,25 +202,33 @@ def limit_outlier(optimizer: torch.optim.AdamW) -> Tensor | None:
     update by the same comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a
     training without outliers is not touched.
 
-    Call it between ``backward`` and ``step``. What is typical is read off the optimizer's second moment, so that a
-    training that is resumed goes on the same. Returns the factor ``[]`` that the gradient was multiplied by, 1 for any
-    ordinary one; None while the optimizer has seen too few.
+    Call it between ``backward`` and the optimiser's step. Its state dict goes into checkpoints, so that a training that
+    is resumed goes on the same.
+
+    Args:
+        parameters (iterable): what is trained.
+        decay (float): of the mean of squared lengths: the optimiser's second beta.
     """
-    group = optimizer.param_groups[0]
-    parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
-    states = [optimizer.state[parameter] for parameter in parameters if "step" in optimizer.state[parameter]]
-    if len(states) < len(parameters) or not states:
-        return None
-    updates = states[0]["step"]
-    if not updates.is_cuda and updates < SETTLED:
-        return None
-    gradients = [parameter.grad for parameter in parameters]
-    length = torch.nn.utils.get_total_norm(gradients)
-    moment = torch.stack([state["exp_avg_sq"].sum() for state in states]).sum()
-    share = 1 - group["betas"][1] ** updates.double()
-    typical = (moment / share.to(moment.dtype)).sqrt()
-    factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or one that is not finite
-    factor = torch.where(updates < SETTLED, 1.0, factor)  # not read on a GPU, which would have to be waited for
-    if factor.is_cuda or factor < 1:
-        torch._foreach_mul_(gradients, factor)
-    return factor
+
+    mean_square: Tensor
+    seen: Tensor
+
+    def __init__(self, parameters: Iterable[nn.Parameter], decay: float):
+        super().__init__()
+        self._trained, self.decay = tuple(parameters), decay
+        self.register_buffer("mean_square", torch.zeros([], dtype=torch.float64))
+        self.register_buffer("seen", torch.zeros([], dtype=torch.float64))
+
+    @torch.no_grad()
+    def forward(self) -> Tensor:
+        """Returns the factor ``[]`` that the gradient was multiplied by: 1 for any ordinary one, and the first 100."""
+        gradients = [each.grad for each in self._trained if each.grad is not None]
+        length = torch.nn.utils.get_total_norm(gradients)
+        typical = (self.mean_square / (1 - self.decay**self.seen)).sqrt()
+        factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or not finite
+        factor = torch.where(self.seen < SETTLED, 1.0, factor).to(length)
+        if factor.is_cuda or factor < 1:  # not read on a GPU, which would have to be waited for
+            torch._foreach_mul_(gradients, factor)
+        self.mean_square.lerp_((factor * length).square().to(self.mean_square), 1 - self.decay)
+        self.seen += 1
+        return factor
