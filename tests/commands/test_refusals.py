@@ -56,6 +56,13 @@ def test_an_earlier_run_is_not_touched(words, message, copied_run, demonstration
     assert contents(copied_run) == before
 
 
+@pytest.mark.parametrize("command", ["eval", "inspect"])
+@pytest.mark.parametrize("wrong", [("--env", "Nowhere-v0"), ("--dataset", "nowhere")])
+def test_a_wrong_call_leaves_no_copy_of_a_run(command, wrong, copied_run, tmp_path, capsys):
+    fails(capsys, command, copied_run, "--out", tmp_path / "copy", *wrong)
+    assert not (tmp_path / "copy").exists()
+
+
 def full_disk(*arguments, **options):
     raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -337,3 +337,4 @@ def test_four_updates_weigh_as_much_as_ever():
     module = Planner().loss
     assert moving_average(module, 90).eps == pytest.approx(0.9**4)
     assert moving_average(module, 10**6).eps == pytest.approx(0.998**4)
+    assert moving_average(module, 2).eps == 0.5

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.evaluation.closed_loop import find_environment
+from torchrl_koap.evaluation.closed_loop import RolloutEnvironment, find_environment
 from torchrl_koap.evaluation.config import EvalConfig, check_options
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
@@ -82,28 +82,30 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
             f"task {task.name!r} has no environment to make experiments in: name one with --env, or --latent-only looks"
             " into the latent space alone; `koap eval` judges plans and actions on recorded data"
         )
-    directory = RunDirectory(writable_folder(run, config.out))
-    data = trained.data(config.dataset)
-    if config.latent_only:  # what earlier experiments found stays
-        result = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
-    elif trained.planner is None:
+    if trained.planner is None and not config.latent_only:
         method = trained.config.method
         raise ValueError(f"method {method!r} samples actions: it has no planner and controller to compare")
-    else:
-        result = _experiments(config, trained, data)
+    data = trained.data(config.dataset)
+    where = None if config.latent_only else find_environment(task, config, Observer.of(task, trained.cameras))
+    directory = RunDirectory(writable_folder(run, config.out))  # a wrong call leaves no copy
+    if where is not None:
+        result = _experiments(config, trained, data, where)
+    else:  # what earlier experiments found stays
+        result = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
     result["latent"] = _look_into(config, trained, data)
     result["findings"] = describe_inspection(result, task)
     directory.write_json("inspect.json", result)
     return result
 
 
-def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:
+def _experiments(
+    config: InspectConfig, trained: Trained, data: TensorDictBase, where: RolloutEnvironment
+) -> dict[str, Any]:
     task = trained.task
     planner = trained.planner.to(config.device)
     policy = trained_policy(trained, config.execution).to(config.device)
     interval = policy.execution.replan_interval
     seeds = list(range(config.seed, config.seed + config.episodes))
-    where = find_environment(task, config, Observer.of(task, trained.cameras))
     found: dict[str, Any] = {} if config.env is None else {"env": config.env}
     at_once = config.num_envs or config.batch_size
     options = {"max_steps": where.max_steps, "contexts": where.contexts, "batch_size": at_once}

@@ -39,7 +39,8 @@ def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
 
     Its memory is a share of a short training: the decay per update is ``1 - 10 / (num_steps + 10)``, at most 0.998.
     """
-    return SoftUpdate(loss_module, eps=min(0.998, 1 - 10 / (num_steps + 10)) ** AVERAGE_EVERY)
+    decay = min(0.998, 1 - 10 / (num_steps + 10))
+    return SoftUpdate(loss_module, eps=max(0.5, decay**AVERAGE_EVERY))  # of less it warns
 
 
 class DivergedError(RuntimeError):
