@@ -25,8 +25,8 @@ def rows_of(config=None, **summary):
 def test_a_training_in_five_rows():
     assert rows_of() == {
         "labels": "20 of 40 steps; in 1 of 2 recordings",
-        "planner": "500 updates in 22 s; kept update 500, with plan error 0.263 on held-out recordings"
-        " (standing still: 1)",
+        "planner": "500 updates in 22 s; kept update 500, with plan score 0.263 on held-out recordings"
+        " (smaller is better)",
         "training ended": "with its last update; still improving: train again with --steps 1000",
         "controller": "koap, 500 updates in 11 s; fitted to 18 labels",
     }

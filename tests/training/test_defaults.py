@@ -128,7 +128,7 @@ class TestExecution:
             config = TrainConfig(out="run", method=method, execution=ExecutionConfig(**asked))
             return resolve(config, task).execution.on(Execution())
 
-        assert execution(task) == Execution(temperature=0.7) != execution(get_task("avoiding")) == Execution()
+        assert execution(task) == Execution(temperature=0.4) != execution(get_task("avoiding")) == Execution()
         fast = replace(task, control_hz=100)
         assert execution(fast).replan_interval == 10 and execution(fast, replan_interval=3).replan_interval == 3
         assert execution(task, temperature=0.2).temperature == 0.2 and execution(task, "koap_paper").temperature == 1.0

@@ -9,9 +9,11 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap import PlannerConfig, fit, make_demonstrations
+from torchrl_koap.data import cut_windows, flatten_trajectories, select_state
+from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import planner as planner_file
-from torchrl_koap.training.planner import augmentation, check_interval, column_weights
+from torchrl_koap.training.planner import augmentation, check_interval, column_weights, plan_score
 
 
 @pytest.mark.parametrize(("steps", "batch_size", "every"), [(20_000, 512, 500), (4000, 256, 134), (100, 64, 100)])
@@ -20,6 +22,34 @@ def test_scores_take_a_twentieth_of_the_training(steps, batch_size, every):
     assert check_interval(section, solver_steps=10) == every
     forward_passes = 128 * 4 * 10 / every, 3 * batch_size
     assert every == steps or forward_passes[0] <= 0.05 * forward_passes[1]
+
+
+def test_plans_between_recorded_ways_score_worse_than_their_error_says(monkeypatch):
+    """Two ways part; the one held out is near the left one, and a plan in the middle is in nobody's recordings."""
+
+    def way(side):
+        along = torch.linspace(0, 1.5, 40).sin()
+        return torch.stack([along, side * along], -1)
+
+    task = make_demonstrations([way(1).numpy()] * 2, [np.zeros((39, 2))] * 2, control_hz=10)[1]
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
+    known, unseen = (
+        select_state(flatten_trajectories(list(map(way, s)), None, action_dim=2), range(2)) for s in ([-1, 1], [-0.9])
+    )
+    score = plan_score(planner, unseen, cut_windows(known, 16, select=["state"], pad_before=1)["state"], task)
+    _, future = planner.split_window(cut_windows(unseen, 16, select=["state"], pad_before=1)["state"])
+
+    def judged(side):
+        """The score of plans on a way, and their energy score alone."""
+        plans = future * future.new_tensor([1.0, side / -0.9])
+        monkeypatch.setattr(planner_file, "sample_sequences", lambda *_, samples: plans.expand(samples, -1, -1, -1))
+        both = score(planner)
+        with monkeypatch.context() as patch:
+            patch.setattr(planner_file, "relative_distance", lambda *_: 1.0)
+            return both, score(planner)
+
+    (middle, middle_error), (left, left_error) = judged(-0.5), judged(-1.0)
+    assert left < left_error < middle_error < middle
 
 
 @pytest.mark.parametrize(("columns", "robot", "share"), [(9, (3, 4), 1 / 3), (5, (0, 1, 2), None), (6, (0, 1), None)])

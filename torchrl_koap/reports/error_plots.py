@@ -36,7 +36,7 @@ TERMS = {
     "loss_reconstruction": "reconstruction",
     "loss_koopman": "linear latent dynamics",
     "loss_action": "action decoder (labelled steps)",
-    "held_out_score": "plan error, held-out recordings",
+    "held_out_score": "plan score, held-out recordings",
 }
 _PLANS = {
     "planner": ("planner", BLUE, "solid"),
@@ -59,9 +59,9 @@ _MANY = 6  # from here on names of columns are turned
     "losses.png",
     source="metrics.csv",
     title="Losses",
-    caption="Logarithmic scale. Pale: logged values; line: running mean; number: its last value. A plan error of 1 is"
-    " that of standing still. The dot marks the weights that were kept. A planner's loss has no absolute scale: read"
-    " the plan error, or the rollouts, instead.",
+    caption="Logarithmic scale. Pale: logged values; line: running mean; number: its last value. The dot"
+    " marks the weights that were kept. A planner's loss has no absolute scale: read the rollouts instead, or the plan"
+    " score, which falls as plans come near to recordings.",
     order=100,
 )
 def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:

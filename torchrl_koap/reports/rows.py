@@ -71,7 +71,7 @@ def _planner(run: RunFacts) -> list[Row]:
     value = f"{updates:,.0f} updates{_seconds(run, 'planner')}"
     if kept is None or score is None:
         return [Row("planner", value, "no recording was held out")]
-    note = f"kept update {kept:,.0f}, with plan error {score:.3g} on held-out recordings (standing still: 1)"
+    note = f"kept update {kept:,.0f}, with plan score {score:.3g} on held-out recordings (smaller is better)"
     return [Row("planner", value, note), Row("training ended", *_ending(updates, kept, number(asked.get("steps"))))]
 
 

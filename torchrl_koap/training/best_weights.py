@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The latest averaged weights whose score on held-out trajectories is near the best one."""
+"""The averaged weights whose score on held-out trajectories is best."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import torch
 from torch import nn
 from torchrl.objectives import LossModule
 
-ROOM = 1.05  # times the best score; of weights below it the latest are kept, since they follow plans more exactly
 PATIENCE = 1.5  # a training ends after that many times the updates of the kept weights
 
 
 class BestWeights(nn.Module):
-    """Scores the averaged weights of a loss now and then; keeps the latest within 5 % of the best score.
+    """Scores the averaged weights of a loss now and then; keeps the best.
 
     Its state dict holds everything that a resumed training needs.
 
@@ -41,13 +40,13 @@ class BestWeights(nn.Module):
         self.register_buffer("step", torch.tensor(0))
 
     def check(self, step: int) -> dict[str, float]:
-        """Scores the averaged weights after so many updates and keeps good ones; returns the score and :meth:`kept`."""
+        """Scores the averaged weights after so many updates and keeps the best; returns the score and :meth:`kept`."""
         began, (loss,), (now,) = time.perf_counter(), self._loss, self._now
         now.load_state_dict(loss.target_network_params.flatten_keys(".").to_dict())
         score = self._score(now)
-        if score < ROOM * self.best or not self.best.isfinite():  # where nothing moves there is no score
+        if score < self.best or not self.best.isfinite():  # where nothing moves there is no score
             self.network.load_state_dict(now.state_dict())
-            self.best.fill_(min(score, self.best.item()))
+            self.best.fill_(score)
             self.step.fill_(step)
         self.seconds += time.perf_counter() - began
         return {"held_out_score": score} | self.kept()

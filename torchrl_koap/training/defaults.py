@@ -24,7 +24,7 @@ CONTROLLER_UPDATES = 500
 PLACES = "absolute"  # the default preset where decoded actions are places
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
-OWN_TEMPERATURE = 0.7  # of plans where no figure counts the modes
+OWN_TEMPERATURE = 0.4  # of plans where no figure counts the modes
 PLAN_SECONDS = 0.1  # with feedback, at least: plans made anew every few ms begin where the robot lags behind the last
 MOST_FOLLOWED = 10  # frames of a plan: actions of later ones would need frames beyond its end
 Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)

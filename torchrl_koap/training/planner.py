@@ -25,7 +25,7 @@ from torchrl_koap.data import (
 from torchrl_koap.data.recovery import GripperRecovery, NeighborRecovery
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.modules import StatePlanner
-from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
+from torchrl_koap.modules.planning.energy_score import relative_distance, relative_score, sample_sequences
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.config import PlannerConfig, TrainConfig
 from torchrl_koap.runs.device import DTYPES
@@ -36,6 +36,7 @@ from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner
 
 SITUATIONS, SAMPLES = 128, 4  # held out, and plans in each, that weights are chosen by
+RECORDED = 8192  # windows, of which the nearest one is looked for
 CHECKS = 40  # scores in a training at most
 COST = 0.05  # share of the training time that they may take
 BLIND = 1000  # updates at most where there is nothing to hold out
@@ -74,6 +75,7 @@ def learn_planner(
     planner.fit_normalizers(windows[:, unseen:])
     planner.to(config.run.device)
     augment = augmentation(task, windows)
+    score = None if held_out is None else plan_score(planner, held_out, spread_evenly(windows, RECORDED), task)
     del windows  # as large as the data many times over
     buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
@@ -82,9 +84,7 @@ def learn_planner(
 
     weights = column_weights(task)
     loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision], weights=weights).to(config.run.device)
-    best = None
-    if held_out is not None:
-        best = BestWeights(loss, plan_score(planner, held_out, task), check_interval(section, planner.num_steps))
+    best = None if score is None else BestWeights(loss, score, check_interval(section, planner.num_steps))
     values = loop(
         "planner",
         loss,
@@ -130,18 +130,28 @@ def check_interval(section: PlannerConfig, solver_steps: int) -> int:
     return min(max(section.steps // CHECKS, math.ceil(updates / COST)), section.steps)
 
 
-def plan_score(planner: StatePlanner, data: TensorDictBase, task: Task) -> Callable[[StatePlanner], float]:
-    """Makes the score of planners on trajectories: the energy score as a share of that of standing still.
+def plan_score(
+    planner: StatePlanner, data: TensorDictBase, recorded: Tensor, task: Task
+) -> Callable[[StatePlanner], float]:
+    """Makes the score of planners on trajectories that none learns from; smaller is better.
 
-    Flat data ``[N]`` with ``state`` are those that no planner learns from; planners have the frames of the one given.
+    It is the energy score of plans as a share of standing still's, times the square of how far they are from recordings
+    (:func:`relative_distance`). The energy score is best long before rollouts are: it rewards plans that spread, and
+    what is executed is one of them. The product orders updates and networks nearly as rollouts do
+    (``benchmarks/planner_scores.py``).
+
+    Flat data ``[N]`` have ``state``; recorded are windows ``[M, T, d]`` that end with the planner's horizon. Planners
+    have the frames of the one given.
     """
     length = planner.history + planner.horizon
     states = cut_windows(data, length, select=["state"], pad_before=planner.history - 1)["state"]
     history, future = planner.split_window(spread_evenly(states, SITUATIONS))
     still, groups = history[:, -1:].expand_as(future), list(unit_groups(task.state_units).values())
+    known = recorded[:, -planner.horizon :].to(future)
 
     def score(planner: StatePlanner) -> float:
-        return relative_score(sample_sequences(planner, history, samples=SAMPLES), future, still, groups)
+        plans = sample_sequences(planner, history, samples=SAMPLES)
+        return relative_score(plans, future, still, groups) * relative_distance(plans, future, known, groups) ** 2
 
     return score
 

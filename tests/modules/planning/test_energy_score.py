@@ -7,7 +7,12 @@ import pytest
 import torch
 
 from torchrl_koap.modules import StatePlanner, TemporalUnet
-from torchrl_koap.modules.planning.energy_score import energy_score, relative_score, sample_sequences
+from torchrl_koap.modules.planning.energy_score import (
+    energy_score,
+    relative_distance,
+    relative_score,
+    sample_sequences,
+)
 
 
 def test_the_energy_score_is_least_for_the_true_distribution():
@@ -28,6 +33,17 @@ def test_the_relative_score_is_a_mean_of_shares_over_the_columns_that_move():
     samples = torch.tensor([[[[1.0, 10.0, 9.0]]]])  # half the error in the first column, none in the second
     assert relative_score(samples, true, still, [[0], [1], [2]]) == pytest.approx(0.25)
     assert math.isnan(relative_score(samples, true, still, [[2]]))
+
+
+def test_the_relative_distance_is_that_to_the_nearest_recorded_sequence():
+    recorded = torch.tensor([[[0.0, 7.0, 0.0]], [[10.0, 7.0, 0.0]], [[20.0, 7.0, 0.0]]])  # [M, H, d]
+    true = torch.tensor([[[11.0, 7.0, 0.5]]])  # [N, H, d]: 1 and 0.5 away
+    samples = torch.tensor([[[[14.0, 9.0, 1.0]]], [[[20.0, 7.0, 0.0]]]])  # 4 and 0 away, 1 and 0
+    assert relative_distance(samples, true, recorded, [[0]]) == pytest.approx(2.0)
+    assert relative_distance(samples, true, recorded, [[0], [1], [2]]) == pytest.approx(1.5), "no share of column 1"
+    assert relative_distance(samples, true, recorded, [[1]]) == 1.0
+    far = 1e4 + torch.tensor([[[0.0]], [[0.1]]])  # small distances between places far from zero
+    assert relative_distance(far[None, 1:] + 0.01, far[1:] + 0.02, far, [[0]]) == pytest.approx(0.5, rel=0.02)
 
 
 def test_samples_depend_on_their_seed_alone():
