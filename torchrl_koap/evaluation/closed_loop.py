@@ -214,5 +214,5 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
         "step_limit": f"{probe.max_steps} steps ({limit})",
     }
     if probe.success_key is None:
-        facts["success"] = "success: an end with a positive reward, as info says nothing of success"
+        facts["success"] = "success: an end with a positive reward, or what info says where it comes later"
     return RolloutEnvironment(make_env, probe.max_steps, lambda mode: mode[..., 0], 1, record=record, facts=facts)

@@ -1,0 +1,130 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Which score of a planner on held-out recordings predicts its rollouts? Trainings of several lengths and networks.
+
+    python benchmarks/planner_scores.py pusht avoiding_human --seeds 1
+
+A tenth of the recordings is held out by hand, and no training is ended or chosen by them. One controller per seed
+follows all planners. Appends rows to ``benchmarks/results/planner_scores.csv`` and prints, for every ground, the rank
+correlation of scores with successes. ``avoiding_human`` are the recordings of Avoiding by people, the other names are
+those of ``benchmarks/proving_grounds``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from proving_grounds.ground import SHARED, Ground
+from proving_grounds.run import grounds, roll
+from scipy.stats import spearmanr
+from tables import open_table, read_rows
+
+from torchrl_koap import EvalConfig, LabelConfig, Trained, fit, load_policy
+from torchrl_koap.data import cut_windows, open_dataset
+from torchrl_koap.data.windows import spread_evenly
+from torchrl_koap.evaluation.closed_loop import find_environment
+from torchrl_koap.evaluation.rollouts import roll_out
+from torchrl_koap.evaluation.scores import outcome_of
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import ExecutionConfig, StatePlanner
+from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
+from torchrl_koap.tasks.columns import unit_groups
+from torchrl_koap.training.datasets import choose_held_out, split_held_out
+from torchrl_koap.training.defaults import OWN_TEMPERATURE
+from torchrl_koap.training.planner import RECORDED, SAMPLES, SITUATIONS, plan_score
+
+RESULTS = Path(__file__).parent / "results" / "planner_scores.csv"
+COLUMNS = ("ground", "seed", "network", "octaves", "updates", "n", "plan_score", "energy_score", "successes")
+TRAININGS = (*(("mlp", 0, updates) for updates in (600, 1000, 1500, 2000, 3000)), ("mlp", 4, 3000), ("unet", 4, 3000))
+HUMAN = "avoiding_human"
+
+
+def closed_loop(ground: Ground | None, trained: Trained, n: int) -> int:
+    """Successes of so many rollouts, as data of one's own are executed."""
+    execution = ExecutionConfig(temperature=OWN_TEMPERATURE)
+    if ground is not None:
+        return roll(ground, trained, execution, n)["successes"]
+    where = find_environment(trained.task, EvalConfig(episodes=n, threads=1))
+    policy = load_policy(trained, temperature=OWN_TEMPERATURE)
+    episodes = roll_out(policy, where.make_env, list(range(100, 100 + n)), max_steps=where.max_steps, batch_size=n)
+    return sum(outcome_of(episode) == "success" for episode in episodes)
+
+
+def energy(planner: StatePlanner, states: torch.Tensor, trained: Trained) -> float:
+    """The energy score of plans in windows that were held out, as a share of standing still's."""
+    history, future = planner.split_window(spread_evenly(states, SITUATIONS))
+    still, groups = history[:, -1:].expand_as(future), list(unit_groups(trained.task.state_units).values())
+    return relative_score(sample_sequences(planner, history, samples=SAMPLES), future, still, groups)
+
+
+def study(name: str, ground: Ground | None, folder: Path, seed: int, n: int) -> None:
+    """Trains and scores what the table lacks for one ground and training seed."""
+    done, write = open_table(RESULTS, COLUMNS, COLUMNS[:6])
+    left = [each for each in TRAININGS if tuple(map(str, (name, seed, *each, n))) not in done]
+    if not left:
+        return
+    source = SHARED.parent / "d3il_avoiding_human" if ground is None else folder / name
+    if ground is not None and not (source / "ted").is_dir():
+        ground.write(source)
+    data, task = open_dataset(source)
+    budget = LabelConfig(count=2 if ground is None else ground.labels[0]).budget(seed)
+    data, _ = budget.apply(data, command=task.command_columns)
+    known, unseen, _ = split_held_out(data, choose_held_out(data, 0.1, seed=seed))
+    controlled = fit(data, task, planner=False, seed=seed)
+    for network, octaves, updates in left:
+        options = {"network": network, "octaves": octaves, "steps": updates, "held_out": 0.0}
+        planner = fit(known, task, method="linear", planner=options, seed=seed).planner
+        length = planner.history + planner.horizon
+        windows = [cut_windows(part, length, select=["state"], pad_before=1)["state"] for part in (known, unseen)]
+        score = plan_score(planner, unseen, spread_evenly(windows[0], RECORDED), task)(planner)
+        trained = replace(controlled, planner=planner)
+        row = (name, seed, network, octaves, updates, n, f"{score:.4f}", f"{energy(planner, windows[1], trained):.4f}")
+        row += (closed_loop(ground, trained, n),)
+        write(row)
+        print(*row, flush=True)
+
+
+def correlations() -> None:
+    """Prints the rank correlation of each score with failures on every ground, seed by seed."""
+    rows = read_rows("planner_scores")
+    for name, seed in dict.fromkeys((row["ground"], row["seed"]) for row in rows):
+        mine = [row for row in rows if (row["ground"], row["seed"]) == (name, seed)]
+        failures = [int(row["n"]) - int(row["successes"]) for row in mine]
+        found = {kind: spearmanr([float(row[kind]) for row in mine], failures)[0] for kind in COLUMNS[6:8]}
+        print(name, seed, *(f"{kind} {value:.2f}" for kind, value in found.items()), f"of {len(mine)} planners")
+
+
+def main(
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pusht", HUMAN),
+    /,
+    *,
+    seeds: int = 1,
+    n: int = 150,
+    folder: Path = Path("runs/proving_grounds"),
+) -> None:
+    """Runs the cells that the table lacks.
+
+    Args:
+        names: proving grounds, and avoiding_human.
+        seeds: number of training seeds, from 0.
+        n: rollouts per planner.
+        folder: where data sets of the proving grounds are, or are written to.
+    """
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 1)))
+    known: dict[str, Ground | None] = {**grounds(), HUMAN: None}
+    for name in names:
+        ground = lookup(known, name, "ground")
+        if ground is not None and (ground.env is None or ground.missing()):
+            sys.exit(f"{name} has no simulator here: {ground.missing()}")
+        for seed in range(seeds):
+            study(name, ground, folder.resolve(), seed, n)
+    correlations()
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
