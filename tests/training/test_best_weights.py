@@ -46,14 +46,14 @@ class Curve:
         return self.scores[len(self.seen) - 1]
 
 
-def test_the_best_averaged_weights_are_kept_and_training_ends(tmp_path):
+def test_the_latest_good_averaged_weights_are_kept_and_training_ends(tmp_path):
     curve = Curve(0.9, 0.5, 0.52, *[0.53] * 7)
     loss, best, run = training(tmp_path, curve)
-    assert (best.best.item(), best.step.item()) == (0.5, 20)
+    assert (best.best.item(), best.step.item()) == (0.5, 30)
     scores = [float(row["held_out_score"]) for row in run.read_metrics() if row["held_out_score"]]
-    assert scores == [0.9, 0.5, 0.52, *[0.53] * 4], "1.5 times 20 updates and four more scores"
+    assert scores == [0.9, 0.5, 0.52, *[0.53] * 5], "1.5 times 30 updates and four more scores"
     kept = best.network.state_dict()
-    assert all(torch.equal(value, kept[name]) for name, value in curve.seen[1].items())
+    assert all(torch.equal(value, kept[name]) for name, value in curve.seen[2].items())
     average = loss.target_network_params.flatten_keys(".")
     assert not torch.equal(average["denoiser.last.weight"], kept["denoiser.last.weight"])
 
