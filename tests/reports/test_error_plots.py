@@ -32,6 +32,16 @@ def test_losses_get_a_panel_each_and_zero_is_said():
     assert fitted[0].lines[1].get_marker() == "o" and fitted[2].lines[1].get_marker() == ""  # one value, two values
 
 
+def test_the_dot_marks_the_weights_that_were_kept_not_the_best_score():
+    names = ("step", "held_out_score", "kept_update")
+    logged = ("10 0.9 10", "15 - 10", "20 0.5 20", "30 0.52 30", "40 0.6 30")
+    rows = [dict(zip(names, row.replace("-", "").split(" "), strict=True)) for row in logged]
+    (scores,) = draw_losses(rows, NOTHING).axes
+    dot = scores.lines[0]
+    assert (dot.get_xdata()[0], dot.get_ydata()[0]) == (30, 0.52)
+    assert scores.texts[0].get_text() == "kept: 0.52, update 30; last: 0.6"
+
+
 def test_a_running_mean_skips_what_is_missing():
     np.testing.assert_allclose(running_mean(np.array([1.0, np.nan, 3.0, 5.0]), 1), [1, 2, 4, 4])
 

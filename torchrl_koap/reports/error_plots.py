@@ -92,11 +92,10 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
             smooth = running_mean(y, max(1, len(y) // 40))
             note = f"{smooth[np.isfinite(smooth)][-1]:.3g}"
             if name == "held_out_score":
-                best = int(np.nanargmin(y))
-                axes.plot(x[best], y[best], "o", color=BLUE, markersize=5)
-                note = f"kept: {y[best]:.3g}, update {x[best]:,.0f}" + (
-                    f"; last: {y[-1]:.3g}" if y[-1] > y[best] else ""
-                )
+                kept = int(np.searchsorted(x, _column(rows, "kept_update")[here][-1]))
+                axes.plot(x[kept], y[kept], "o", color=BLUE, markersize=5)
+                last = f"; last: {y[-1]:.3g}" if kept < len(x) - 1 else ""
+                note = f"kept: {y[kept]:.3g}, update {x[kept]:,.0f}{last}"
             axes.plot(x, y, color=BLUE, alpha=0.25, linewidth=0.7)
             axes.plot(x, smooth, color=BLUE, linewidth=1.6, marker="o" if len(x) == 1 else "")
             axes.set_yscale("log")

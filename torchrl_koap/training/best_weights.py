@@ -41,7 +41,7 @@ class BestWeights(nn.Module):
         self.register_buffer("step", torch.tensor(0))
 
     def check(self, step: int) -> dict[str, float]:
-        """Scores the averaged weights after so many updates and keeps the best; returns the score and :meth:`kept`."""
+        """Scores the averaged weights after so many updates and keeps good ones; returns the score and :meth:`kept`."""
         began, (loss,), (now,) = time.perf_counter(), self._loss, self._now
         now.load_state_dict(loss.target_network_params.flatten_keys(".").to_dict())
         score = self._score(now)
