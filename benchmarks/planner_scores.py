@@ -40,7 +40,7 @@ from torchrl_koap.training.planner import RECORDED, SAMPLES, SITUATIONS, plan_sc
 
 RESULTS = Path(__file__).parent / "results" / "planner_scores.csv"
 COLUMNS = ("ground", "seed", "network", "octaves", "updates", "n", "plan_score", "energy_score", "successes")
-TRAININGS = (*(("mlp", 0, updates) for updates in (600, 1000, 1500, 2000, 3000)), ("mlp", 4, 3000), ("unet", 4, 3000))
+TRAININGS = (*(("mlp", 0, updates) for updates in (1000, 2000, 3000)), ("mlp", 4, 2000), ("unet", 4, 2000))
 HUMAN = "avoiding_human"
 
 
@@ -104,7 +104,7 @@ def main(
     /,
     *,
     seeds: int = 1,
-    n: int = 150,
+    n: int = 100,
     folder: Path = Path("runs/proving_grounds"),
 ) -> None:
     """Runs the cells that the table lacks.
