@@ -85,6 +85,8 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
     if trained.planner is None and not config.latent_only:
         method = trained.config.method
         raise ValueError(f"method {method!r} samples actions: it has no planner and controller to compare")
+    if config.out is None:
+        writable_folder(run)  # a pretrained run is refused before its data are looked for
     data = trained.data(config.dataset)
     where = None if config.latent_only else find_environment(task, config, Observer.of(task, trained.cameras))
     directory = RunDirectory(writable_folder(run, config.out))  # a wrong call leaves no copy
