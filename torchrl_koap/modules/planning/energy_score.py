@@ -65,7 +65,7 @@ def relative_distance(samples: Tensor, true: Tensor, recorded: Tensor, groups: S
     """Computes how far samples are from the nearest recorded sequence, as a share of how far true ones are.
 
     A plan between two recorded ways, or one that is blurred, is farther from all recordings than a new recording is;
-    the energy score alone hardly tells it. The measure is the precision of generative models (Kynkaanniemi et al. 2019)
+    the energy score alone hardly tells it. The measure is the precision of generative models (Kynkäänniemi et al. 2019)
     as a mean distance.
 
     Samples are ``[S, N, H, d]``, true ones, which are not among the recorded, ``[N, H, d]``, recorded ones
