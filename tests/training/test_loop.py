@@ -174,6 +174,7 @@ def test_an_interrupted_training_ends_bit_for_bit_like_an_uninterrupted_one(unin
     whole, about = load_tensors(run.path / "checkpoints" / f"{kind.phase}.safetensors")
     again, same = load_tensors(tmp_path / "checkpoints" / f"{kind.phase}.safetensors")
     assert about == same and about["step"] == 40
+    assert whole["limit.seen"] == 40 and whole["limit.mean_square"] > 0, "what gradients are compared with goes on too"
     for name, value in whole.items():
         torch.testing.assert_close(again[name], value, rtol=0, atol=0, equal_nan=True)
 
