@@ -98,6 +98,13 @@ def test_one_episode_per_environment_even_if_some_end_early():
     assert not episodes[3]["next", "done"].any()
 
 
+def test_episodes_that_are_over_are_neither_planned_nor_counted():
+    policy = make_policy(CountingPlanner(), EchoController(), state_of=(1, 2), ranges=[(0.0, 0.0)] * 4)
+    roll_out(policy, lambda n: EpisodesOfRandomLength(n, ((9,), (1,), (3,))), [0, 1, 2], max_steps=12)
+    assert policy.limited.tolist() == [13, 13]  # every action of an episode was held in its range
+    assert [len(states) for states in policy.planner.calls] == [3, 1, 1]
+
+
 @pytest.mark.parametrize(("seeds", "size"), [([], None), ([1], 0), ([1], -2)])
 def test_nothing_to_roll_out_is_refused(seeds, size):
     with pytest.raises(ValueError, match="at least one seed and a batch size >= 1"):

@@ -25,6 +25,7 @@ from torchrl_koap.modules.planning.diffusion_policy import ACTION_CHUNK
 OBSERVATION_HISTORY = "observation_history"
 IS_INIT = "is_init"
 PLANNED_STATE = "planned_state"
+UNDER_WAY = "_step"  # of a batch in a rollout of TorchRL, which episodes are not over
 
 
 class PlanningPolicy(TensorDictModuleBase):
@@ -245,14 +246,20 @@ class PlanningPolicy(TensorDictModuleBase):
         if self._written is not None and self._written.batch_size == batch and kept[0] not in tensordict.keys():
             if not tensordict.get(IS_INIT).all():
                 tensordict.update(self._written)
-        if len(batch) == 1:
-            tensordict = self._step(tensordict)
-        else:  # the wrapper wants one batch dimension
-            noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
-            flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
-            flat = self._step(flat.reshape(-1) if batch else flat.unsqueeze(0))
-            written = flat.select(*self.out_keys, *kept, *self.receding.action_keys)
-            tensordict.update(written.reshape(batch) if batch else written[0])
+        noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
+        # the wrapper wants one batch dimension
+        flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
+        flat = flat.reshape(-1) if batch else flat.unsqueeze(0)
+        under_way = tensordict.get(UNDER_WAY, None)
+        if under_way is None or under_way.all():
+            written = self._step(flat)
+        else:
+            rows = under_way.reshape(-1)
+            part = self._step(flat[rows])
+            written = part.new_zeros(flat.batch_size)
+            written[rows] = part
+        written = written.select(*self.out_keys, *kept, *self.receding.action_keys)
+        tensordict.update(written.reshape(batch) if batch else written[0])
         self._written = tensordict.select(*kept)
         return tensordict
 
