@@ -19,8 +19,7 @@ from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import Defaults, Task
 
-# of PO-Sorting, where time is short: noise makes decoded actions too small, and plans are followed from behind; chosen
-# on one trained planner (benchmarks/results/planner_ablations.csv)
+# of PO-Sorting: its steps are few, and noise makes predicted actions too small; chosen with one trained planner
 ACTION_GAIN = 1.15
 COLOURS = ("red", "blue")
 BIN_X = (0.4, 0.625)  # centre of the red and of the blue bin (m)

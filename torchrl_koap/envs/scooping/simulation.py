@@ -2,8 +2,7 @@
 """Scooping simulated: its scene, and batches of it with joint targets in, the spoon's pose and the pieces in it out.
 
 The scene has a table, a bowl, free pieces, a camera, and what holds the spoon: a Panda of capsules, or a hand. All are
-primitive shapes, at a small part of the cost of detailed meshes in software rendering; the arm's outline is only
-roughly that of the meshes (``docs/results/scooping.md``).
+primitive shapes, which cost little in software rendering; the arm only roughly has the outline of its meshes.
 """
 
 from __future__ import annotations

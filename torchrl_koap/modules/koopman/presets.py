@@ -103,7 +103,7 @@ def make_koopman_inverse_dynamics(
         action_dim (int): size of an action.
 
     Keyword Args:
-        preset (str): ``"default"``, ``"absolute"``, ``"semi_supervised"`` or ``"paper"``.
+        preset (str): ``"default"``, ``"absolute"``, ``"semi_supervised"``, ``"scene"`` or ``"paper"``.
         **overrides: any entry of ``PRESETS[preset]`` but its network.
 
     Returns:
