@@ -125,7 +125,7 @@ def grounds_table() -> str:
         row += ["not run" if score is None else score.text for score in scores]
         body.append([*row, fact(key) if key in published else "none"])
     heads = [name for name, _ in COMPARED.values()]
-    return table(["ground", "labelled", "training seeds x n", *heads, "published, all labels"], body)
+    return table(["benchmark", "labelled", "training seeds x n", *heads, "published, all labels"], body)
 
 
 def draw_grounds(path: Path) -> Path:
