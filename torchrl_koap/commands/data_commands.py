@@ -52,12 +52,12 @@ class Demos(Command):
         episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
         seed: seed of the experts' variation.
         threads: simulator threads.
-        batch_size: episodes played at once; the demonstrations do not depend on it.
+        batch_size: episodes simulated at once; the demonstrations do not depend on it.
         disturbance: share of the demonstrations in which the expert is disturbed now and then (pushes, slips, late
             turns, a height that drifts); those from which it recovers are kept, and OUT/ted/about.json says how often
             it did (default: that of the task).
-        embodiment: of a task that is recorded by a camera, "robot" (with actions) or "hand" (frames alone); OUT is then
-            a LeRobot data set with pictures, for `koap embed`.
+        embodiment: for tasks recorded by a camera: "robot" (with actions) or "hand" (frames alone); OUT is then a
+            LeRobot data set with pictures, for `koap embed`.
         plugins: modules that register tasks; imported before anything else.
     """
 
@@ -110,7 +110,7 @@ class Demos(Command):
 class Convert(Command):
     """Turn recordings of any robot, few with actions, into a data set.
 
-    It holds the whole task of the robot.
+    The data set also describes the task: names, units and roles of the columns.
 
     Example: `koap convert recordings --out arm --control-hz 30`
 
@@ -120,25 +120,24 @@ class Convert(Command):
         out: folder to write.
         to: another format than this library's: "npz" or "lerobot" (3.0).
         name: name of the task (default: that of the folder).
-        control_hz: frames per second (default: as the source says; time stamps are not looked at if it is given).
-        resample: frames per second that are wanted: for irregular time stamps, or a rate at which a plan covers enough
-            of the motion.
+        control_hz: frames per second, in place of time stamps (default: as the source says).
+        resample: new frames per second: for irregular time stamps, or if a plan covers too little of the motion.
         observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
-            that are no images).
+            but images).
         episodes: which episodes of a LeRobot data set to read, such as those that were downloaded (default: all).
-        action_columns: columns of CSV or parquet tables that are actions, if they are not named action...
-        action_dim: number of action columns, where nothing has actions.
-        state_columns: columns that make up the state, in that order (default: all that are no clock, counter, reward
-            or flag of an episode).
-        drop_columns: state and action columns that are left out.
+        action_columns: columns of CSV or parquet tables that are actions (default: those named action...).
+        action_dim: number of action columns, needed if no recording has actions.
+        state_columns: columns that make up the state, in that order (default: all but clocks, counters, rewards and
+            flags of episodes).
+        drop_columns: state and action columns to leave out.
         trim_still: cut the frames at both ends of trajectories in which nothing moves.
         drop_short: leave out trajectories that are shorter than a window.
-        robot: state columns of the robot itself, which the controller reads (default: all that are no command and
-            change within a recording).
-        command: neighbouring columns that repeat the last command; nothing that learns sees them.
-        action_kind: of each action column, or one for all: "delta" (velocities, efforts, changes), "absolute" (targets
-            of state columns) or "raw" (neither, such as normalised targets); with --resample "change" (over one frame,
-            summed) or "velocity" (or effort, held) instead of "delta" (default: delta).
+        robot: state columns of the robot itself, which the controller reads (default: all that change within a
+            recording, without the command).
+        command: neighbouring columns that repeat the last command; they are hidden from planner and controller.
+        action_kind: kind of each action column, or one for all: "delta" (velocities, efforts, changes), "absolute"
+            (targets of state columns) or "raw" (neither, such as normalised targets); with --resample "change" (over
+            one frame, summed) or "velocity" (or effort, held) instead of "delta" (default: delta).
         targets: for absolute actions the state column that each is the target of (default: the robot's).
         action_units: unit of each action column, or one for all.
         state_units: unit of each state column, or one for all.
@@ -227,7 +226,7 @@ class Convert(Command):
 class Validate(Command):
     """Report every problem of a folder of demonstrations.
 
-    Warnings name what is right in form but unlikely.
+    Warnings name what is valid but unlikely.
 
     Example: `koap validate arm`
 

@@ -34,7 +34,7 @@ class Embed(Command):
     Attributes:
         sources: folders that `koap convert` wrote (with --task any recordings), in the order in which the data set has
             them.
-        out: folder to write: OUT/ted, and OUT/cameras with what policies embed frames by.
+        out: folder to write: OUT/ted with the data, OUT/cameras with the principal components.
         camera: which cameras (default: all).
         components: principal components per camera, fitted to the frames (a task with embeddings has its own number).
         network: "package.module:name" or "file.py:name" of a network of your own (default: EfficientNet-Lite0 of the

@@ -65,7 +65,7 @@ def _how_to_go_on(out: Path) -> str:
 class Eval(Command):
     """Evaluate a run by rollouts or on recorded data; write its report.
 
-    `--strategy` to `--limits` are those of the training unless given.
+    Options from `--strategy` to `--limits` default to those of the training.
 
     Example: `koap eval runs/arm`
 
@@ -102,7 +102,7 @@ class Eval(Command):
 class Inspect(Command):
     """Find out which part of a run fails and what latent actions hold.
 
-    `--strategy` to `--limits` are those of the training unless given.
+    Options from `--strategy` to `--limits` default to those of the training.
 
     Example: `koap inspect runs/arm`
 

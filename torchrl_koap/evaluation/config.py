@@ -24,22 +24,22 @@ class EvalConfig:
 
     Attributes:
         episodes: number of rollouts.
-        seed: seed of the first rollout; the others count on from it.
-        execution: how plans become actions; what is not asked for is the run's, the method's, the task's.
-        out: folder to write to instead of the run's own; what the run is made of is copied there.
+        seed: seed of the first rollout; rollout i has this seed plus i.
+        execution: how plans become actions; what is not given is the run's.
+        out: folder to write to instead of the run's own; the files of the run are copied there.
         env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
         env_kwargs: arguments of gymnasium.make, such as obs_type=state max_episode_steps=300.
-        success_key: entry of its info that says whether the task is done (default: "is_success" or "success" where it
-            has one of them, else an episode that terminates with a positive reward).
+        success_key: entry of its info that says whether the task is done (default: "is_success" or "success"; without
+            them, an episode that terminates with a positive reward succeeds).
         num_envs: environments at a time, each in a process of its own (default: all in this process).
         dataset: where the data set of the training is now (default: where it was).
         threads: torch and simulator threads (default: as many as torch has).
         device: "cpu" or "cuda".
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
-        rollouts_per_context: rollouts in each context, which tasks that have them take from the evaluation table in
-            turn; from 2 on the entropy of the modes per context is known.
+        rollouts_per_context: rollouts in each context (place of the objects); from 2 on the report has the entropy of
+            the modes per context.
         batch_size: episodes at a time; results do not depend on it.
-        contexts_file: a context file of D3IL to take instead of the table.
+        contexts_file: a context file of D3IL, instead of the 60 contexts of the library.
 
     Examples:
         >>> from torchrl_koap.evaluation import EvalConfig, evaluate

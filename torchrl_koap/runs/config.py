@@ -64,14 +64,14 @@ class PlannerConfig:
         steps: updates at most.
         network: "unet" or "mlp".
         width: channels of the first level of "unet" (the second has twice as many), or hidden width of "mlp".
-        octaves: octaves of the Fourier features of what it sees; with 0 it sees the plain numbers.
+        octaves: octaves of the Fourier features of the observed states; 0: the states themselves.
         batch_size: windows per update.
         learning_rate: peak learning rate.
-        frames: frames that it sees, 1 or 2.
-        held_out: share of the trajectories that it never learns from, those without labels first. Training keeps the
+        frames: observed frames that it reads, 1 or 2.
+        held_out: share of the trajectories that it is not trained on, those without labels first. Training keeps the
             weights that plan them best, and `koap eval` evaluates plans on them (default: 0.1 for a task without an
             environment, else 0).
-        source: run whose planner is taken over instead of training one, or pretrained:NAME.
+        source: run whose planner is used instead of training one, or pretrained:NAME.
 
     Raises:
         ValueError: for a number out of range.
@@ -101,8 +101,8 @@ class ControllerConfig:
     Attributes:
         preset: variant of KOAP: "default", "absolute", "semi_supervised", "scene" or "paper".
         steps: updates (default: 500); with 0 only a closed form is fitted.
-        columns: what it reads: "robot" (the robot's own columns), "all" (KOAP's configurations), or "related" (all, and
-            the relative positions that the planner reads).
+        columns: state columns that it reads: those of the "robot", "all" as in the paper, or "related" (all, and the
+            relative positions that the planner reads).
 
     Raises:
         ValueError: for a number out of range.
@@ -126,11 +126,10 @@ class RunConfig:
         seed: seed of label choice, initialisation and batches.
         threads: torch threads (default: OMP_NUM_THREADS where it is set, else 1).
         device: "cpu" or "cuda".
-        precision: of the matrix products in the planner's training: "float32", "bfloat16" (several times quicker where
-            the processor has units for it, many times slower where not), or "auto", which looks.
-        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise) or
-            "tensorboard".
-        resume: go on with an interrupted run; options left at their defaults are those it was started with.
+        precision: of the matrix products in the planner's training: "float32", "bfloat16" (several times faster if the
+            processor has units for it, else many times slower), or "auto": bfloat16 if it has.
+        logger: "csv" (metrics.csv alone), or also "wandb" (offline unless WANDB_MODE says otherwise) or "tensorboard".
+        resume: go on with an interrupted run; options that are not given are those it was started with.
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run.
 
@@ -164,7 +163,7 @@ class TrainConfig:
         task: name of the task (default: that of the data set).
         method: "koap", "mpc" (plans followed by an identified model of the robot), "linear" (ridge on raw frames),
             "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or another name in
-            torchrl_koap.training.methods.METHODS, those that plugins register included (default: the task's).
+            torchrl_koap.training.methods.METHODS, also of a plugin (default: the task's).
         labels: which labels may be seen.
         planner: its network and training (default: the task's).
         controller: its variant and training (default: the method's).

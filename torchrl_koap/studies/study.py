@@ -86,24 +86,24 @@ class Study:
         out: folder of the study; the same command goes on where it was interrupted, and may add tasks, methods, shares
             or seeds.
         preset: a comparison of the paper, "table1" (methods), "table2" (variants), "demonstrations" (planner and
-            controller know a share of them) or "quick" (a small look at table1): fills in what is not given.
+            controller know a share of them) or "quick" (a small table1); it fills in what is not given.
         tasks: names of tasks (default: that of the data set, else "avoiding").
-        datasets: folder of the demonstrations of a single task, or TASK=FOLDER for each. Where none is given scripted
-            ones are recorded in the folder, once for all cells.
+        datasets: folder of the demonstrations of a single task, or TASK=FOLDER for each (default: scripted ones are
+            recorded in the folder, once for all cells).
         record: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS.
         labels: shares of the units that keep their labels.
         levels: label levels of the paper for every task (1: fewest labels) instead of shares.
-        first_seed_only: levels that are measured with seed 0 alone (default: those of the preset).
+        first_seed_only: levels that are trained with seed 0 alone (default: those of the preset).
         label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
         demonstrations: shares of the demonstrations that planner and controller know at all (default: 1).
         seeds: number of seeds of label choice and training (default: 3).
-        planners: finished run, or pretrained:NAME, whose planner all cells of a task share, or TASK=RUN for each;
-            where none is given one is trained. It must know the same data, which nothing here can check.
-        planner: network and training of planners, and of methods that have none but sample actions.
+        planners: finished run, or pretrained:NAME, whose planner all cells of a task share, or TASK=RUN for each
+            (default: one is trained). It must be trained on the same data; this is not checked.
+        planner: network and training of planners, and of methods that sample actions without a planner.
         controller: training of every controller.
         execution: how plans become actions.
-        evaluation: rollouts of every cell, one thread each; cells with the same seed meet the same contexts and noise.
+        evaluation: rollouts of every cell, one thread each; cells with the same seed have the same contexts and noise.
         run: processor, precision and plugins of every training.
 
     Examples:

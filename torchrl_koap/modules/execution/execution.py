@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How plans become actions, as one value that is saved with a run and handed on unread."""
+"""How plans become actions: the options that are saved with a run."""
 
 from __future__ import annotations
 
@@ -69,20 +69,19 @@ class Execution:
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """What is asked of an :class:`Execution`; what is not asked for is the method's, the task's or the library's.
+    """Options of an :class:`Execution`; None is the default of the method, the task or the library.
 
     Attributes:
-        strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (the simulator's own
-            inverse map, which takes the tool where the plan says: what fails then is the planner's).
-        replan_interval: control steps per plan; with feedback by default those of 0.1 s, at least 4 and at most 10.
-        blend: share of the distance between robot and plan that remains after each step; 0: plans as they are.
-        lead: farthest that the command may be ahead of the robot along each axis, in the units of the actions; 0: any
-            distance.
-        gain: factor of actions that are changes of a command: above 1 the robot is quicker than planned.
-        temperature: factor of the noise that plans are sampled from. Below 1 they are nearer to the average plan: more
-            precise, and less varied.
-        limits: commands stay in the range of the demonstrated ones, widened on both sides by this share of it; inf:
-            anywhere.
+        strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (inverse dynamics of
+            the simulator, which follow plans closely: remaining failures are the planner's).
+        replan_interval: control steps per plan (default with feedback: those of 0.1 s, at least 4 and at most 10).
+        blend: share of the distance between robot and plan that remains after each step; 0: plans are not shifted.
+        lead: largest distance of the command from the robot along each axis, in the units of the actions; 0: no limit.
+        gain: factor of actions that are changes of a command: above 1 the robot is faster than planned.
+        temperature: factor of the noise that plans are sampled from, 0 to 1. Below 1 plans are more precise and vary
+            less.
+        limits: commands stay in the range of the demonstrated ones, widened on both sides by this share of it; inf: no
+            limit.
 
     Raises:
         ValueError: as :class:`Execution`.
