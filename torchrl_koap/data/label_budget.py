@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which steps keep their action label, an exact account of how many that were, and which trajectories are used.
+"""Label budgets: which steps keep their action label, how many these are, and which trajectories are used.
 
 Labels outside the budget become NaN, so code that reads them by mistake produces NaN losses. The observation of some
 tasks repeats the last command. Its differences are the actions, so those columns become NaN too

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recovery as augmentations of windows: what was observed is moved aside, and the future comes back."""
+"""Recovery augmentations of windows: the observed frames are displaced, and the future returns to the recording."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ def _remaining(state: Tensor, history: int, decay: float, ahead: int = 0, under_
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
-    r"""Recovery augmentation: moves the observed frames of a window aside and lets the future come back.
+    r"""Recovery augmentation: displaces the observed frames of a window, and its future returns to the recording.
 
     .. math::
         x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
         \delta = 2 \sigma\, r\, n, \; r \sim U(0, 1), \; n \sim N(0, I)
 
-    A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
-    there. The augmentation shows it such states together with the way back.
+    A planner trained on demonstrations alone has seen no state off their paths, where it drifts in closed loop. The
+    augmentation shows it such states together with the way back.
 
     Frames that all move alike show the moment of a push, and the earlier velocity. With ``under_way`` the robot is on
     its way back already, as in the next steps of the loop: :math:`x'_{t-j} = x_{t-j} + \rho^{-j} \delta`. Choose it
     where motions are so smooth that velocity follows from position, so that the difference of the two betrays a shift.
 
-    An arm with more joints than its tool needs is moved aside at the tool: the tool is displaced, and the joints follow
+    A redundant arm is displaced at the tool, and the joints follow
     by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`.
 
     Args:
@@ -133,7 +133,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
 
 
 class GripperRecovery(TensorDictModuleBase):
-    r"""Gripper recovery augmentation: shows open fingers as closed on nothing, and a future in which they open.
+    r"""Gripper recovery augmentation: replaces open fingers by closed, empty ones, and a future in which they open.
 
     .. math::
         w'_{t-j} = w_0, \qquad w'_{t+i} = \min(w_{t+i},\; w_{open} - \rho^i (w_{open} - w_0)), \qquad

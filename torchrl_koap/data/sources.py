@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From a folder of demonstrations to data and the task that they are used for: the one way in for every command."""
+"""Reads a folder of demonstrations: the data and their task, for every command."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Symmetries of a scene as augmentations of windows: where it is on the table, and which of alike objects is which."""
+"""Symmetries of a scene as augmentations of windows: its pose on the table, and the order of identical objects."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """How far plans and actions lie from what was recorded; no environment needed.
 
-A planner says what may come next, and more than one thing may. A single sample is then a bad measure: one that follows
-another way than the demonstrator is no mistake. Scores of the whole distribution are not fooled by that.
+Several futures may be right: a sampled plan that differs from the demonstrator's is no error. Therefore scores of the
+whole distribution are computed.
 
 Labels outside the budget are read here, for evaluation only, after the training; how many is in the result.
 """

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Which part of a policy fails: planner, controller, or the data.
 
-Three success rates tell them apart. The planner alone continues its own plans: the executed part of each becomes the
+Three success rates separate them. The planner alone continues its own plans: the executed part of each becomes the
 next history, nothing is simulated. The controller alone follows the recorded states of demonstrations, as if the
 planner were perfect. Both together are the closed loop.
 """

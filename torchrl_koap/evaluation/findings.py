@@ -18,7 +18,7 @@ MORE = "train longer (--steps) or record more"  # what to do about plans
 KIND = "check --action-kind and --robot, or label a recording that moves it"  # about an action
 _NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, leave it"
 _LEFT = 0.1  # share of recorded paths that a controller may leave
-_WORSE = 2.0  # from here on a latent model's error is no longer that of a comparable model
+_WORSE = 2.0  # times the error of a comparable model from which a latent model counts as worse
 
 
 def error_unit(part: str, task: Task) -> tuple[str, float]:

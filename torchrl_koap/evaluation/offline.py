@@ -26,7 +26,7 @@ _COMMANDS = "the controller decodes no recorded states: it follows plans by the 
 
 
 def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Judges a run on recorded data; a data set that has moved, or is another one, is refused.
+    """Evaluates a run on recorded data; a data set that has moved, or is another one, is refused.
 
     Plans are scored on trajectories that the planner has not seen, actions on labels outside the budget and on those
     inside it, a trajectory left out at a time. The whole policy acts in a linear model of how states follow actions.

@@ -121,7 +121,7 @@ class WindowLoss(NetworkLoss):
     def set_keys(self, **kwargs) -> None:
         """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too.
 
-        Call ``set_keys`` of the network afterwards where it is to keep names of its own.
+        Call ``set_keys`` of the network afterwards if it needs other names.
         """
         super().set_keys(**kwargs)
         self.network.set_keys(

@@ -30,7 +30,7 @@ class Advice:
 
 
 def advice(run: RunFacts) -> Iterator[Advice]:
-    """Yields everything that there is to say about a run, most telling first."""
+    """Yields all advice about a run, the most important first."""
     success, policy = run.success(), number(run.summary.get("planner_parameters")) == 0  # a policy has no planner
     planner, controller, both = (run.experiment(name) for name in EXPERIMENTS)
     method, fails = run.config.get("method"), success is not None and success < GOOD

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a training and an evaluation came to, in rows of words: the same for a terminal and for the report."""
+"""Results of a training and an evaluation as rows of text, for terminal and report."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.
 
 
 def tidy(axes: Axes, title: str | None = None, *, grid: bool = False) -> Axes:
-    """Gives a panel a light frame, small ticks and labels; a title flush left and lines across if asked for."""
+    """Styles a panel with a light frame, small ticks and labels; a title flush left and lines across if asked for."""
     if title is not None:
         set_title(axes, title)
     if grid:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Does what is missing of a study, resumable at any moment, and writes its table and report."""
+"""Runs the missing cells of a study, resumable at any moment, and writes its table and report."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class StudyResult:
 
 
 def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
-    """Does what is missing of a study and writes its report; ``koap curve`` calls this.
+    """Runs the missing cells of a study and writes its report; ``koap curve`` calls this.
 
     Args:
         study (Study): what to compare on what, and where to write it.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a study compares: tasks x methods x labels x demonstrations x seeds, and what all its cells have in common."""
+"""A study: tasks x methods x labels x demonstrations x seeds, and the options that its cells share."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Observation columns, and what of them makes up the state that planner and controller see: angles without poles.
+"""Columns of observation and state: their names and units, and angles without poles.
 
 D3IL hands out ``tan(yaw)``, which has poles, and whole quaternions, of which a box on a table uses one angle. Both
 become a point on the unit circle; ``tan(yaw)`` tells the yaw up to half a turn only.

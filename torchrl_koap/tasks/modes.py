@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The ways in which a task can be done: their number, their names, and how an environment tells them."""
+"""Modes, the ways in which a task can be done: their number, their names, and how an environment reports them."""
 
 from __future__ import annotations
 

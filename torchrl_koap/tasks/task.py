@@ -40,8 +40,8 @@ class Defaults:
         relative (bool): plans are displacements from the present state.
         recovery (float, optional): typical shift of the recovery augmentation, in the units of the robot's columns.
             Default: of every column what it usually changes in a control step.
-        neighbor_recovery (float): farthest share of the way to the nearest other window that windows are moved, where
-            no column is a position that could be shifted.
+        neighbor_recovery (float): largest displacement of a window towards the nearest other one, as a share of their
+            difference; used if no column is a position that could be shifted.
         planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
             another one that is asked for by name comes with its own.
         controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method`` alone.
@@ -78,7 +78,7 @@ class Task(Columns):
             position of the tool ``[*B, 3]``, where joints are commanded; ``position`` then follows them.
         planar_parts (tuple of str): parts whose positions and yaws may be moved and turned together for training.
         interchangeable (tuple): groups of bodies that may be permuted for training.
-        relative_positions (tuple): what the planner is told besides the state: ``(part, seen from part, in the frame of
+        relative_positions (tuple): what the planner reads besides the state: ``(part, seen from part, in the frame of
             part, yaw of part)``, the last two optional (see :meth:`relative_columns`).
         goal (str, optional): import string of the function of the task and a state ``[*B, d]`` that says where it is
             done, bool ``[*B]``.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The recipe of ``koap train`` in memory: demonstrations in, trained networks out.
+"""Training in memory as ``koap train`` does it: demonstrations in, trained networks out.
 
 Normalisers, scales, losses, augmentation, averaged weights and the closed form at the end are those of ``koap train``:
 with the same data, seed and options the weights are the same bit for bit.

@@ -201,7 +201,7 @@ class OutlierLimit(nn.Module):
     then moves every parameter by several learning rates, the next one is longer still, and within twenty updates the
     loss is what it was at the beginning. Such jumps are known from large models (Wortsman et al. 2023, which limits the
     update by the same comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a
-    training without outliers is not touched.
+    training without outliers is unchanged.
 
     Call it between ``backward`` and the optimiser's step. Its state dict goes into checkpoints, so that a training that
     is resumed goes on the same.

@@ -43,7 +43,7 @@ FORMAT, VERSION = "torchrl_koap policy", 2
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training leaves: networks in evaluation mode, and everything that tells how they were made.
+    """Result of a training: networks in evaluation mode, with task and options.
 
     Args:
         task (Task): the task.
@@ -180,7 +180,7 @@ class Trained:
 
     @property
     def execution(self) -> Execution:
-        """How its plans become actions unless asked otherwise."""
+        """Default options of how its plans become actions."""
         return self.config.execution.on(Execution())
 
     def policy(self, execution: Execution | None = None, *, follower: Follower | None = None) -> PlanningPolicy:
@@ -225,7 +225,7 @@ class Trained:
         return make_policy(self.controller, **facts, execution=execution)
 
     def data(self, dataset: str | None = None) -> TensorDictBase:
-        """Reads the demonstrations that it was trained on, with all labels, from where they are now or were then.
+        """Reads the demonstrations of the training with all labels; ``dataset`` is their folder if it has moved.
 
         Raises:
             RunDirectoryError: if they are not there.
@@ -239,7 +239,7 @@ class Trained:
         return open_dataset(where, task=self.task)[0]
 
     def seen(self, data: TensorDictBase) -> TensorDictBase:
-        """Flat data ``[N]`` as the controller sees them: what it reads, and what actions are learned as."""
+        """Converts flat data ``[N]`` to what the controller reads and predicts."""
         return controller_data(self.task, self.config.controller, with_commands(self.task, data))
 
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:

@@ -25,7 +25,7 @@ class WeightsError(ValueError):
 
 
 class Backbone(nn.Module):
-    """Freezes a network up to one stage and normalises what it is shown.
+    """Frozen network up to one stage, with normalised input.
 
     Args:
         stages (nn.Module): any module from pictures ``[B, 3, H, W]``, normalised, to feature maps ``[B, C, h, w]`` or

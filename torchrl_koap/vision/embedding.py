@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Data with camera frames as data with embeddings, which ``koap train --dataset`` takes."""
+"""Converts data with camera frames to data with embeddings, for ``koap train --dataset``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HELD_OUT = 10  # one trajectory in so many judges them
 
 @dataclass(frozen=True)
 class CameraReport:
-    """How well embeddings hold what a camera saw."""
+    """What a camera's embeddings keep of its features."""
 
     size: tuple[int, int]  # height and width of its frames
     components: int  # columns of an embedding

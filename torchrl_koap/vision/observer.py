@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a robot gives, numbers and camera frames, as the observation that a policy was trained on."""
+"""Converts numbers and camera frames of a robot to the observation that a policy was trained on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STATE = "state"
 
 
 class Observer:
-    """Lays the numbers of a robot and the embeddings of its frames side by side, as the task's columns are.
+    """Concatenates the numbers of a robot and the embeddings of its frames in the order of the task's columns.
 
     Args:
         task (Task): whose observation; a part with the name of a camera is that camera's embedding.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Controllers with a latent that unlabelled windows teach: codes (LAPO), and a variational auto-encoder of windows."""
+"""Controllers with latents trained on unlabelled windows: codes (LAPO), and a variational auto-encoder of windows."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class FiniteScalarQuantizer(nn.Module):
 
 
 class QuantizedInverseDynamics(LatentInverseDynamics):
-    r"""Squeezes the steps around a frame into a discrete code, from which a forward model predicts the next state.
+    r"""Encodes the steps around a frame as a discrete code, from which a forward model predicts the next state.
 
     .. math::
         u_t = \mathrm{FSQ}(f_\theta(s_t, x_t)), \qquad

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Inverse dynamics networks without linear maps: one that labels alone teach, and KOAP with perceptrons throughout."""
+"""Inverse dynamics networks without linear maps: a supervised one, and KOAP with perceptrons throughout."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class SupervisedInverseDynamics(InverseDynamics):
 
 
 class NonlinearInverseDynamics(LiftedInverseDynamics):
-    r"""Works as KOAP does, but with nonlinear latent dynamics and a nonlinear action decoder.
+    r"""KOAP with nonlinear latent dynamics and a nonlinear action decoder.
 
     .. math::
         z_t = g_\theta(x_t), \qquad u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad

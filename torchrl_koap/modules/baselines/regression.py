@@ -65,7 +65,7 @@ class LinearInverseDynamics(InverseDynamics):
 
 
 class PrincipalInverseDynamics(LatentInverseDynamics):
-    """Decodes the leading principal components of what a window holds by ridge regression.
+    """Decodes the leading principal components of a window by ridge regression.
 
     A window is the present frame and the scaled steps around it, those that ``semi_supervised`` reads. The components
     come from all windows, labelled or not (:meth:`finish`); their number, 2, 4, 8, 16, 32 or 64, from the held-out

@@ -27,7 +27,7 @@ def percentiles(seconds: Sequence[float]) -> dict[str, float]:
 
 
 class Agent:
-    """Acts with a policy, one robot or several at a time, without gradients.
+    """Runs a policy in a control loop, for one robot or several at a time, without gradients.
 
     Frames observed so far, the current plans and start noise live inside. With the same seed the actions are bit for
     bit those of a :class:`~torchrl_koap.modules.PolicyEnv`. Its first episode is that of this seed in ``koap eval``;
@@ -70,13 +70,13 @@ class Agent:
         self._forget()
 
     def reset(self) -> None:
-        """Begins an episode with the next observation; the start noise goes on in its stream."""
+        """Begins an episode with the next observation; random numbers continue."""
         self._forget()
         self._ready = True
 
     @torch.no_grad()
     def act(self, observation: np.ndarray | Tensor | Sequence[float] | Mapping[str, Any]) -> np.ndarray | Tensor:
-        """The action ``[act]`` for an observation ``[obs]`` in raw units, or ``[n, act]`` for those of several robots.
+        """Returns the action ``[act]`` for an observation ``[obs]`` in raw units, or ``[n, act]`` for several robots.
 
         It is a tensor where the observation is one, else an array. A policy that was trained with cameras takes
         ``{"state": x, "top": frame}``: numbers ``[d]`` and a frame of every camera by its name, uint8 ``[H, W, 3]``.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Control that never waits for a plan: the next one is made in a thread while the present one is executed."""
+"""Asynchronous planning: a thread makes the next plan while the present one is executed."""
 
 from __future__ import annotations
 
@@ -76,11 +76,11 @@ class AsynchronousAgent(Agent):
         self.close()
 
     def close(self) -> None:
-        """Waits for the plan that is being made, and ends the thread."""
+        """Waits for the plan in progress, and ends the thread."""
         self._thread.shutdown(wait=True)
 
     def reset(self, observation: object = None) -> None:
-        """Forgets everything: the next observation begins an episode.
+        """Begins an episode with the next observation.
 
         From the first observation, ``[obs]`` or ``[n, obs]``, the first plan is made now; without one it is made in the
         first :meth:`act`, which waits for it.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The range of commands, how fast a robot is told to be, and how far its command may be ahead of it."""
+"""Limits, gain and lead of commands (:class:`Execution`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def ends_of(ranges: Ranges) -> Tensor:
 
 
 class CommandLimits(nn.Module):
-    r"""Keeps actions in a range, multiplies changes of a command, and holds back those too far ahead of the robot.
+    r"""Limits actions to a range, scales changes of a command, and limits the distance of the command from the robot.
 
     An action is clipped to its range first; what a planner or controller says far from its data has no bound of its
     own. Changes of a command follow:
@@ -72,7 +72,7 @@ class CommandLimits(nn.Module):
             self.register_buffer(name, torch.as_tensor(list(columns), dtype=torch.long), persistent=False)
 
     def forward(self, observations: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """What is left of an action ``[*B, act]``, by observations ``[*B, history, obs]``, the present one last.
+        """Limits actions ``[*B, act]``, given observations ``[*B, history, obs]``, the present one last.
 
         What is within the limits stays the same bit for bit: a rounding error changes episodes with contacts. The
         second tensor says whether a column left its range, bool ``[*B]``.

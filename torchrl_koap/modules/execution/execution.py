@@ -61,7 +61,7 @@ class Execution:
             raise ValueError(f"limits must be a number >= 0, or infinity, got {self.limits}")
 
     def replaced(self, **asked: Any) -> Execution:
-        """The same with what was asked for; ``None`` leaves a field as it is, and an unknown one is refused."""
+        """Returns a copy with some fields replaced; ``None`` leaves a field as it is, and an unknown one is refused."""
         for name in asked:
             lookup(asdict(self), name, "option of an execution")
         return replace(self, **{name: value for name, value in asked.items() if value is not None})
@@ -104,5 +104,5 @@ class ExecutionConfig:
         self.on(Execution())
 
     def on(self, default: Execution) -> Execution:
-        """A default with what is asked for."""
+        """Returns a default with the given options in place."""
         return default.replaced(**asdict(self))

@@ -42,7 +42,7 @@ Outputs = tuple[Tensor, ...]
 
 
 class ExportError(RuntimeError):
-    """An export that is impossible here, or whose numbers are not those of the policy."""
+    """An export that is impossible on this machine, or that differs from the policy."""
 
 
 class _Stateless(nn.Module):
@@ -66,7 +66,7 @@ class Exportable:
     facts: dict[str, Any]  # what a caller has to know: shapes, columns, order of frames, noise, rate, steps per plan
 
     def batch(self, size: int) -> tuple[Tensor, ...]:
-        """Inputs of several robots, no two alike."""
+        """Returns example inputs of several robots, all different."""
         return tuple(torch.cat([value + 0.1 * index for index in range(size)]) for value in self.inputs.values())
 
 
@@ -104,7 +104,7 @@ def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, s
 def export_policy(
     what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5
 ) -> Callable[..., Outputs]:
-    """Writes a policy, of :func:`exportable`, and returns what is read back, which is compared with the original.
+    """Writes a policy of :func:`exportable`, compares the file with the original and returns what it loads as.
 
     The batch of the file is dynamic: it is tried with one robot and with three. The facts are in the file:
     ``torch.export.load(file, extra_files={"facts.json": ""})``, the metadata of an ONNX model, entry by entry as JSON,

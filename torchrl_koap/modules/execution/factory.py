@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The one place where policies are made."""
+"""The factory of policies."""
 
 from __future__ import annotations
 

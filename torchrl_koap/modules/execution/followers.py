@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What turns a plan into actions: the base class, and an inverse dynamics as a follower."""
+"""Followers turn a plan into actions: the base class, and inverse dynamics as a follower."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _AT_PRESENT = (9.0, 0.0, -4.0, -3.0, 3.0)
 
 
 class Follower(nn.Module):
-    """Base class of what turns a plan into actions; a subclass writes ``forward``.
+    """Base class of modules that turn a plan into actions; a subclass defines ``forward``.
 
     Args:
         controller (nn.Module, optional): what it decides by, whose weights are saved.
@@ -56,7 +56,7 @@ class Follower(nn.Module):
         raise NotImplementedError
 
     def attach(self, env: EnvBase) -> None:
-        """Is told the batch of environments whose episodes are about to begin; needs none by default."""
+        """Receives the batch of environments before their episodes begin; does nothing by default."""
 
 
 class InverseDynamicsFollower(Follower):
@@ -106,7 +106,7 @@ def remaining_plan(plan: Tensor, age: Tensor | int) -> Tensor:
 
 
 def blend_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
-    r"""Bends the beginning of a plan so that it leaves from the present state.
+    r"""Shifts a plan to begin at the present state; the shift decays along the plan.
 
     .. math::
         x'_{t+k} = x_{t+k} + \rho^k e, \qquad e = x_t - (9 x_{t+1} - 4 x_{t+3} - 3 x_{t+4} + 3 x_{t+5}) / 5

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Model predictive control: commands whose effect, by a linear model of how the robot answers them, is the plan."""
+"""Model predictive control with a linear model of how the robot follows its commands."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class ResponseModel(nn.Module):
         return self.memory + 1
 
     def coordinates(self, positions: Tensor, lead: Tensor, changes: Tensor) -> Tensor:
-        """What the next step is linear in, ``[*B, J, 2 memory + 1]``.
+        """Returns the regressors of the next step, ``[*B, J, 2 memory + 1]``.
 
         Measured positions are ``[*B, memory + 1, J]``, the present one last; the distance from there to the command
         ``[*B, J]``; changes of the command ``[*B, memory, J]``, the latest last.
@@ -94,7 +94,7 @@ class ResponseModel(nn.Module):
     def predict(
         self, positions: Tensor, command: Tensor, changes: Tensor, future: Tensor, *, weight: Tensor | None = None
     ) -> Tensor:
-        """The next N positions ``[*B, N, J]`` under given changes of the command.
+        """Predicts the next N positions ``[*B, N, J]`` under given changes of the command.
 
         Args:
             positions (Tensor): measured ``[*B, memory + 1, J]``, the present one last.
@@ -222,7 +222,7 @@ class MPC(Follower):
         self.follow_gain, self.keep_gain = inverse @ effect.T @ measured, SMOOTHNESS * inverse[:, :axes]
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
-        """The actions of the next steps, as if the robot answered as predicted; beyond the look-ahead it is held."""
+        """Computes the actions of the next steps by predicted positions; beyond the look-ahead the command stays."""
         model = self.controller
         tracked = self.track(observations, states, plan)[..., :steps, :]
         if (missing := steps - tracked.shape[-2]) > 0:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The policy: a plan is made every few steps, followed step by step, then made anew."""
+"""The policy: it makes a plan every few steps and follows it in between."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class PlanningPolicy(TensorDictModuleBase):
         return self.planner.noise_shape
 
     def check_rate(self, control_hz: float) -> None:
-        """Warns of a control rate (Hz) a fifth or more beside that of the data; refuses what is no positive number."""
+        """Warns if a control rate (Hz) is outside 0.8 to 1.25 times that of the data; refuses what is not positive."""
         number = isinstance(control_hz, (int, float, np.number)) and not isinstance(control_hz, bool)
         if not (number and math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz!r}")
@@ -167,7 +167,7 @@ class PlanningPolicy(TensorDictModuleBase):
         return self.follower(observations, states, chunk, self.execution.replan_interval)
 
     def sample(self, states: Tensor, noise: Tensor | None = None, **options: Any) -> Tensor:
-        """Samples what the planner plans, ``[*B, H, w]``, at the temperature of the execution.
+        """Samples plans ``[*B, H, w]`` at the temperature of the execution.
 
         The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`; options are of the planner's
         ``sample``, such as the ``prefix``.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a policy reads besides observations: their history, and start noise, of one source for all who act."""
+"""Environment transforms for policies: the history of observations, and seeded start noise."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def policy_transforms(
 
 
 class PolicyEnv(TransformedEnv):
-    """An environment with what a policy reads: the last observations, and start noise.
+    """An environment that also returns what a policy reads: the last observations, and start noise.
 
     ``set_seed`` fixes the whole rollout. With the same seed an :class:`~torchrl_koap.modules.Agent` gives the same
     actions in the first episode. It may stand inside of :class:`torchrl.envs.SerialEnv`,

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Named variants of KOAP: everything that one is, from normalisation to the decoder's penalty, in one entry."""
+"""Named variants of KOAP: one entry each, from normalisation to the decoder's penalty."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _DEFAULT: dict[str, Any] = {
 
 # everything that a variant is; what only its network takes stands last
 PRESETS: dict[str, dict[str, Any]] = {
-    # best measured: observables of the frames relative to the current one, an input matrix B, no clamped look-ahead, a
+    # observables of the frames relative to the current one, an input matrix B, no clamped look-ahead, a
     # decoder in closed form
     "default": _DEFAULT
     | {"num_features": 512, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "position_weight": 0.0},

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Networks that predict the clean sequence in a noisy one, and features of what that depends on."""
+"""Networks that predict the clean sequence from a noisy one, and features of their condition."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Denoiser(nn.Module):
 
 
 class MLPDenoiser(Denoiser):
-    """Residual network on the flattened sequence, for one fixed horizon: what planners of tasks with objects have.
+    """Residual network on the flattened sequence, for one fixed horizon; the default for tasks with objects.
 
     On Avoiding its plans touch obstacles more often than those of
     :class:`~torchrl_koap.modules.planning.unet.TemporalUnet`.
