@@ -16,7 +16,7 @@ Run it with ``python tutorials/compare_controllers.py``; it writes ``compare_con
 # One set of demonstrations, several budgets
 # ------------------------------------------
 # ``LabelBudget`` hides every action outside the budget. A larger budget of the same seed contains the smaller ones.
-# Three seeds show how large chance is.
+# Three seeds show the random variation.
 
 import statistics
 
@@ -154,8 +154,8 @@ figure.savefig("compare_controllers.png", dpi=90)
 # ----------
 # The three lines of KOAP coincide. Random features do as well, and so does KOAP without the unlabelled demonstrations.
 # On Avoiding the scaled inputs, the Fourier features and the closed-form decoder decide. Trainings here have 150
-# updates; the study with 1,000 agrees. Supervised networks and ridge regression on raw frames need more labels. The
-# size of the actions makes no difference.
+# updates; longer ones agree (``docs/results/few_labels.md``). Supervised networks and ridge regression on raw frames
+# need more labels. The error does not depend on the size of the actions.
 #
 # An action error is not a success rate. ``koap curve`` measures success, with intervals and paired comparisons.
 # Unlabelled data train the *planner*.

@@ -81,7 +81,7 @@ print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 # %%
 # A planner over states
 # ---------------------
-# It reads no action. The augmentation displaces states from the demonstrated path and adds the way back.
+# It reads no action. The augmentation displaces observed states, and the planned states return to the demonstration.
 
 planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, relative=False, num_steps=5)
 extended = extrapolate_ends(data, 13)
@@ -128,4 +128,4 @@ print("latent actions of a window:", tuple(latent.shape))
 # Two labelled trajectories out of 48 were enough. ``result`` holds the success rate with its interval. ``report``
 # counts the labels that were used.
 #
-# ``koap train --help`` does the same in one command. ``docs/results.md`` shows what each choice brings.
+# ``koap train`` does the same in one command. ``docs/results.md`` shows the effect of each choice.

@@ -15,7 +15,7 @@ Run it with ``python tutorials/gymnasium_robot.py``; it writes ``gymnasium_robot
 # The environment
 # ---------------
 # ``PointMaze`` of gymnasium-robotics has a ball in a U-shaped maze, pushed by a force. A policy reads one flat row of
-# columns. The wrapper lays position, velocity and goal side by side. It repeats every force for four steps (25 Hz).
+# columns. The wrapper concatenates position, velocity and goal. It repeats every force for four steps (25 Hz).
 
 import tempfile
 from pathlib import Path

@@ -71,8 +71,8 @@ def choose(criterion, first, count):
 # %%
 # What it gains
 # -------------
-# Errors are measured on twelve demonstrations that no method has labels of. Six different first labels show how large
-# chance is.
+# Errors are measured on twelve demonstrations that no method has labels of. Six different first labels show the
+# random variation.
 
 judged = every[-12:]
 pool = torch.isin(demonstrations["episode"], torch.tensor(every[:-12]))

@@ -147,6 +147,6 @@ figure.savefig("own_robot.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# Three of sixty trajectories had commands. If trials miss, train the planner longer first; the default is more than ten
-# times as long. An ``AsynchronousAgent`` plans in a thread. From the shell, use ``koap convert``, ``koap train`` and
+# Three of sixty trajectories had commands. If trials miss, train the planner longer first; the default has six times
+# as many updates. An ``AsynchronousAgent`` plans in a thread. From the shell, use ``koap convert``, ``koap train`` and
 # ``koap eval``. The time per tick is that of the machine that made this page.

@@ -177,8 +177,8 @@ class PushExpert(Expert):
 
 
 # %%
-# Everything else is there
-# ------------------------
+# Record, train, roll out
+# -----------------------
 # Now record demonstrations balanced over modes, train with 5 % of the labels and roll out from new places.
 
 folder = Path(tempfile.mkdtemp())

@@ -16,8 +16,8 @@ Run it with ``python tutorials/scooping.py``; it needs the extra ``vision`` and 
 # %%
 # Two kinds of videos
 # -------------------
-# A spoon takes pieces out of a bowl, filmed at ten frames a second. The robot's recordings have joint targets. All but
-# five demonstrations lose them. The hand has neither joints nor labels, and differs in look, speed and approach. From
+# A spoon takes pieces out of a bowl, filmed at ten frames a second. The robot's recordings have joint targets. Only
+# five demonstrations keep them. The hand has neither joints nor labels, and differs in look, speed and approach. From
 # the shell: ``koap demos --task scooping --embodiment robot``, or ``hand``.
 
 import tempfile
