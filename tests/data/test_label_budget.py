@@ -171,6 +171,16 @@ def test_commands_hide_with_the_actions():
     assert (hide_commands(data, COMMAND) == data).all()
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_a_smaller_budget_takes_the_commands_of_labels_away_too(told):
+    whole, _ = LabelBudget(fraction=1.0).apply(demonstrations(), command=COMMAND, tell_commands=True)
+    assert not whole["label_command"].isnan().any()
+    less, _ = LabelBudget(count=1).apply(whole, command=COMMAND, tell_commands=told)
+    assert ("label_command" in less.keys()) == told
+    if told:
+        assert torch.equal(~less["label_command"].isnan().any(-1), less["has_action"].squeeze(-1))
+
+
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("amount", [1, 0.4])
 def test_nothing_outside_the_budget_leaks(unit, amount):

@@ -1,6 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Simulated actions come true, and the present is left as it was."""
 
+import copy
+import pickle
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -56,3 +61,17 @@ def test_episodes_that_are_over():
     assert env.over.tolist() == [False, False]
     env.step(data.set("action", torch.zeros(2, 2, dtype=torch.float64)))
     assert env.over.tolist() == [True, True]
+
+
+def test_copies_and_what_is_unpickled_have_simulations_of_their_own(tmp_path):
+    env, data = started(AvoidingEnv, "avoiding", 0)
+    env.render()
+    data = data.set("action", torch.full((2, 2), 0.01, dtype=torch.float64))
+    (tmp_path / "env").write_bytes(pickle.dumps(env))
+    before = env.sims.data[0].time
+    steps = [other.step(data.clone()) for other in (copy.deepcopy(env), pickle.loads((tmp_path / "env").read_bytes()))]
+    assert env.sims.data[0].time == before
+    wanted = env.step(data.clone())["next", "observation"]
+    assert all(torch.equal(step["next", "observation"], wanted) for step in steps)
+    load = f"import pickle; print(pickle.load(open({str(tmp_path / 'env')!r}, 'rb')).rollout(3).shape)"
+    assert "[2, 3]" in subprocess.run([sys.executable, "-c", load], capture_output=True, text=True, check=True).stdout

@@ -64,6 +64,12 @@ def test_value_in_closed_form(dtype):
     assert value.dtype == dtype
 
 
+@pytest.mark.parametrize(("entry", "shape"), [("planner_noise", (5, 6, 1)), ("planner_time", (5, 1))])
+def test_given_noise_and_times_of_another_shape_are_refused(entry, shape):
+    with pytest.raises(ValueError, match=rf"'{entry}' must be \[5.*\], got \{list(shape)}"):
+        make_loss()(batch_of(5).set(entry, torch.ones(shape)))
+
+
 def test_weights_scale_the_errors_of_their_columns():
     plain, weighted = make_loss(reduction="none"), make_loss(reduction="none", weights=torch.tensor([3.0, 1.0]))
     data = batch_of(5)

@@ -175,6 +175,12 @@ def test_a_labelled_action_that_is_nan_is_loud():
 # the network
 
 
+def test_coefficients_may_be_given_as_whole_numbers_and_changed():
+    loss = KOAPLoss(make_network(), action_coeff=1)
+    loss.action_coeff = 0.5
+    assert loss.action_coeff == 0.5
+
+
 def test_keys_of_the_network_are_taken_over_and_renaming_reaches_it():
     network = make_network()
     network.set_keys(state="window", action=("robot", "velocity"))

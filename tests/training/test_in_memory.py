@@ -11,6 +11,7 @@ from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.data import LabelBudget, cut_windows, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.data.ted import load_ted
 from torchrl_koap.files import DataError
+from torchrl_koap.modules import StatePlanner, TemporalUnet
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.runs.weights import load_tensors
@@ -158,6 +159,10 @@ def test_refusals():
     planner = fit(data, task, method="linear", planner={"steps": 1, **SMALL}, progress=False).planner
     with pytest.raises(ValueError, match="method 'dp' samples actions and has no planner"):
         fit(data, task, method="dp", planner=planner)
+    with pytest.raises(ValueError, match="planner: it plans 2 columns, states of the data have 4"):
+        fit(data, task, planner=StatePlanner(TemporalUnet(2, 4), state_dim=2))
+    with pytest.raises(ValueError, match="planner must be a StatePlanner, a mapping of options, None or False, got 3"):
+        fit(data, task, planner=3)
 
 
 @pytest.mark.parametrize(

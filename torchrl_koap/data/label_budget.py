@@ -154,10 +154,11 @@ class LabelBudget:
         has_action = torch.from_numpy(kept).to(data.get(keys.ACTION).device).unsqueeze(-1)
         labelled, told = data.clone().set(keys.HAS_ACTION, has_action), 0
         labelled.set(keys.ACTION, torch.where(has_action, data.get(keys.ACTION), math.nan))
+        last = labelled.pop(keys.LABEL_COMMAND, None)
         if command is not None:
             labelled = hide_commands(labelled, command)
             if tell_commands:
-                last = data.get(keys.LABEL_COMMAND, data.get(keys.OBSERVATION)[:, command])
+                last = data.get(keys.OBSERVATION)[:, command] if last is None else last
                 labelled.set(keys.LABEL_COMMAND, torch.where(has_action, last, math.nan))
                 blank = labelled.get(keys.OBSERVATION)[:, command].isnan().any(-1, keepdim=True)
                 told = int((blank & has_action).sum())

@@ -70,6 +70,7 @@ class InverseDynamics(TensorDictModuleBase):
     ):
         super().__init__()
         self.in_keys, self.out_keys = [STATE], [ACTION]
+        self._out_key: NestedKey = ACTION  # out_keys may be selected
         self.register_module("reader", reader)  # where a part holds it, a property of the subclass finds it there
         self.columns = None if columns is None else list(columns)
         self.targets = list(targets)
@@ -83,14 +84,15 @@ class InverseDynamics(TensorDictModuleBase):
     @property
     def out_key(self) -> NestedKey:
         """Entry of the raw actions."""
-        return self.out_keys[-1]
+        return self._out_key
 
     def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
         """Renames :attr:`in_key` and :attr:`out_key`, those that are given."""
         if state is not None:
             self.in_keys = [state]
         if action is not None:
-            self.out_keys = [*self.out_keys[:-1], action]
+            self.out_keys = [action if key == self._out_key else key for key in self.out_keys]
+            self._out_key = action
 
     @property
     def num_past(self) -> int:
@@ -216,6 +218,7 @@ class LatentInverseDynamics(InverseDynamics):
     def __init__(self, reader: WindowReader | None, action_decoder: nn.Module, **kwargs):
         super().__init__(reader, **kwargs)
         self.out_keys = [LATENT_ACTION, *self.out_keys]
+        self.latent_key: NestedKey = LATENT_ACTION
         self.action_decoder = action_decoder
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
@@ -239,5 +242,5 @@ class LatentInverseDynamics(InverseDynamics):
         """Writes latent and action of every frame."""
         state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
         latent = self.infer(state)
-        tensordict.set(self.out_keys[0], latent)
+        tensordict.set(self.latent_key, latent)
         return tensordict.set(self.out_key, self.raw_action(self.decode(latent), state))

@@ -161,7 +161,7 @@ class VariationalLoss(WindowLoss):
 
     def __init__(self, network: VariationalInverseDynamics, *, kl_coeff: float = 0.01, reduction: str = "mean"):
         super().__init__(network, reduction=reduction)
-        self.register_coeff_buffer("kl_coeff", kl_coeff)
+        self.register_coeff_buffer("kl_coeff", float(kl_coeff))
 
     def _noise(self, tensordict: TensorDictBase, mean: Tensor) -> Tensor:
         noise = tensordict.get(self.tensor_keys.noise, None)

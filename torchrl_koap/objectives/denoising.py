@@ -83,8 +83,12 @@ class DenoisingLoss(NetworkLoss):
                 if counts is not None:  # before the network: masking afterwards would leave NaN in the gradient
                     clean = torch.where(counts, clean, 0.0)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
-                noise = torch.randn_like(clean) if noise is None else noise
+                noise = torch.randn_like(clean) if noise is None else noise.to(clean.dtype)
+                if noise.shape != clean.shape:
+                    raise ValueError(f"{names.noise!r} must be {list(clean.shape)}, got {list(noise.shape)}")
                 time = network.schedule.sample_time(clean) if time is None else time.to(clean.dtype)
+                if time.shape != clean.shape[:-2]:
+                    raise ValueError(f"{names.time!r} must be {list(clean.shape[:-2])}, got {list(time.shape)}")
                 noisy = network.schedule.add_noise(clean, noise, time)
             with torch.autocast(clean.device.type, self.dtype, enabled=self.dtype is not None):
                 predicted = network.denoiser(noisy, time, condition)

@@ -155,8 +155,8 @@ class KOAPLoss(_KoopmanLoss):
         reduction: str = "mean",
     ):
         super().__init__(network, reduction=reduction)
-        self.register_coeff_buffer("koopman_coeff", koopman_coeff)
-        self.register_coeff_buffer("action_coeff", action_coeff)
+        self.register_coeff_buffer("koopman_coeff", float(koopman_coeff))
+        self.register_coeff_buffer("action_coeff", float(action_coeff))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

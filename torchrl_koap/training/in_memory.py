@@ -101,6 +101,10 @@ def fit(
     """
     data, task = _prepared(data, task)
     shared = planner if isinstance(planner, StatePlanner) else None
+    if shared is not None and shared.state_dim != task.state_dim:
+        raise ValueError(f"planner: it plans {shared.state_dim} columns, states of the data have {task.state_dim}")
+    if shared is None and not (planner is None or planner is False or isinstance(planner, Mapping)):
+        raise ValueError(f"planner must be a StatePlanner, a mapping of options, None or False, got {planner!r}")
     # a planner from elsewhere may have seen all trajectories
     given = {"held_out": 0.0} | ({} if shared is None else sizes_of(shared))
     options = given if shared is not None or planner is False else dict(planner or {})

@@ -2,6 +2,7 @@
 """Plans made while the one before is executed."""
 
 import threading
+from concurrent.futures import wait
 
 import numpy as np
 import pytest
@@ -126,3 +127,24 @@ def test_plans_are_followed_as_the_policy_follows_them():
         acted.append(np.stack([agent.act(row) for row in observations]))
     np.testing.assert_allclose(acted[0], acted[1], atol=1e-6)
     assert not np.allclose(acted[0], acted[2], atol=1e-6)
+
+
+def test_an_error_of_the_thread_ends_its_episode_alone(monkeypatch):
+    agent, answer = make_agent(), np.zeros(2)
+    agent.reset()
+    before = agent.act(answer)
+    agent.act(answer)
+
+    def fails(*inputs, **options):
+        raise RuntimeError("no plan")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(agent.policy.planner, "sample", fails)
+        agent.act(answer)  # due
+        wait([agent._pending])
+        with pytest.raises(RuntimeError, match="no plan"):
+            agent.act(answer)
+        agent.act(answer)  # due again
+    agent.reset()
+    np.testing.assert_array_equal(agent.act(answer), before)
+    agent.close()

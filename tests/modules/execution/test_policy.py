@@ -1,14 +1,26 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Which frame of which plan is used at which step, against a reference loop."""
 
+import pickle
+
 import pytest
 import torch
+from small_networks import small_planner
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from toy_policies import CountingPlanner, CountingSampler, EchoController, EpisodesOfRandomLength, state_number
 
-from torchrl_koap.modules import Execution, PlanningPolicy, ResponseModel, make_policy, policy_transforms
+from torchrl_koap.envs import AvoidingEnv
+from torchrl_koap.modules import (
+    Execution,
+    PlanningPolicy,
+    PolicyEnv,
+    ResponseModel,
+    make_koopman_inverse_dynamics,
+    make_policy,
+    policy_transforms,
+)
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
 
 LENGTHS = ((5, 3, 11), (9,), (1, 2, 7, 4), (12, 6), (4, 4, 8))
@@ -134,3 +146,18 @@ def test_decoded_commands_become_changes_of_the_last_one():
     sampled = make_policy(CountingSampler(), **options)
     chunk = sampled.plan(observed)
     assert sampled.act(observed, chunk, 2)[0, 1] == chunk[0, 2, 1] - 3.5
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("mpc", [False, True])
+def test_policies_are_pickled_selected_and_roll_out_in_their_own_precision(mpc, double):
+    controller = ResponseModel([0, 1], [0, 1], [0, 1]) if mpc else make_koopman_inverse_dynamics(2, 2)
+    policy = make_policy(small_planner(), controller, state_of=(2, 3), ranges=[(-0.01, 0.01)] * 2)
+    dtype = torch.float64 if double else torch.float32
+    policy = pickle.loads(pickle.dumps(policy)).to(dtype)
+    env = PolicyEnv(AvoidingEnv(2, max_steps=5, dtype=dtype), policy)
+    env.set_seed(0)
+    whole = env.rollout(5, policy)["action"]
+    assert whole.dtype == dtype
+    env.set_seed(0)
+    assert torch.equal(env.rollout(5, policy.select_out_keys("action"))["action"], whole)

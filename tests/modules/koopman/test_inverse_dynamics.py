@@ -114,6 +114,16 @@ def test_fitting_takes_any_batch_and_leaves_the_mode_alone():
     assert not nested.latent_action.training
 
 
+def test_selected_entries_are_written_under_their_names():
+    model, data = make_model(), labelled(4)[0].select("state")
+    whole = model(data.clone())
+    for name in ("latent_action", "action"):
+        chosen = make_model().select_out_keys(name)
+        written = chosen(data.clone())
+        assert torch.equal(written[name], whole[name]) and chosen.out_key == "action"
+        assert set(written.keys()) == {"state", name}
+
+
 def test_bad_fits_are_explained():
     model = make_model()
     data, mask = labelled(4)
@@ -129,6 +139,8 @@ def test_bad_fits_are_explained():
         model.fit_labels(data.select("state"), mask)
     with pytest.raises(ValueError, match=r"'action' must have the batch and frames \[4, 9\] .*, got \[4, 8, 2\]"):
         model.fit_labels(data.clone().set("action", data["action"][:, 1:]), mask)
+    with pytest.raises(ValueError, match=r"weights are \[2, \d+\] \[action, latent\], those of the labels \[1, "):
+        make_model(normalizers=False).fit_labels(data.clone().set("action", data["action"][..., :1]), mask)
     with pytest.raises(ValueError, match="a window of 4 frames is too short"):
         model.fit_labels(data[:, :4] if data.batch_dims > 1 else data.apply(lambda x: x[:, :4]), mask[:, :4])
 

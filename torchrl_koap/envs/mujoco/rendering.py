@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -92,7 +93,7 @@ class Renderer:
             if not isinstance(size, int) or size < 1:
                 raise ValueError(f"{name} must be a positive number of pixels, got {size!r}")
         self.size = (width, height)
-        self._model = model
+        self._model, self._shadows = model, shadows
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._context, self._gpu = open_context(backends(), model, width, height)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
@@ -100,6 +101,9 @@ class Renderer:
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
+
+    def __reduce__(self) -> tuple[Any, ...]:  # a copy has a context of its own
+        return partial(Renderer, shadows=self._shadows), (self._model, *self.size)
 
     def render(self, data: mujoco.MjData, camera: str) -> np.ndarray:
         """Draws one simulation, uint8 [height, width, 3], by a camera; the arm's prefix may be left out of its name."""

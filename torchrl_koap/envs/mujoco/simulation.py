@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -25,12 +26,24 @@ class Simulations:
     """
 
     _episode: dict[str, np.ndarray]  # what decides the future beside the physics, a row per simulation
+    _CONNECTED: tuple[str, ...] = ("_executor", "_executor_pid")
 
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
         self.model, self.num_threads = model, num_threads
         self.data = [mujoco.MjData(model) for _ in range(num_sims)]
+        self._connect()
+
+    def _connect(self) -> None:
+        """Sets what belongs to this process and this object alone; a copy, or what is unpickled, sets its own."""
         self._executor: ThreadPoolExecutor | None = None
         self._executor_pid: int | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in self._CONNECTED}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._connect()
 
     def __len__(self) -> int:
         return len(self.data)
@@ -78,7 +91,22 @@ class Simulations:
 class SimulationBatch(Simulations):
     """Simulations of D3IL's arm under its controller, in a :func:`~torchrl_koap.envs.mujoco.scene.scene`."""
 
+    _CONNECTED = (
+        *Simulations._CONNECTED,
+        "_step",
+        "_data_addresses",
+        "_pointers",
+        "_tcp_views",
+        "_arm_views",
+        "_object_views",
+    )
+
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
+        joint = model.joint(f"{PANDA}joint1")
+        self._qpos_start, self._qvel_start = int(joint.qposadr[0]), int(joint.dofadr[0])
+        if (self._qpos_start, self._qvel_start) != (model.nq - _NUM_JOINTS, model.nv - _NUM_JOINTS):
+            raise ValueError("the arm's nine joints must come last in the state, after the free bodies of the task")
+        self._tcp = model.body(f"{PANDA}tcp").id
         super().__init__(model, num_sims, num_threads)
         self.joint_targets = np.zeros((num_sims, 7))
         self.started = np.zeros(num_sims, dtype=bool)
@@ -88,11 +116,8 @@ class SimulationBatch(Simulations):
         self._episode |= {"width": self.widths, "grasping": self.grasping}
         self._log = np.zeros((num_sims, controller.LOG_WIDTH + model.nq - _NUM_JOINTS))
 
-        joint = model.joint(f"{PANDA}joint1")
-        self._qpos_start, self._qvel_start = int(joint.qposadr[0]), int(joint.dofadr[0])
-        if (self._qpos_start, self._qvel_start) != (model.nq - _NUM_JOINTS, model.nv - _NUM_JOINTS):
-            raise ValueError("the arm's nine joints must come last in the state, after the free bodies of the task")
-        self._tcp = model.body(f"{PANDA}tcp").id
+    def _connect(self) -> None:
+        super()._connect()
         self._step = controller.step_address()
         self._data_addresses = np.array([data._address for data in self.data], dtype=np.int64)
         self._pointers = np.array([self._arrays(data) for data in self.data], dtype=np.int64)

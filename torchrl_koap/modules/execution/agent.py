@@ -151,5 +151,7 @@ class Agent:
         if bad.any():
             columns = bad.any(0).nonzero().flatten().tolist()
             raise ValueError(f"columns {columns} of the observation are NaN or infinite as {self.dtype}")
+        if self._shape is None:
+            self.policy.state_of(read)  # refuses another width before anything is kept
         self._shape = shape
         return read

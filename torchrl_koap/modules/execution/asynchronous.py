@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import torch
 from torch import Tensor
@@ -92,7 +92,7 @@ class AsynchronousAgent(Agent):
     def _forget(self) -> None:
         super()._forget()
         if self._pending is not None:
-            self._pending.result()
+            wait([self._pending])  # of another episode, as is an error in it
         self._pending = None
         self._plan = None
         self._age = 0  # steps since the plan was begun
@@ -104,8 +104,9 @@ class AsynchronousAgent(Agent):
         if self._plan is None:
             self._make_first(frames)
         if self._pending is not None and self._pending.done():
-            self._plan, took = self._pending.result()
-            self._delay, self._age, self._pending = self._steps(took), self._begun, None
+            made, self._pending = self._pending, None
+            self._plan, took = made.result()
+            self._delay, self._age = self._steps(took), self._begun
         if self._pending is None and self._age >= policy.execution.replan_interval:
             bound = remaining_plan(self._plan, self._age)[..., : min(self._delay, policy.planner.horizon - 1), :]
             self._pending = self._thread.submit(self._make, frames, self._noise(len(frames)), bound)

@@ -13,7 +13,7 @@ from torchrl_koap.modules.execution.command_limits import CommandLimits, Ranges
 from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import ActionRule, Follower, InverseDynamicsFollower
 from torchrl_koap.modules.execution.mpc import MPC, ResponseModel
-from torchrl_koap.modules.execution.policy import PlanningPolicy
+from torchrl_koap.modules.execution.policy import PlanningPolicy, columns_of
 
 
 def make_policy(
@@ -86,7 +86,7 @@ def make_policy(
             lead=execution.lead,
             commands=own.get("commands", ()),
             positions=own.get("states", ()),
-            state_of=state_of if callable(state_of) else lambda observed: observed[..., list(state_of)],
+            state_of=columns_of(state_of),
         )
     return PlanningPolicy(planner, follower, state_of=state_of, execution=execution, limits=limits, **options).eval()
 

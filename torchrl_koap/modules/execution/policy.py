@@ -113,12 +113,13 @@ class PlanningPolicy(TensorDictModuleBase):
         self.execution, self.max_steps, self.control_hz = execution, max_steps, control_hz
         self.observe = observe
         self.register_buffer("limited", torch.zeros(2, dtype=torch.long), persistent=False)
-        self.state_of = state_of if callable(state_of) else _Columns(state_of)
+        self.state_of = columns_of(state_of)
         self.origins = None if origins is None else [torch.tensor(part, dtype=torch.float64) for part in origins]
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
         self._decodes = follower is not None and execution.strategy != "open_loop"  # at every step
         chunk_key = PLAN if self._decodes else ACTION_CHUNK
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
+        self._action_key, self._chunk_key = action_key, chunk_key  # out_keys may be selected
         self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
             _Chunk(self.plan, history_key, planner.noise_key, chunk_key),
@@ -242,7 +243,7 @@ class PlanningPolicy(TensorDictModuleBase):
             raise ValueError(
                 f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
             )
-        batch, kept = tensordict.batch_size, [self.out_keys[1], self.receding.counter_key]
+        batch, kept = tensordict.batch_size, [self._chunk_key, self.receding.counter_key]
         if self._written is not None and self._written.batch_size == batch and kept[0] not in tensordict.keys():
             if not tensordict.get(IS_INIT).all():
                 tensordict.update(self._written)
@@ -258,16 +259,16 @@ class PlanningPolicy(TensorDictModuleBase):
             part = self._step(flat[rows])
             written = part.new_zeros(flat.batch_size)
             written[rows] = part
-        written = written.select(*self.out_keys, *kept, *self.receding.action_keys)
+        written = written.select(self._action_key, *kept, *self.receding.action_keys)
         tensordict.update(written.reshape(batch) if batch else written[0])
         self._written = tensordict.select(*kept)
         return tensordict
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = self.receding(tensordict)
-        observed, plan = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[1])
+        observed, plan = tensordict.get(self.in_keys[0]), tensordict.get(self._chunk_key)
         age = tensordict.get(self.receding.counter_key).squeeze(-1).long() - 1
-        return tensordict.set(self.out_keys[0], self.act(observed, plan, age))
+        return tensordict.set(self._action_key, self.act(observed, plan, age))
 
 
 class _Chunk(TensorDictModuleBase):
@@ -281,6 +282,11 @@ class _Chunk(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
         return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
+
+
+def columns_of(state_of: Callable[[Tensor], Tensor] | Sequence[int]) -> Callable[[Tensor], Tensor]:
+    """Returns what makes states of observations; columns become a module that selects them."""
+    return state_of if callable(state_of) else _Columns(state_of)
 
 
 class _Columns(nn.Module):

@@ -118,6 +118,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
             raise ValueError(f"latent_action writes {written!r}, but action_decoder reads {read!r}")
         super().__init__(latent_action, action_decoder, lifting, **kwargs)
         self.out_keys = [*latent_action.out_keys, self.out_key]
+        self.latent_key = latent_action.out_keys[0]
         self.operator, self.penalty = operator, penalty
         sizes = {"state_normalizer": lifting.state_dim, "action_normalizer": action_decoder.linear.out_features}
         for name, width in sizes.items():

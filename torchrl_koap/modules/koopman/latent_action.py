@@ -272,6 +272,13 @@ class LinearActionDecoder(TensorDictModuleBase):
 
     @torch.no_grad()
     def assign(self, fit: RidgeFit) -> None:
-        """Takes over the weights of a ridge regression from latent actions to normalised actions."""
+        """Takes over the weights of a ridge regression from latent actions to normalised actions.
+
+        Raises:
+            ValueError: if it is from or to another number of columns.
+        """
+        if fit.weight.shape != self.linear.weight.shape:
+            wanted, found = (list(weight.shape) for weight in (self.linear.weight, fit.weight))
+            raise ValueError(f"the decoder's weights are {wanted} [action, latent], those of the labels {found}")
         self.linear.weight.copy_(fit.weight)
         self.linear.bias.copy_(fit.bias)

@@ -151,7 +151,7 @@ class ConditionalSampler(TensorDictModuleBase):
             )
         sequence = self.schedule.solve(
             lambda x, time: self.denoiser(x, time, condition),
-            noise,
+            noise.to(condition.dtype),
             self.num_steps,
             self.solver,
             prefix=None if prefix is None else self._encode_prefix(history, prefix),
