@@ -8,7 +8,7 @@ with the same data, seed and options the weights are the same bit for bit.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
@@ -127,7 +127,9 @@ def fit(
     plans = get_method(config.method).plans
     if shared is not None and not plans:
         raise ValueError(f"planner: method {config.method!r} samples actions and has no planner")
-    with _seeded(seed, device, progress):
+    bars = contextlib.nullcontext() if progress else without_progress_bars()
+    with torch.random.fork_rng(devices=None if device != "cpu" else []), bars:
+        torch.manual_seed(seed)
         if plans and shared is None and planner is not False:
             shared, results["planner"] = learn_planner(task, config, seen, Phases(), held_out=unseen)
         torch.manual_seed(seed)
@@ -165,14 +167,3 @@ def _task_of_columns(data: TensorDictBase) -> Task:
     width = (data[keys.OBSERVATION] if seen is None else seen).shape[-1]
     actions = {f"action_{column}": Action() for column in range(data[keys.ACTION].shape[-1])}
     return Task(name="robot", observation_parts={"robot": width}, actions=actions, position="robot")
-
-
-@contextlib.contextmanager
-def _seeded(seed: int, device: str, progress: bool) -> Iterator[None]:
-    """Draws from a seed of its own, with or without bars."""
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(torch.random.fork_rng(devices=None if device != "cpu" else []))
-        if not progress:
-            stack.enter_context(without_progress_bars())
-        torch.manual_seed(seed)
-        yield
