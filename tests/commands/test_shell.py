@@ -13,7 +13,7 @@ import pytest
 from tiny_runs import TINY, write_demonstrations
 
 from torchrl_koap.commands import cli
-from torchrl_koap.commands.shell import ending_like_ctrl_c
+from torchrl_koap.commands.shell import handling_signals, interrupt
 
 COMMAND = (sys.executable, "-m", "torchrl_koap.commands.cli")
 
@@ -40,7 +40,7 @@ def test_signals_are_like_ctrl_c(number, status, monkeypatch, capsys):
 def test_what_is_ignored_stays_ignored():
     earlier = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with ending_like_ctrl_c():
+        with handling_signals(interrupt):
             os.kill(os.getpid(), signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, earlier)

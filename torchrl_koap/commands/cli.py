@@ -21,8 +21,9 @@ from torchrl_koap.commands.shell import (
     ReadEnough,
     describe_interrupt,
     discard_output,
-    ending_at_once,
-    ending_like_ctrl_c,
+    handling_signals,
+    interrupt,
+    leave,
     one_line_warnings,
     open_closed_streams,
     widen_terminal,
@@ -46,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     open_closed_streams()
     try:
-        with ending_like_ctrl_c(), one_line_warnings():
+        with handling_signals(interrupt), one_line_warnings():
             return _run(arguments)
     except ReadEnough:  # `koap ... | head`
         discard_output()
@@ -130,7 +131,7 @@ def _commands() -> tuple[Any, ...]:
             " `koap` are made of; use -O or nothing"
         )
     loaded = "torchrl_koap.commands.subcommands" in sys.modules
-    with nullcontext() if loaded else ending_at_once():
+    with nullcontext() if loaded else handling_signals(leave):
         try:
             from torchrl_koap.commands import options, subcommands
             from torchrl_koap.runs.progress import without_progress_bars

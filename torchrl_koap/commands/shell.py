@@ -42,21 +42,8 @@ def describe_interrupt(error: KeyboardInterrupt) -> tuple[str, int]:
 
 
 @contextlib.contextmanager
-def ending_like_ctrl_c() -> Iterator[None]:
-    """Raises :class:`Interrupted` for SIGTERM and SIGHUP inside the block; ignored ones (``nohup``) stay ignored."""
-    with _handled(_raise_interrupted):
-        yield
-
-
-@contextlib.contextmanager
-def ending_at_once() -> Iterator[None]:
-    """Ends the process with one line at a signal inside the block: half imported modules can do nothing more."""
-    with _handled(_leave):
-        yield
-
-
-@contextlib.contextmanager
-def _handled(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+def handling_signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Calls a handler for the signals that end a process inside the block; ignored ones (``nohup``) stay ignored."""
     if threading.current_thread() is not threading.main_thread():  # Python lets nobody else
         yield
         return
@@ -129,11 +116,13 @@ def discard_output() -> None:
             os.close(nowhere)
 
 
-def _raise_interrupted(number: int, frame: FrameType | None) -> None:
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raises :class:`Interrupted`, which is met like Ctrl-C."""
     raise Interrupted(number)
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
+def leave(number: int, frame: FrameType | None) -> None:
+    """Ends the process with one line: half imported modules can do nothing more."""
     message, status = describe_interrupt(Interrupted(number))
     with contextlib.suppress(OSError):
         os.write(2, f"koap: {message}\n".encode())
