@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
@@ -55,7 +55,9 @@ def roll_out(
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
-        _seed_episodes(env, part)
+        for module in env.modules():  # transforms, and the environment itself
+            if isinstance(module, _SeedsEpisodes):
+                module.seed_episodes(part)
         transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
         if given is not None:
@@ -95,17 +97,6 @@ class _SeedsEpisodes(Protocol):
     """An environment or transform in which what is random has a generator per episode."""
 
     def seed_episodes(self, seeds: Sequence[int]) -> None: ...
-
-
-def _seed_episodes(env: EnvBase, seeds: Sequence[int]) -> None:
-    """What is random in an episode depends on its own seed alone, where the environment can see to that."""
-    base = env.base_env if isinstance(env, TransformedEnv) else env
-    if isinstance(base, _SeedsEpisodes):
-        base.seed_episodes(seeds)
-    transforms = env.transform if isinstance(env, TransformedEnv) else ()
-    for transform in transforms if isinstance(transforms, Iterable) else (transforms,):
-        if isinstance(transform, _SeedsEpisodes):
-            transform.seed_episodes(seeds)
 
 
 def rollouts_to_tensors(
