@@ -107,9 +107,8 @@ planner_loss.target_network_params.to_module(planner)
 policy = make_policy(planner, inverse_dynamics, state_of=task.state_columns)
 seeds = list(range(24))
 episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
-mode_index = task.modes.index_of
-result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
-rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], mode_index=mode_index, interval=4)
+result = score(episodes, seeds, task.modes)
+rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], modes=task.modes, interval=4)
 rollouts = {name: tensor.numpy() for name, tensor in rollouts.items()}
 draw_rollouts(rollouts, RunFacts(Path(), task)).savefig("few_labels.png", dpi=150)
 rate, low, high = (100 * result["rates"]["success"][name] for name in ("rate", "low", "high"))

@@ -74,7 +74,7 @@ def closed_loop(steps, temperature=1.0):
     policy = load_policy(run, temperature=temperature)
     policy.planner.num_steps = steps
     episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
-    return score(episodes, seeds, num_modes=task.num_modes, mode_index=task.modes.index_of), episodes
+    return score(episodes, seeds, task.modes), episodes
 
 
 print("\nclosed loop, 24 rollouts each")

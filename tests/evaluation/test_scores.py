@@ -3,11 +3,11 @@
 
 import pytest
 import torch
-from toy_policies import episode_of, number
+from toy_policies import episode_of, numbered_modes
 
 from torchrl_koap.evaluation.scores import outcome_of, score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval, wilson_interval
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Modes, get_task
 
 
 def test_outcomes():
@@ -17,7 +17,7 @@ def test_outcomes():
     without = episode_of(3)
     del without["next", "collision"]
     assert outcome_of(without) == "timeout"
-    counts = [score([each], [0], num_modes=1, mode_index=number).get("collisions") for each in (without, episode_of(3))]
+    counts = [score([each], [0], Modes()).get("collisions") for each in (without, episode_of(3))]
     assert counts == [None, 0]
 
 
@@ -32,7 +32,7 @@ def test_scores_by_hand():
         episode_of(90, mode=3),
         episode_of(8, collision=True, mode=-1),
     ]
-    result = score(episodes, range(8), num_modes=4, mode_index=number)
+    result = score(episodes, range(8), numbered_modes(4))
     rows = result.pop("episode")
     low, high = wilson_interval(5, 8)
     assert 0 <= result.pop("mode_entropy_low") < 0.75 < result.pop("mode_entropy_high") <= 1
@@ -47,26 +47,26 @@ def test_scores_by_hand():
     assert rows[2] == {"seed": 2, "outcome": "success", "mode": 1, "steps": 30}
     assert rows[5]["outcome"] == "collision" and rows[6]["outcome"] == "timeout"
     with pytest.raises(ValueError, match="longer"):
-        score(episodes, range(7), num_modes=4, mode_index=number)
+        score(episodes, range(7), numbered_modes(4))
 
 
 def test_entropy_per_context_by_hand():
     modes = [(0, 1), (1, 1), (-1, 0), (0, 0)]
     episodes = [episode_of(5, success=context < 3, mode=mode) for context in range(4) for mode in modes[context]]
     contexts = [context for context in range(4) for _ in range(2)]
-    options = {"num_modes": 2, "mode_index": number, "contexts": contexts}
     # entropies 1, 0, 0 (one of the two modes was not complete) of the contexts with success
-    result = score(episodes, range(8), **options)
+    result = score(episodes, range(8), numbered_modes(2), contexts=contexts)
     assert result["mode_entropy"] == pytest.approx(1 / 3) and result["contexts"] == 4
     assert result["rates"]["success"]["rate"] == 6 / 8 and result["episode"][3]["context"] == 1
     assert result["pooled_mode_entropy"] == pytest.approx(0.9709505944546686)  # 2 of 0, 3 of 1
     assert 0 <= result["mode_entropy_low"] <= 1 / 3 <= result["mode_entropy_high"] <= 1
-    assert score(episodes, range(8), unsolved="zero", **options)["mode_entropy"] == pytest.approx(1 / 4)
+    result = score(episodes, range(8), numbered_modes(2, entropy="contexts"), contexts=contexts)
+    assert result["mode_entropy"] == pytest.approx(1 / 4)
 
 
 def test_one_rollout_per_context_has_no_entropy_per_context():
     episodes = [episode_of(5, success=True, mode=mode) for mode in (0, 1)]
-    result = score(episodes, [7, 8], num_modes=2, mode_index=number, contexts=[0, 1])
+    result = score(episodes, [7, 8], numbered_modes(2), contexts=[0, 1])
     assert result["mode_entropy"] is None and result["pooled_mode_entropy"] == pytest.approx(1.0)
 
 
@@ -88,7 +88,7 @@ def test_rates_of_stacking_join_the_success():
 
 
 def test_without_modes_there_is_no_entropy():
-    result = score([episode_of(4, success=True)], [0], num_modes=1, mode_index=number)
+    result = score([episode_of(4, success=True)], [0], Modes())
     assert result["rates"]["success"]["rate"] == 1.0 and not [name for name in result if "mode" in name]
     assert "mode" not in result["episode"][0]
 
@@ -97,7 +97,7 @@ def test_an_episode_in_which_the_environment_failed_is_no_success():
     failed = episode_of(2, success=True)
     failed["next", "failed"] = failed["next", "success"].clone()
     assert outcome_of(failed) == "error"
-    assert score([failed], [0], num_modes=1, mode_index=number)["rates"]["success"]["rate"] == 0
+    assert score([failed], [0], Modes())["rates"]["success"]["rate"] == 0
 
 
 def test_bootstrap_interval_covers_the_mean():

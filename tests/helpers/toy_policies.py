@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_koap.envs.avoiding import OBSTACLES
 from torchrl_koap.modules import StatePlanner
+from torchrl_koap.tasks import Modes
 
 
 class CountingPlanner(nn.Module):
@@ -162,5 +163,6 @@ def episode_of(steps, *, success=False, collision=False, mode=3, start=0.0, plan
     )
 
 
-def number(flags):
-    return flags.squeeze(-1)
+def numbered_modes(number, **options):
+    """Modes whose flag in :func:`episode_of` is their number."""
+    return Modes((("way", tuple(map(str, range(number)))),), tuple((mode,) for mode in range(number)), **options)

@@ -84,7 +84,7 @@ def test_modes_scores_and_goal():
     assert task.modes.index_of(torch.tensor([[1], [-1]])).tolist() == [1, -1]
     env = make_env(task, 4, max_steps=5)
     episodes = list(env.rollout(5, break_when_any_done=False))
-    result = score(episodes, range(4), num_modes=2, mode_index=task.modes.index_of, contexts=[0, 0, 1, 1])
+    result = score(episodes, range(4), task.modes, contexts=[0, 0, 1, 1])
     assert result["rates"]["success"]["rate"] == 0.0 and result["episodes"] == 4
     assert task.goal_reached(torch.tensor([[0.0, 0.0, 0.5, 0.4], [0.5, 0.4, 0.0, 0.0]])).tolist() == [True, False]
 

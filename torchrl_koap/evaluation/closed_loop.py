@@ -24,7 +24,7 @@ from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.runs.weights import save_tensors
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Modes, Task
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
 
@@ -89,14 +89,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
             contexts=where.contexts,
             progress=count_up_to(bar),
         )
-    result = score(
-        episodes,
-        seeds,
-        num_modes=where.num_modes,
-        mode_index=where.mode_index,
-        contexts=where.numbers,
-        unsolved="zero" if task.modes.entropy == "contexts" else "skip",
-    )
+    result = score(episodes, seeds, where.modes, contexts=where.numbers)
     if config.env is None:
         result = task_scores(task, result, episodes, where.numbers)
     rows = result.pop("episode")
@@ -111,7 +104,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
-        mode_index=where.mode_index,
+        modes=where.modes,
         interval=policy.execution.replan_interval,
         objects=[task.observation[body.position] for body in task.bodies] if config.env is None else (),
         plans_position=task.plans_position,
@@ -169,8 +162,7 @@ class RolloutEnvironment:
 
     make_env: Callable[[int], Any]  # of a number of parallel episodes
     max_steps: int
-    mode_index: Callable[[torch.Tensor], torch.Tensor]  # from the environment's leaf ``mode``
-    num_modes: int
+    modes: Modes
     numbers: list[int] | None = None  # of the context of every rollout
     contexts: np.ndarray | None = None
     record: EpisodeRecord | None = None  # of an environment of Gymnasium: what happened in the episodes
@@ -189,7 +181,7 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
 
         options = {"num_threads": config.threads or torch.get_num_threads(), "max_steps": task.max_steps}
         make = partial(make_env, task, noisy=True, **options)
-        return RolloutEnvironment(make, task.max_steps, task.modes.index_of, task.num_modes, numbers, contexts)
+        return RolloutEnvironment(make, task.max_steps, task.modes, numbers, contexts)
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 
     record = EpisodeRecord()
@@ -215,4 +207,4 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
     }
     if probe.success_key is None:
         facts["success"] = "success: an end with a positive reward, or what info says where it comes later"
-    return RolloutEnvironment(make_env, probe.max_steps, lambda mode: mode[..., 0], 1, record=record, facts=facts)
+    return RolloutEnvironment(make_env, probe.max_steps, Modes(), record=record, facts=facts)

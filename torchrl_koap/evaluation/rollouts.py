@@ -20,6 +20,7 @@ from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, policy_transforms
 from torchrl_koap.modules.execution.policy_env import NOISE, NoiseStreams
+from torchrl_koap.tasks import Modes
 
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
 
@@ -103,7 +104,7 @@ def rollouts_to_tensors(
     episodes: Sequence[TensorDict],
     *,
     position: slice,
-    mode_index: Callable[[Tensor], Tensor],
+    modes: Modes,
     interval: int,
     objects: Sequence[slice] = (),
     plans_position: bool = True,
@@ -134,7 +135,7 @@ def rollouts_to_tensors(
     tensors = {
         "position": path[:, :, 0].contiguous(),
         "length": torch.tensor([len(episode) for episode in episodes]),
-        "mode": torch.stack([mode_index(end[MODE]).reshape(()) for end in last]).long(),
+        "mode": torch.stack([modes.index_of(end[MODE]) for end in last]),
         "outcome": torch.tensor([OUTCOMES.index(outcome_of(episode)) for episode in episodes]),
         "plan": pad(plans, padding_value=torch.nan),
         "action": pad([episode[ACTION] for episode in episodes], padding_value=torch.nan),

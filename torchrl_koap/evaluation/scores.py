@@ -13,12 +13,11 @@ from functools import partial
 from typing import Any
 
 from tensordict import TensorDict
-from torch import Tensor
 
 from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, rate
 from torchrl_koap.keys import COLLISION, FAILED, MODE, SUCCESS
 from torchrl_koap.lookup import resolve
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Modes, Task
 
 
 def outcome_of(episode: TensorDict) -> str:
@@ -31,21 +30,17 @@ def outcome_of(episode: TensorDict) -> str:
 def score(
     episodes: Sequence[TensorDict],
     seeds: Sequence[int],
+    modes: Modes,
     *,
-    num_modes: int,
-    mode_index: Callable[[Tensor], Tensor],
     contexts: Sequence[int] | None = None,
-    unsolved: str = "skip",
 ) -> dict[str, Any]:
     """Success (in ``rates``) with its 95 % interval, entropy of the modes of successful episodes, a row per episode.
 
     Modes and collisions are told of where there are any. There is a seed per episode of
-    :func:`~torchrl_koap.evaluation.rollouts.roll_out`; ``mode_index`` maps the leaf ``mode`` to a number, -1 if
-    incomplete; ``num_modes`` is the base of the entropy's logarithm.
+    :func:`~torchrl_koap.evaluation.rollouts.roll_out`.
 
     With ``contexts``, the number of the context of every episode, ``mode_entropy`` is the mean over contexts, None
-    below two rollouts per context, and ``pooled_mode_entropy`` that of all successful episodes together. ``unsolved``
-    is as of :func:`~torchrl_koap.evaluation.statistics.conditional_entropy`.
+    below two rollouts per context, and ``pooled_mode_entropy`` that of all successful episodes together.
     """
     rows: list[dict[str, Any]] = [
         {"seed": seed, "outcome": outcome_of(episode), "steps": len(episode)}
@@ -57,30 +52,29 @@ def score(
         for row, context in zip(rows, contexts, strict=True):
             row["context"] = int(context)
         result["contexts"] = len({row["context"] for row in rows})
-    if num_modes > 1:
+    if modes.number > 1:
         for row, episode in zip(rows, episodes, strict=True):
-            row["mode"] = int(mode_index(episode[-1]["next", MODE]))
-        result |= _mode_scores(rows, num_modes, result.get("contexts"), unsolved)
+            row["mode"] = int(modes.index_of(episode[-1]["next", MODE]))
+        result |= _mode_scores(rows, modes, result.get("contexts"))
     if any(COLLISION in episode["next"].keys() for episode in episodes):
         result["collisions"] = sum(row["outcome"] == "collision" for row in rows)
     return result | {"mean_steps": statistics.fmean(row["steps"] for row in rows), "episode": rows}
 
 
-def _mode_scores(
-    rows: Sequence[dict[str, Any]], num_modes: int, contexts: int | None, unsolved: str
-) -> dict[str, float | None]:
+def _mode_scores(rows: Sequence[dict[str, Any]], modes: Modes, contexts: int | None) -> dict[str, float | None]:
     won = [row for row in rows if row["outcome"] == "success" and row["mode"] >= 0]
-    modes = [row["mode"] for row in won]
+    taken = [row["mode"] for row in won]
     found: dict[str, float | None] = {"mode_entropy": None}
     if contexts is not None and len(rows) >= 2 * contexts:
         groups: dict[int, list[int]] = {row["context"]: [] for row in rows}
         for row in won:
             groups[row["context"]].append(row["mode"])
-        conditional = partial(conditional_entropy, num_modes=num_modes, unsolved=unsolved)
+        unsolved = "zero" if modes.entropy == "contexts" else "skip"
+        conditional = partial(conditional_entropy, num_modes=modes.number, unsolved=unsolved)
         found |= _entropy("mode_entropy", list(groups.values()), conditional)
-    pooled = partial(mode_entropy, num_modes=num_modes)
-    found |= _entropy("mode_entropy" if contexts is None else "pooled_mode_entropy", modes, pooled)
-    return found | {"distinct_modes": len(set(modes))}
+    pooled = partial(mode_entropy, num_modes=modes.number)
+    found |= _entropy("mode_entropy" if contexts is None else "pooled_mode_entropy", taken, pooled)
+    return found | {"distinct_modes": len(set(taken))}
 
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
