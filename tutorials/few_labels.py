@@ -108,7 +108,7 @@ policy = make_policy(planner, inverse_dynamics, state_of=task.state_columns)
 seeds = list(range(24))
 episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
 result = score(episodes, seeds, task.modes)
-rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], modes=task.modes, interval=4)
+rollouts = rollouts_to_tensors(episodes, task, interval=4)
 rollouts = {name: tensor.numpy() for name, tensor in rollouts.items()}
 draw_rollouts(rollouts, RunFacts(Path(), task)).savefig("few_labels.png", dpi=150)
 rate, low, high = (100 * result["rates"]["success"][name] for name in ("rate", "low", "high"))

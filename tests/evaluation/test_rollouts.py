@@ -2,6 +2,7 @@
 """Rollouts that depend on nothing but their seed, and the numbers made of them."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -22,10 +23,9 @@ from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.modules import make_policy
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, get_task
 
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
-MODES = numbered_modes(4)
 KEYS = ({}, {"history_key": "frames"})
 
 
@@ -118,9 +118,12 @@ def test_a_policy_may_read_its_history_from_another_entry():
     assert torch.equal(first["action"], second["action"]) and len(first) == 5
 
 
+COUNTED = replace(get_task("avoiding"), modes=numbered_modes(4), actions={"x": Action(), "y": Action()}, robot=(1, 0))
+
+
 def test_pictures_get_padded_paths_and_the_plans_that_were_made():
     episodes = [episode_of(6, success=True, mode=1), episode_of(3, collision=True, mode=-1, start=50.0)]
-    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), modes=MODES, interval=4)
+    tensors = rollouts_to_tensors(episodes, COUNTED, interval=4)
     assert tensors["length"].tolist() == [6, 3] and tensors["outcome"].tolist() == [1, 2]
     assert tensors["mode"].tolist() == [1, -1]
     assert tensors["position"].shape == (2, 7, 2)
@@ -130,12 +133,11 @@ def test_pictures_get_padded_paths_and_the_plans_that_were_made():
     assert tensors["plan"].shape == (2, 2, 14, 2) and tensors["plan_step"].tolist() == [[0, 4], [0, -1]]
     assert tensors["plan"][0, :, 0, 0].tolist() == [0, 4] and tensors["plan"][1, 0, 0, 0] == 50
     assert tensors["plan"][1, 1].isnan().all()
-    kept = {"shown": [1, 0], "state_of": lambda observation: observation[..., 2:4]}
-    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), modes=MODES, interval=4, **kept)
+    tensors = rollouts_to_tensors(episodes, replace(COUNTED, env=None), interval=4)
     assert tensors["column"].tolist() == [1, 0] and tensors["state"].shape == (2, 7, 2)
     assert torch.equal(tensors["state"][0].flip(-1), tensors["position"][0]) and tensors["state"][1, 4:].isnan().all()
     assert torch.equal(tensors["state_plan"][0].flip(-1), tensors["plan"][0])
-    plain = rollouts_to_tensors([episode_of(3, plans=False)], position=slice(2, 4), modes=MODES, interval=4)
+    plain = rollouts_to_tensors([episode_of(3, plans=False)], COUNTED, interval=4)
     assert plain["plan"].shape[:2] == (1, 0) and plain["plan_step"].shape == (1, 0)
 
 

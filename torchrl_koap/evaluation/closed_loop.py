@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord  # takes seconds
 
 
-_SHOWN = 6  # columns of plans that are drawn where nobody knows what lies in a plane
-
-
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
@@ -103,13 +100,9 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
-        position=task.observation[task.position],
-        modes=where.modes,
+        task,
         interval=policy.execution.replan_interval,
-        objects=[task.observation[body.position] for body in task.bodies] if config.env is None else (),
-        plans_position=task.plans_position,
-        shown=(task.targets or task.moved_columns() or task.robot or range(task.state_dim))[:_SHOWN],
-        state_of=task.state_of if task.env is None else None,
+        elsewhere=config.env is not None,
     )
     if where.contexts is not None:  # in full precision: a film of the same episode starts from it
         rollouts["context"] = torch.from_numpy(where.contexts)

@@ -20,8 +20,9 @@ from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, policy_transforms
 from torchrl_koap.modules.execution.policy_env import NOISE, NoiseStreams
-from torchrl_koap.tasks import Modes
+from torchrl_koap.tasks import Modes, Task
 
+SHOWN = 6  # columns of plans that are drawn where nobody knows what lies in a plane
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
 
 
@@ -101,37 +102,30 @@ class _SeedsEpisodes(Protocol):
 
 
 def rollouts_to_tensors(
-    episodes: Sequence[TensorDict],
-    *,
-    position: slice,
-    modes: Modes,
-    interval: int,
-    objects: Sequence[slice] = (),
-    plans_position: bool = True,
-    shown: Sequence[int] = (),
-    state_of: Callable[[Tensor], Tensor] | None = None,
+    episodes: Sequence[TensorDict], task: Task, *, interval: int, elsewhere: bool = False
 ) -> dict[str, Tensor]:
     """Stacks what the pictures need, padded to the longest episode.
 
-    Of the columns ``position`` and ``objects`` of the observation the first two are drawn, and of plans where
-    ``plans_position`` says that they are that position. Columns ``shown`` of the state (``state_of`` observations) and
-    of the plans are kept too.
+    A plan was made every ``interval`` steps. ``elsewhere`` are rollouts in another environment than the task's own:
+    they have neither modes nor bodies. For a task without an environment the columns that actions are about are kept.
 
     Returns:
         dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``
         ``[E, T, act]``, ``plan`` ``[E, P, H, 2]`` and ``plan_step`` ``[E, P]`` (NaN and -1 padding; empty for open-loop
         execution, whose cache holds actions); for a task with objects ``object_position`` ``[E, T, objects, 2]`` and
-        ``context`` ``[E, objects, 3]``; with ``state_of`` ``column`` ``[k]``, ``state`` ``[E, T, k]`` and
+        ``context`` ``[E, objects, 3]``; without an environment ``column`` ``[k]``, ``state`` ``[E, T, k]`` and
         ``state_plan`` ``[E, P, H, k]``, NaN behind the end.
     """
     pad, last = partial(pad_sequence, batch_first=True), [episode[-1]["next"] for episode in episodes]
     frames = [torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]) for episode in episodes]
-    columns = [slice(part.start, part.start + 2) for part in (position, *objects)]
+    modes, bodies = (Modes(), ()) if elsewhere else (task.modes, task.bodies)
+    starts = [task.observation[part].start for part in (task.position, *(body.position for body in bodies))]
+    columns = [slice(start, start + 2) for start in starts]
     paths = [torch.stack([seen[:, part] for part in columns], 1).float() for seen in frames]
     path = pad(paths, padding_value=torch.nan)
-    none = torch.zeros(0, 1, 1 + max((1, *shown)))
+    none = torch.zeros(0, 1, max(2, task.state_dim))
     made = [episode.get(PLAN, none)[::interval] for episode in episodes]
-    plans = [plan[..., :2] if plans_position else none[..., :2] for plan in made]
+    plans = [plan[..., :2] if task.plans_position else none[..., :2] for plan in made]
     tensors = {
         "position": path[:, :, 0].contiguous(),
         "length": torch.tensor([len(episode) for episode in episodes]),
@@ -140,13 +134,14 @@ def rollouts_to_tensors(
         "plan": pad(plans, padding_value=torch.nan),
         "action": pad([episode[ACTION] for episode in episodes], padding_value=torch.nan),
     }
-    if state_of is not None:
-        chosen, plans = list(shown), made
+    if task.env is None:
+        about = task.targets or task.moved_columns() or task.robot or range(task.state_dim)
+        chosen, plans = list(about[:SHOWN]), made
         tensors["column"] = torch.tensor(chosen)
-        tensors["state"] = pad([state_of(seen)[:, chosen] for seen in frames], padding_value=torch.nan)
+        tensors["state"] = pad([task.state_of(seen)[:, chosen] for seen in frames], padding_value=torch.nan)
         tensors["state_plan"] = pad([plan[..., chosen] for plan in made], padding_value=torch.nan)
     tensors["plan_step"] = pad([torch.arange(len(plan)) * interval for plan in plans], padding_value=-1)
-    if objects:
+    if bodies:
         tensors["object_position"] = path[:, :, 1:].contiguous()
         tensors["context"] = torch.stack([end[CONTEXT] for end in last])
     return tensors
