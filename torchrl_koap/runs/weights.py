@@ -6,7 +6,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -100,9 +100,14 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _digest(tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> str:
-    digest = hashlib.sha256(json.dumps(facts).encode())
-    for name in sorted(tensors):
-        value = tensors[name].detach().cpu().contiguous()
+    return digest_of(sorted(tensors.items()), json.dumps(facts).encode())
+
+
+def digest_of(named: Iterable[tuple[Any, Tensor]], start: bytes = b"") -> str:
+    """Computes the SHA-256 of some bytes and then of tensors, their names, types and shapes included."""
+    digest = hashlib.sha256(start)
+    for name, tensor in named:
+        value = tensor.detach().cpu().contiguous()
         digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
         digest.update(value.reshape(-1).view(torch.uint8).numpy())
     return digest.hexdigest()

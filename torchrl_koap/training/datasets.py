@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from tensordict import TensorDictBase
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.runs.config_files import read_config
 from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import digest_of
 
 # what is derived from these may differ from version to version
 _RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("next", "observation"), ("next", "done"))
@@ -23,13 +23,8 @@ _RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("n
 
 def fingerprint(data: TensorDictBase) -> dict[str, Any]:
     """What tells flat data ``[N]`` from others: their size, and a checksum of what was recorded."""
-    digest = hashlib.sha256()
     present = set(data.keys(True, True))
-    for name in [name for name in _RECORDED if name in present]:
-        value = data.get(name).detach().cpu().contiguous()
-        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.reshape(-1).view(torch.uint8).numpy())
-    return {"steps": len(data), "sha256": digest.hexdigest()}
+    return {"steps": len(data), "sha256": digest_of((name, data.get(name)) for name in _RECORDED if name in present)}
 
 
 def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int = 0) -> list[int]:
