@@ -48,14 +48,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         torch.Size([4, 2])
     """
 
-    def __init__(
-        self,
-        task: str,
-        root: str | Path,
-        *,
-        label_budget: LabelBudget | None = None,
-        **kwargs: Any,
-    ):
+    def __init__(self, task: str, root: str | Path, *, label_budget: LabelBudget | None = None, **kwargs: Any):
         self.root = Path(root).expanduser()
         data, self.task = open_dataset(root, task=get_task(task))
         self.label_report: LabelReport | None = None

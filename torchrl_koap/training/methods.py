@@ -172,12 +172,7 @@ for _method in (
         updates=1000,
         execution=_AS_PLANNED,
     ),
-    Method(
-        "linear_steps",
-        "ridge on KOAP's scaled steps",
-        partial(_koap, num_features=0),
-        closed_form=True,
-    ),
+    Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
     Method(
         "pca",
         "ridge on principal components of unlabelled windows",

@@ -29,12 +29,7 @@ from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.controller import check_lengths, learn_controller
-from torchrl_koap.training.datasets import (
-    choose_held_out,
-    fingerprint,
-    held_out_by,
-    split_held_out,
-)
+from torchrl_koap.training.datasets import choose_held_out, fingerprint, held_out_by, split_held_out
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.methods import get_method

@@ -20,10 +20,7 @@ from torchrl_koap.training.method import Method
 
 
 def policy_facts(
-    task: Task,
-    *,
-    reads: StateReader | None = None,
-    ranges: Sequence[Sequence[float] | None] | None = None,
+    task: Task, *, reads: StateReader | None = None, ranges: Sequence[Sequence[float] | None] | None = None
 ) -> dict[str, Any]:
     """The facts of a task as keyword arguments of :func:`~torchrl_koap.modules.make_policy`.
 

@@ -57,11 +57,7 @@ class FrozenImageEncoder(ObservationTransform):
     """
 
     def __init__(
-        self,
-        backbone: Backbone | None = None,
-        *,
-        projection: nn.Module | None = None,
-        size: int | Sequence[int] = 96,
+        self, backbone: Backbone | None = None, *, projection: nn.Module | None = None, size: int | Sequence[int] = 96
     ):
         super().__init__(in_keys=["pixels"], out_keys=["embedding"])
         self.backbone = load_backbone() if backbone is None else backbone

@@ -30,12 +30,7 @@ from tensordict import TensorDict
 
 from torchrl_koap.data import flatten_trajectories, save_ted
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.disturbances import (
-    KINDS,
-    Disturbances,
-    choose_disturbed,
-    disturbed_columns,
-)
+from torchrl_koap.envs.experts.disturbances import KINDS, Disturbances, choose_disturbed, disturbed_columns
 from torchrl_koap.envs.experts.recording import FAULTS, Attempt, expert_of, play
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.files import one_at_a_time, replacing_file
