@@ -7,7 +7,6 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -43,12 +42,7 @@ BLIND = 1000  # updates at most where there is nothing to hold out
 
 
 def learn_planner(
-    task: Task,
-    config: TrainConfig,
-    data: TensorDictBase,
-    loop: Phases,
-    *,
-    held_out: TensorDictBase | None = None,
+    task: Task, config: TrainConfig, data: TensorDictBase, loop: Phases, *, held_out: TensorDictBase | None = None
 ) -> tuple[StatePlanner, dict[str, float]]:
     """Builds and trains a planner on flat data ``[N]`` with the whole ``state``; no action is looked at.
 
@@ -79,16 +73,13 @@ def learn_planner(
     del windows  # as large as the data many times over
     buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
-    def draw() -> TensorDictBase:
-        return augment(buffer.sample())[:, unseen:]
-
     weights = column_weights(task)
     loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision], weights=weights).to(config.run.device)
     best = None if score is None else BestWeights(loss, score, check_interval(section, planner.num_steps))
     values = loop(
         "planner",
         loss,
-        draw,
+        lambda: augment(buffer.sample())[:, unseen:],
         num_steps=section.steps,
         learning_rate=section.learning_rate,
         weight_decay=WEIGHT_DECAY,
@@ -101,11 +92,6 @@ def learn_planner(
         planner.load_state_dict(best.network.state_dict())
         values["held_out_seconds"] = best.seconds
     return planner, values
-
-
-def usual_step(windows: Tensor) -> Tensor:
-    """Root mean square ``[d]`` of what columns change in a control step, of the first one of windows ``[N, T, d]``."""
-    return (windows[:, 1] - windows[:, 0]).square().mean(0).sqrt()
 
 
 def column_weights(task: Task) -> Tensor | None:
@@ -172,16 +158,18 @@ def augmentation(task: Task, windows: Tensor, *, actions: bool = False) -> Tenso
         steps.append(RandomPlanarTransform(points, directions, history=HISTORY, turned_actions=turned))
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
-        tool: dict[str, Any] = {"tool": task.tool_columns, "kinematics": task.tool_position}
-        sigma = task.defaults.recovery
+        sigma: float | Tensor | None = task.defaults.recovery
+        if sigma is None:  # what columns usually change in a control step
+            sigma = (windows[:, 1] - windows[:, 0]).square().mean(0).sqrt()
         steps.append(
             RecoveryAugmentation(
-                usual_step(windows) if sigma is None else sigma,
+                sigma,
                 history=HISTORY,
                 under_way=task.env is None,
                 columns=arm,
+                tool=task.tool_columns,
+                kinematics=task.tool_position,
                 moved_by=moved_by,
-                **tool,
             )
         )
     if task.gripper is not None and not actions:
