@@ -31,7 +31,10 @@ def drawn(task, mode, folder=Path("run")):
 
 
 def test_modes_histogram(tmp_path):
-    save_file({"mode": np.array([5, 5, 6, -1])}, tmp_path / "demonstrations.safetensors")
+    gaps = [(0.4, 0.5, 0.42), (0.4, 0.5, 0.42), (0.4, 0.5, 0.58)]  # of modes 5, 5 and 6
+    paths = [np.stack([x, (-0.1, 0.08, 0.27)], 1) for x in gaps] + [np.array([[0.5, -0.3]])]
+    recorded = {"position": np.concatenate(paths), "episode": np.repeat(range(4), [3, 3, 3, 1])}
+    save_file(recorded, tmp_path / "demonstrations.safetensors")
     figure = drawn("avoiding", [0, 0, 23, 23, -1], tmp_path)
     axes = figure.axes[0]
     assert [bar.get_height() for bar in axes.patches] == [2] + [0] * 22 + [2]

@@ -109,16 +109,16 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 def recorded_modes(demonstrations: Path, modes: Modes) -> np.ndarray:
     """Returns the modes of the demonstrations that are decided; none where paths do not tell them.
 
-    The file holds ``mode`` ``[episodes]``, or ``position`` ``[N, 2]`` (m) and ``episode`` ``[N]``.
+    The file holds ``position`` ``[N, 2]`` (m) and ``episode`` ``[N]``.
     """
-    data = load_file(demonstrations) if demonstrations.exists() else {}
-    found = entry(data, "mode", [None]).astype(int) if "mode" in data else np.zeros(0, int)
     mode_of_path = resolve(modes.of_path, "of_path of the modes")
-    if "mode" not in data and mode_of_path is not None and "position" in data:
-        position = entry(data, "position", [None, 2])
-        episode = entry(data, "episode", [len(position)])
-        paths = np.split(position, np.flatnonzero(np.diff(episode) != 0) + 1)
-        found = np.array([mode_of_path(path) for path in paths], int)
+    data = load_file(demonstrations) if demonstrations.exists() else {}
+    if mode_of_path is None or "position" not in data:
+        return np.zeros(0, int)
+    position = entry(data, "position", [None, 2])
+    episode = entry(data, "episode", [len(position)])
+    paths = np.split(position, np.flatnonzero(np.diff(episode) != 0) + 1)
+    found = np.array([mode_of_path(path) for path in paths], int)
     return found[(found >= 0) & (found < modes.number)]
 
 
