@@ -13,7 +13,6 @@ import tyro
 
 from torchrl_koap.commands.options import Command
 from torchrl_koap.data.ted import read_about
-from torchrl_koap.lookup import lookup
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import get_task
@@ -68,8 +67,6 @@ class Embed(Command):
                 file = projection_of(asked.name)
         projection = None if file is None else Projection.load(file)
         recordings, task = read_sources(self.sources, asked)
-        for name in self.camera:
-            lookup(recordings.cameras, name, "camera")
         frames = len(self.camera or recordings.cameras) * sum(map(len, recordings.states))
         with progress_bar(frames, "embedding", unit="frame", delay=1) as bar:
             reports = embed_recordings(
