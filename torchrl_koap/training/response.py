@@ -6,6 +6,7 @@ A ridge regression of single steps comes first, then nonlinear least squares of 
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -100,26 +101,22 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
         raise ValueError(
             f"following plans by prediction needs {response.memory} labelled steps in a row at least, there are none"
         )
-    best = None
-    folds = _folds(steps)
+    folds, found = _folds(steps), dict[bool, float]()
     for coupled in (False, True) if folds is not None else ():
         errors = []
         for fold in range(_FOLDS):
             out = folds == fold
-            if not out.any() or out.all():
-                continue
             _fit(response, data, take(steps, ~out), changes, coupled=coupled)
             errors.append(prediction_errors(response, _stretches(response, data, take(steps, out), changes)).flatten())
         errors = torch.cat(errors)
-        error = errors.pow(2).mean().sqrt().item() if len(errors) else float("inf")
-        if best is None or error < best[0]:
-            best = error, coupled
-    error, coupled = best if best is not None and best[0] < float("inf") else (None, False)
+        found[coupled] = errors.pow(2).mean().sqrt().item() if len(errors) else math.inf
+    coupled = min(found, key=found.__getitem__, default=False)
+    error = found.get(coupled, math.inf)
     _fit(response, data, steps, changes, coupled=coupled)
     return {
         "coupled": coupled,
         "labels_used": len(steps.row),
-        "held_out_error": None if error is None else float(f"{error:.4g}"),
+        "held_out_error": float(f"{error:.4g}") if error < math.inf else None,
     }
 
 
@@ -146,21 +143,14 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
     segment = broken.cumsum(0) - 1
     known = ~after[row - 1].isnan().any(-1)
     # where the command is hidden, it is counted from the beginning of the stretch
-    command = torch.where(known.unsqueeze(-1), after[row - 1], _counted(changes[row - 1], segment))
+    total = changes[row - 1].cumsum(0)
+    counted = total - (total - changes[row - 1])[broken][segment]
+    command = torch.where(known.unsqueeze(-1), after[row - 1], counted)
     history = torch.stack([positions[row - back] for back in range(memory, -1, -1)], 1)
     past = torch.stack([changes[row - back] for back in range(memory, 0, -1)], 1)
     read = response.coordinates(history, command - positions[row], past)
     steps = (positions[row + 1] - positions[row]).reshape(-1, axes)
     return LabelledSteps(read, steps, segment, known, row), changes
-
-
-def _counted(changes: Tensor, segment: Tensor) -> Tensor:
-    """Sums of ``changes [n, J]`` from the beginning of each segment on."""
-    total = changes.cumsum(0)
-    first = torch.ones_like(segment, dtype=torch.bool)
-    first[1:] = segment.diff() != 0
-    before = (total - changes)[first]
-    return total - before[segment]
 
 
 def _fit(
