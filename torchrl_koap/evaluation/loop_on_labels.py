@@ -208,15 +208,13 @@ def _roll(
     agent.reset()
     origin, added = policy.origins or (0.0, 0.0)  # the agent reads and tells the robot's numbers
     for _ in range(steps):
-        if not (now.abs() < AWAY).all():
-            break
         action = agent.act(now + origin).double().cpu() - added
         change = response.step(now, change, action)
         now = now + change
         commands.append(action)
         visited.append(now)
-    if not (now.abs() < AWAY).all():
-        return torch.stack(commands), math.inf, math.inf
+        if not (now.abs() < AWAY).all():
+            return torch.stack(commands), math.inf, math.inf
     spread, recorded = _spread(data), observed[observed.isfinite().all(-1)]
     ways = [observed[data[EPISODE] == number][1 : steps + 2] for number in data[EPISODE][starts].tolist()]
     usual = torch.stack([_way(rows - rows[:1], spread) for rows in ways]).median()
