@@ -51,23 +51,17 @@ def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: in
     with plans spread over the steps (Hz).
     """
     device = device_of(policy)
-    observed = torch.zeros(1, policy.history, observation_dim, device=device)
-    td = TensorDict({policy.in_keys[0]: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
-    between: list[float] = []
-    with_plan: list[float] = []
-    for repeat in range(repeats + 3):
-        td["is_init"] = torch.ones(1, 1, dtype=torch.bool, device=device)
-        for kind in (with_plan, between):
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
+    td = TensorDict({policy.in_keys[0]: torch.zeros(1, policy.history, observation_dim)}, [1], device=device)
+    took: dict[bool, list[float]] = {True: [], False: []}  # with a plan, and without
+    for _ in range(repeats + 3):
+        for begins, times in took.items():
+            td["is_init"] = torch.full((1, 1), begins, device=device)
             began = time.perf_counter()
             td = policy(td)
-            td[ACTION].sum().item()
-            if repeat >= 3:  # the first calls warm caches up
-                kind.append((time.perf_counter() - began) * 1e3)
-            td["is_init"] = torch.zeros(1, 1, dtype=torch.bool, device=device)
-    control = statistics.median(between)
-    plan = max(statistics.median(with_plan) - control, 0.0)
+            td[ACTION].sum().item()  # waits for a GPU
+            times.append((time.perf_counter() - began) * 1e3)
+    with_plan, control = (statistics.median(times[3:]) for times in took.values())  # the first calls warm caches up
+    plan = max(with_plan - control, 0.0)
     rate = 1e3 / (control + plan / policy.execution.replan_interval)
     return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
 
