@@ -207,10 +207,10 @@ def _film_frames(actions: np.ndarray, task: Task, context: np.ndarray | None, st
     from torchrl_koap.envs.mujoco.rendering import Renderer
     from torchrl_koap.envs.registry import make_env
 
-    env = make_env(task, 1, max_steps=len(actions) + 1, dtype=torch.float64)
-    renderer: Any = None
-    try:
-        renderer = Renderer(env.sims.model, *SIZE, shadows=False)
+    with (
+        contextlib.closing(make_env(task, 1, max_steps=len(actions) + 1, dtype=torch.float64)) as env,
+        contextlib.closing(Renderer(env.sims.model, *SIZE, shadows=False)) as renderer,
+    ):
         data = env.reset() if context is None else env.reset(contexts=context)
         yield renderer.render(env.sims.data[0], task.scene.camera)
         for number, action in enumerate(actions):
@@ -220,7 +220,3 @@ def _film_frames(actions: np.ndarray, task: Task, context: np.ndarray | None, st
                 yield renderer.render(env.sims.data[0], task.scene.camera)
             if last:
                 return
-    finally:
-        if renderer is not None:
-            renderer.close()
-        env.close()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,9 +99,8 @@ def record_videos(
         task="take a piece out of the bowl with the spoon",
     )
     arm, stream = SpoonKinematics(), sorted(HABITS).index(embodiment)
-    renderer = Renderer(sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)
     attempts, frames, again = 0, 0, 0
-    try:
+    with closing(sims), closing(Renderer(sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)) as renderer:
         for number in range(episodes):
             for attempt in range(MAX_ATTEMPTS):
                 own = (seed, stream, number, attempt)
@@ -119,8 +119,5 @@ def record_videos(
             frames, again = frames + len(pictures), again + int(expert.attempts > 1)
             if progress is not None:
                 progress(number + 1, episodes)
-    finally:
-        renderer.close()
-        sims.close()
     writer.close()
     return VideoReport(embodiment, episodes, attempts, frames, again)
