@@ -1,19 +1,33 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Noise of a stated size on the end effector, in specs, rollouts and any batch."""
+"""Partial observability: dropped parts, noise of a stated size, the same in specs, rollouts and any batch."""
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import SortingEnv
-from torchrl_koap.envs.transforms import EndEffectorNoise
+from torchrl_koap.envs.transforms import EndEffectorNoise, PartialObservation
 from torchrl_koap.tasks import get_task
 
 
-def test_specs_stay_those_of_the_environment():
-    check_env_specs(TransformedEnv(SortingEnv(2, seed=0), EndEffectorNoise("po_sorting", sigma=0.002)))
+def test_po_sorting_is_sorting_plus_transforms():
+    env = TransformedEnv(
+        SortingEnv(2, seed=0), Compose(EndEffectorNoise("po_sorting", sigma=0.002), PartialObservation("po_sorting"))
+    )
+    check_env_specs(env)
+    assert env.observation_spec["observation"].shape == (2, 10)
+    data = env.rollout(3)
+    assert data["observation"].shape == (2, 3, 10) and data["next", "observation"].shape == (2, 3, 10)
+
+
+def test_what_remains_is_what_the_task_shows_its_planner():
+    observation, hide = torch.randn(7, 16), PartialObservation("po_sorting")
+    partial = hide(TensorDict({"observation": observation.clone()}, [7]))["observation"]
+    assert torch.equal(partial, observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]])
+    with pytest.raises(ValueError, match="has 16 columns, got 20"):
+        hide(TensorDict({"observation": torch.zeros(1, 20)}, [1]))
 
 
 def test_noise_has_the_stated_size_and_touches_nothing_else():

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Noise on the measured end effector, as PO-Sorting has it, as a TorchRL transform."""
+"""Partial observability as TorchRL transforms: what makes PO-Sorting of Sorting."""
 
 from __future__ import annotations
 
@@ -8,10 +8,44 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs.transforms import ObservationTransform
 
 from torchrl_koap.keys import OBSERVATION
 from torchrl_koap.tasks import Task, get_task
+
+
+class PartialObservation(ObservationTransform):
+    """Leaves of observations ``[*B, obs]`` what ``Task.state_of`` does: no command, and nothing of ``Task.hidden``.
+
+    Raises:
+        ValueError: when applied, if the observation has another number of columns than the task.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.envs.transforms import PartialObservation
+        >>> hide = PartialObservation("po_sorting")
+        >>> hide(TensorDict({"observation": torch.zeros(3, 16)}, [3]))["observation"].shape
+        torch.Size([3, 10])
+    """
+
+    def __init__(self, task: Task | str):
+        super().__init__(in_keys=[OBSERVATION], out_keys=[OBSERVATION])
+        self.task = get_task(task)
+
+    def _apply_transform(self, observation: Tensor) -> Tensor:
+        return self.task.state_of(observation)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """The specification without the columns that are left out."""
+        spec = observation_spec[OBSERVATION]
+        shape = (*spec.shape[:-1], self.task.state_dim)
+        observation_spec[OBSERVATION] = Unbounded(shape, device=spec.device, dtype=spec.dtype)
+        return observation_spec
 
 
 class EndEffectorNoise(ObservationTransform):
