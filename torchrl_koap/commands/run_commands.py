@@ -7,7 +7,7 @@ import shlex
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -45,7 +45,7 @@ class Train(Command):
         """Trains."""
         out = str(self.config.out)
         try:
-            train(self.config, command=" ".join(["koap", *sys.argv[1:]]))
+            train(self.config, command=shlex.join(["koap", *sys.argv[1:]]))
         except KeyboardInterrupt as interrupt:
             interrupt.args = (_how_to_go_on(self.config.out),)
             raise
@@ -252,7 +252,7 @@ class Bench(Curve):
         table: 1 (methods) or 2 (variants).
     """
 
-    table: int
+    table: Literal[1, 2]
 
     def __call__(self) -> dict[str, Any]:
         """Does what is missing of the table and writes its report."""

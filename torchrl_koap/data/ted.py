@@ -24,7 +24,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import DataError, read_json, replacing_folder, sha256_of
+from torchrl_koap.files import DataError, read_json, replacing_file, replacing_folder, sha256_of
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 
@@ -81,7 +81,8 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
         "notes": dict(notes or {}),
     }
     with replacing_folder(folder) as aside:
-        save_file({name: value.detach().cpu().clone().contiguous() for name, value in entries.items()}, aside / _STEPS)
+        with replacing_file(aside / _STEPS) as file:
+            save_file({name: value.detach().cpu().clone().contiguous() for name, value in entries.items()}, file)
         about |= {"bytes": (aside / _STEPS).stat().st_size, "sha256": sha256_of(aside / _STEPS)}
         (aside / _ABOUT).write_text(json.dumps(about, indent=1))
     return folder

@@ -52,7 +52,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
             try:
                 self._take(_begin(self.env, seed))
             except Exception as error:  # told with the first step: an episode without a step has no outcome
-                self._error = say(error)
+                self._error = f"reset: {say(error)}"
         return self._last, {}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:

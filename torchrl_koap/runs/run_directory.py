@@ -19,7 +19,8 @@ from torchrl_koap.lookup import lookup
 PREFIX = "pretrained:"
 # what a run is made of; evaluations, reports and checkpoints are made from it
 CAMERAS = "cameras"  # folder of what frames are embedded by
-FILES = ("config.json", "summary.json", "metrics.csv", "planner.safetensors", "controller.safetensors")
+_NETWORKS = ("planner.safetensors", "controller.safetensors")
+FILES = ("config.json", "summary.json", "metrics.csv", "demonstrations.safetensors", *_NETWORKS)
 
 
 class RunDirectoryError(ValueError):

@@ -247,22 +247,26 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
 
 
 def _tasks_of(datasets: Sequence[str]) -> tuple[str, ...]:
-    """The tasks that data sets name, else that of the only one."""
+    """The tasks that data sets name, else those that they are of."""
     named = tuple(text.partition("=")[0] for text in datasets if "=" in text)
     if named or not datasets:
         return named or (DEFAULT_TASK,)
-    return (find_task_of(datasets[0]).name,)
+    return tuple(dict.fromkeys(find_task_of(folder).name for folder in datasets))
 
 
 def _by_task(name: str, values: Sequence[str], tasks: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Task and path of every ``TASK=PATH``; a path alone is that of a single task."""
+    """Task and path of every ``TASK=PATH``; a path alone is that of a single task, which has one."""
+    seen: set[str] = set()
     for text in values:
         task, equals, path = text.partition("=")
-        if not equals and len(tasks) == 1:
+        if not equals and len(tasks) == len(values) == 1:
             task, path = tasks[0], text
         if not task or not path:
-            raise ValueError(f"{name} must be TASK=FOLDER where there are several tasks, got {text!r}")
+            raise ValueError(f"{name} must be TASK=FOLDER where there are several, got {text!r}")
         lookup(tasks, task, f"task of {name}:")
+        if task in seen:
+            raise ValueError(f"{name} names task {task!r} twice: one folder for each task")
+        seen.add(task)
         yield task, path
 
 

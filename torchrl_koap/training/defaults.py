@@ -87,7 +87,7 @@ def _taken_over(asked: PlannerConfig) -> PlannerConfig:
     if all(getattr(asked, field.name) is not None for field in fields(asked)):  # of a run that is resumed
         return asked
     theirs = read_config(RunDirectory(asked.source)).planner
-    for name in ("network", "width", "octaves", "frames"):
+    for name in (field.name for field in fields(asked) if field.name != "source"):
         if getattr(asked, name) not in (None, getattr(theirs, name)):
             raise ValueError(
                 f"planner.{name} {getattr(asked, name)!r} was asked for, but that of {asked.source} is"

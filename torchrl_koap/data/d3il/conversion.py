@@ -142,7 +142,8 @@ def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
             return files
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
-    raise FileNotFoundError("no demonstrations (*.pkl) in " + ", ".join(map(str, folders)))
+    looked = ", ".join(map(str, folders))
+    raise FileNotFoundError(f"no data set of `koap convert` and no demonstrations of D3IL (*.pkl) in {looked}")
 
 
 def read_raw(
