@@ -18,7 +18,8 @@ from torchrl_koap.runs import weights
     [
         (("--task", "avoidin"), "unknown task 'avoidin'; did you mean 'avoiding'?"),
         (("--labels", "few"), "--labels must be a number of trajectories such as 5, or a share such as 0.02"),
-        (("--labels.count", "9"), "9 labelled trajectories asked for, there are 8"),
+        (("--labels", "9"), "9 labelled trajectories asked for, there are 8"),
+        (("--labels.count", "9"), "give one of --labels, --labels.fraction, --labels.count, --labels.episodes, got"),
         (("--dataset", "nowhere"), "dataset 'nowhere' is no folder"),
         (("--planner.source", "nowhere"), "config.json is missing: is nowhere the folder of a finished"),
     ],

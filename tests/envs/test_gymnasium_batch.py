@@ -196,11 +196,11 @@ def test_errors_and_clipped_actions_are_recorded_and_the_others_go_on():
     for push in (5.0, 0.1):
         out = env.step(TensorDict({"action": torch.full((3, 2), push)}, [3]))["next"]
     assert out["done"].flatten().tolist() == [False, True, False]
-    assert record.errors == [{"seed": 11, "step": 1, "error": "RuntimeError: no place"}]
+    assert record.errors == [{"seed": 11, "step": 1, "error": "reset: RuntimeError: no place"}]
     assert (record.actions, record.clipped) == (5, 3)
     assert record.faults() == [
         "3 of 5 actions left the environment's box and were clipped to it",
-        "1 episodes failed by an error of the environment: seed 11, step 1: RuntimeError: no place",
+        "1 episodes failed by an error of the environment: seed 11, step 1: reset: RuntimeError: no place",
     ]
 
 
@@ -220,7 +220,7 @@ def test_a_wrong_observation_fails_its_episode_and_the_others_go_on(seen, said, 
     record = EpisodeRecord()
     rollout = run(GymnasiumBatch("ToyReach-v0", TASK, 3, record=record), 6, [10, 11, 12])
     step = max(at, 1)  # an error of a reset is told with the first step
-    assert record.errors == [{"seed": 11, "step": step, "error": f"ObservationError: {said}"}]
+    assert record.errors == [{"seed": 11, "step": step, "error": f"{'reset: ' * (at == 0)}ObservationError: {said}"}]
     assert rollout["done"].sum(1).flatten().tolist() == [1, 7 - step, 1]
     assert rollout["failed"].any(1).flatten().tolist() == [False, True, False]
     assert rollout["success"].any(1).flatten().tolist() == [True, False, True]

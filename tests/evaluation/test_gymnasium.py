@@ -58,7 +58,7 @@ def test_step_limit_success_and_arguments_are_said(arm_run, capsys):
 def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
     found = evaluate(arm_run, EvalConfig(episodes=3, seed=10, env="toy_gym:ToyBreaks-v0", threads=1))
     assert [row["outcome"] for row in found["episode"]] == ["success", "error", "success"]
-    assert found["errors"] == [{"seed": 11, "step": 1, "error": "RuntimeError: no place"}]
+    assert found["errors"] == [{"seed": 11, "step": 1, "error": "reset: RuntimeError: no place"}]
     assert any("failed by an error of the environment: seed 11, step 1" in fault for fault in found["faults"])
 
 

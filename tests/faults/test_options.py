@@ -6,7 +6,7 @@ import types
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import pytest
 from fault_ledger import EMBED, Fault, check, meet, table
@@ -76,7 +76,7 @@ def plain(kind: Any) -> tuple[Any, bool]:
         kind = next(part for part in get_args(kind) if part is not type(None))
     if get_origin(kind) is tuple:
         return get_args(kind)[0], True
-    return kind, False
+    return (type(get_args(kind)[0]) if get_origin(kind) is Literal else kind), False
 
 
 def options(command: type, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -39,6 +39,12 @@ def test_weights_bring_their_statistics(saved):
     assert torch.equal(model(x), other(x))
 
 
+def test_files_of_tensors_may_be_read_by_whom_other_files_may(tmp_path):
+    (tmp_path / "plain").touch()
+    save_tensors(tmp_path / "tensors", {"x": torch.zeros(2)})
+    assert (tmp_path / "tensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_parts_of_one_storage_and_odd_layouts_are_saved(tmp_path):
     base = torch.arange(12.0).reshape(3, 4)
     save_tensors(tmp_path / "a", {"row": base[1], "transposed": base.T, "same": base, "empty": base[:0]})

@@ -132,3 +132,14 @@ def test_data_and_planners_are_named_by_task(tmp_path):
     for wrong, message in (("demos", "must be TASK=FOLDER"), ("sortin=x", "unknown task of datasets: 'sortin'")):
         with pytest.raises(ValueError, match=message):
             complete(replace(study, datasets=(wrong,)))
+    with pytest.raises(ValueError, match="datasets names task 'sorting' twice"):
+        complete(replace(study, datasets=study.datasets * 2))
+
+
+def test_several_data_sets_must_name_their_tasks(tmp_path):
+    places = [tmp_path / name for name in ("one", "two")]
+    for place in places:
+        save_arm(place)
+    with pytest.raises(ValueError, match="must be TASK=FOLDER where there are several"):
+        complete(Study(out=tmp_path / "s", datasets=tuple(map(str, places))))
+    assert complete(Study(out=tmp_path / "s", datasets=(str(places[0]),))).tasks == ("arm",)

@@ -21,7 +21,7 @@ from torchrl_koap.studies.table import (
 def cell(method="koap", labels=0.02, seed=0, *, successes=20, episodes=30, **more):
     asked = ("avoiding", method, labels, 1.0, seed, "trajectory", "done", "", 4, 320 + seed, 4)
     found = (episodes, successes, successes / episodes, 0.1, 0.9, 0.5 + 0.1 * seed, 2, 80.5, 1.0 + seed, None, None, "")
-    row = (*asked, *found, 500, 12.25, 3.5, f"{method}/{labels}/{seed}")
+    row = (*asked, *found, 500, "", 12.25, 3.5, f"{method}/{labels}/{seed}")
     return dict(zip(CELL_COLUMNS, row, strict=True)) | more
 
 
@@ -95,6 +95,16 @@ def test_table_counts_failures_and_says_why():
     assert "- avoiding, koap, 2 % labels, seed 1: failed: RuntimeError: loss | not finite" in text
     assert "- avoiding, vae, 2 % labels, seed 1: missing" in text
     assert "not done" not in markdown_table([cell()])
+
+
+def test_the_labels_that_errors_are_of_are_named():
+    none = {"episodes": None, "successes": None, "relative_action_error": 0.5}
+    kinds = ("outside_budget", "left_out", "left_out")
+    rows = [cell(labels=0.1 + i // 2, seed=i, action_errors_on=kind) | none for i, kind in enumerate(kinds)]
+    assert [row["action errors on"] for row in table_rows(summarise(rows))] == [
+        "left out and outside budget",
+        "left out",
+    ]
 
 
 def test_columns_that_say_nothing_are_left_out():

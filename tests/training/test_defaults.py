@@ -97,8 +97,9 @@ class TestThePlanner:
         RunDirectory(tmp_path).write_json("config.json", to_json(theirs))
         mine = resolved(planner=PlannerConfig(source=tmp_path)).planner
         assert mine == replace(theirs.planner, source=tmp_path)
-        with pytest.raises(ValueError, match="planner.width 64 was asked for, but that of .* is 8"):
-            resolved(planner=PlannerConfig(source=tmp_path, width=64))
+        for name, asked in (("width", 64), ("steps", 9)):
+            with pytest.raises(ValueError, match=f"planner.{name} {asked} was asked for, but that of .* is"):
+                resolved(planner=PlannerConfig(source=tmp_path, **{name: asked}))
 
 
 class TestExecution:

@@ -103,7 +103,7 @@ def expand(words: Sequence[str]) -> list[str]:
     found: list[str] = []
     from_file: list[str] = []
     amounts = [name for name in (word.partition("=")[0] for word in words) if name in AMOUNTS]
-    if "--labels" in amounts and len(amounts) > 1:
+    if "--labels" in amounts and set(amounts) != {"--labels"}:
         raise ValueError(f"give one of {', '.join(AMOUNTS)}, got {' and '.join(amounts)}")
     rest = iter(words)
     for word in rest:

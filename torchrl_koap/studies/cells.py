@@ -141,7 +141,7 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
         "controller_updates": summary["controller_updates"],
     }
     if result.get("kind") == KIND:
-        names = ("relative_plan_error", "relative_action_error")
+        names = ("relative_plan_error", "relative_action_error", "action_errors_on")
         return common | {"kind": KIND} | {name: result[name] for name in names}
     entropy, success = result.get("mode_entropy"), result["rates"]["success"]
     common |= {name: result.get(name) for name in ("episodes", "collisions", "mean_steps")}

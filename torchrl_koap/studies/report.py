@@ -54,6 +54,12 @@ _CAPTIONS = {
 }
 
 
+_MIXED = (
+    ' Points of one line are of different recordings here: see "action errors on" in the table. Compare methods at one'
+    " share of labels, not shares of labels."
+)
+
+
 def write_study_report(
     folder: str | Path,
     rows: Sequence[Mapping[str, Any]],
@@ -135,9 +141,11 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
             path = folder / FOLDER / f"{name}_{kind}.png"
             counted = plural_of(label_unit) if label_unit else ""
             plot_measure(main, path, kind, methods=methods, label_unit=counted, **wanted[kind])
+            kinds = {compared for item in main for compared in item.action_errors_on}
+            mixed = kind == "relative_action_error" and len(kinds) > 1
             used = f" All with {percent(shares[-1])} of the demonstrations." if shares[-1] != 1 else ""
             hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
-            figures.append(_figure(name, kind, task, used + hollow if kind == "success" else ""))
+            figures.append(_figure(name, kind, task, used + hollow if kind == "success" else _MIXED if mixed else ""))
         if len(shares) > 1 and "success" in known:
             plot_measure(items, folder / FOLDER / f"{name}_demonstrations.png", by=("demonstrations",), methods=methods)
             figures.append(_figure(name, "demonstrations", task))

@@ -262,7 +262,7 @@ def _by_task(name: str, values: Sequence[str], tasks: Sequence[str]) -> Iterator
         if not equals and len(tasks) == len(values) == 1:
             task, path = tasks[0], text
         if not task or not path:
-            raise ValueError(f"{name} must be TASK=FOLDER where there are several, got {text!r}")
+            raise ValueError(f"{name} must be TASK=FOLDER where there are several tasks or values, got {text!r}")
         lookup(tasks, task, f"task of {name}:")
         if task in seen:
             raise ValueError(f"{name} names task {task!r} twice: one folder for each task")

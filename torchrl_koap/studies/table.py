@@ -21,7 +21,7 @@ CELL_COLUMNS = (
     *("labelled_units", "labelled_transitions", "trajectories_touched"),
     *("episodes", "successes", "success_rate", "success_low", "success_high", "mode_entropy", "collisions"),
     *("mean_steps", "action_error", "relative_action_error", "relative_plan_error", "kind", "controller_updates"),
-    *("train_seconds", "eval_seconds", "run"),
+    *("action_errors_on", "train_seconds", "eval_seconds", "run"),
 )
 _MEASURES = (
     *("mode_entropy", "action_error", "relative_action_error", "relative_plan_error"),
@@ -63,6 +63,7 @@ class Summary:
     successes: int
     episodes: int
     measures: Mapping[str, Measure]
+    action_errors_on: tuple[str, ...] = ()  # the labels that action errors without an environment are of
 
     @property
     def offline(self) -> bool:
@@ -131,8 +132,18 @@ def _summary(task: str, method: str, labels: float, demonstrations: float, unit:
         rates = [row["successes"] / row["episodes"] for row in rolled_out]
         measures["success"] = Measure(successes / episodes, *wilson_interval(successes, episodes))
         measures["seed_success"] = Measure(successes / episodes, min(rates), max(rates))
+    compared = tuple(sorted({row["action_errors_on"] for row in done if row.get("action_errors_on")}))
     return Summary(
-        task, method, labels, demonstrations, unit, **seeds, successes=successes, episodes=episodes, measures=measures
+        task,
+        method,
+        labels,
+        demonstrations,
+        unit,
+        **seeds,
+        successes=successes,
+        episodes=episodes,
+        measures=measures,
+        action_errors_on=compared,
     )
 
 
@@ -158,6 +169,7 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
             "demonstrations used": percent(item.demonstrations),
             "method": item.method,
             **_success(item),
+            "action errors on": " and ".join(item.action_errors_on).replace("_", " "),
             "seeds": f"{len(item.done)} of {len(item.done) + len(item.failed) + len(item.missing)}",
             "not done": "; ".join(
                 f"{word}: seed {', '.join(map(str, seeds))}"

@@ -123,8 +123,8 @@ def plan_score(
 
     It is the energy score of plans as a share of standing still's, times the square of how far they are from recordings
     (:func:`relative_distance`). The energy score is best long before rollouts are: it rewards plans that spread, and
-    what is executed is one of them. The product orders planners nearly as rollouts do on Push-T and Avoiding, less so on
-    Meta-World, and not on Adroit's door (``benchmarks/planner_scores.py``).
+    what is executed is one of them. The product orders planners nearly as rollouts do on Push-T and Avoiding, less so
+    on Meta-World, and not on Adroit's door (``benchmarks/planner_scores.py``).
 
     Flat data ``[N]`` have ``state``; recorded are windows ``[M, T, d]`` that end with the planner's horizon. Planners
     have the frames of the one given.
