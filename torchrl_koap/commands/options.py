@@ -133,11 +133,10 @@ def _words_of(path: Path, amounts: Sequence[str]) -> list[str]:
     if not path.is_file():
         raise ValueError(f"--config {path}: there is no such file")
     options = {name: value for name, value in read_json(path).items() if name not in FACTS}
-    labels = options.pop("labels", None)
-    if isinstance(labels, Mapping) and amounts and "--labels" not in amounts:
-        labels = {name: value for name, value in labels.items() if f"--labels.{name}" not in AMOUNTS}
-    if labels is not None and "--labels" not in amounts:
-        options["labels"] = labels
+    if "--labels" in amounts:
+        options.pop("labels", None)
+    elif amounts and isinstance(labels := options.get("labels"), Mapping):
+        options["labels"] = {name: value for name, value in labels.items() if f"--labels.{name}" not in AMOUNTS}
     from_json(TrainConfig, {"out": ""} | options, path)
     return list(_flat(options))
 

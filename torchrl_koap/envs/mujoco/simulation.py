@@ -26,12 +26,13 @@ class Simulations:
     """
 
     _episode: dict[str, np.ndarray]  # what decides the future beside the physics, a row per simulation
-    _CONNECTED: tuple[str, ...] = ("_executor", "_executor_pid")
 
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
         self.model, self.num_threads = model, num_threads
         self.data = [mujoco.MjData(model) for _ in range(num_sims)]
+        before = set(vars(self))
         self._connect()
+        self._connected = set(vars(self)) - before
 
     def _connect(self) -> None:
         """Sets what belongs to this process and this object alone; a copy, or what is unpickled, sets its own."""
@@ -39,7 +40,7 @@ class Simulations:
         self._executor_pid: int | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in self._CONNECTED}
+        return {name: value for name, value in vars(self).items() if name not in self._connected}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -90,16 +91,6 @@ class Simulations:
 
 class SimulationBatch(Simulations):
     """Simulations of D3IL's arm under its controller, in a :func:`~torchrl_koap.envs.mujoco.scene.scene`."""
-
-    _CONNECTED = (
-        *Simulations._CONNECTED,
-        "_step",
-        "_data_addresses",
-        "_pointers",
-        "_tcp_views",
-        "_arm_views",
-        "_object_views",
-    )
 
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
         joint = model.joint(f"{PANDA}joint1")
