@@ -5,6 +5,7 @@ import re
 import socket
 import subprocess
 import sys
+from importlib.metadata import metadata
 from pathlib import Path
 
 import pytest
@@ -120,7 +121,10 @@ def test_doctor_lists_versions(capsys):
     lines = dict(line.split("  ", 1) for line in capsys.readouterr().out.splitlines())
     assert lines["torch"].strip() == torch.__version__ and lines["torchrl_koap"].strip() == "0.1.0"
     assert "MISSING" not in str(lines)
-    assert {"python", "processors", "CUDA", "mujoco", "extra wandb", "films are drawn with"} <= lines.keys()
+    assert {"python", "processors", "CUDA", "mujoco", "films are drawn with"} <= lines.keys()
+    extras = metadata("torchrl_koap").get_all("Provides-Extra")
+    assert {name.removeprefix("extra ") for name in lines if name.startswith("extra ")} == set(extras) - {"docs", "dev"}
+    assert "installed" in lines["extra wandb"]
 
 
 def test_demonstrations_are_recorded_once_and_are_sound(tmp_path, capsys):

@@ -77,6 +77,14 @@ def test_an_interrupted_training_says_how_to_go_on(copied_run, monkeypatch, caps
     assert said(copied_run / "new") == "koap: interrupted; nothing is trained yet: train again\n"
 
 
+def test_the_call_is_kept_as_a_shell_reads_it(tmp_path, monkeypatch):
+    train = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr(run_commands, "train", train)
+    monkeypatch.setattr(sys, "argv", ["koap", "train", "--out", "my arm"])
+    koap("train", "--out", tmp_path / "my arm")
+    assert train.call_args.kwargs["command"] == "koap train --out 'my arm'"
+
+
 def test_a_finished_run_may_be_resumed_and_stays_what_it_is(copied_run, monkeypatch):
     before = contents(copied_run)
     began = RunDirectory(copied_run).read_json("config.json")["command"]

@@ -155,3 +155,14 @@ def test_methods_differ_without_colour():
     styles = list(method_styles([f"method {number}" for number in range(27)]).values())
     assert len({str(style) for style in styles}) == 27 and len({style["marker"] for style in styles[:12]}) == 12
     assert len({(style["color"], str(style["linestyle"])) for style in styles[:12]}) == 12
+
+
+@pytest.mark.parametrize(
+    ("kinds", "mixed"), [(("left_out", "left_out"), False), (("outside_budget", "left_out"), True)]
+)
+def test_a_line_through_errors_of_different_recordings_is_told(tmp_path, kinds, mixed):
+    rows = make_cells(seeds=1, relative_action_error=0.5)
+    for row in rows:
+        row |= {"episodes": None, "successes": None, "action_errors_on": kinds[row["labels"] == 0.1]}
+    page = write_study_report(tmp_path, rows, title="curve").read_text()
+    assert ("Points of one line are of different recordings" in page) == mixed

@@ -122,6 +122,8 @@ def test_selected_entries_are_written_under_their_names():
         written = chosen(data.clone())
         assert torch.equal(written[name], whole[name]) and chosen.out_key == "action"
         assert set(written.keys()) == {"state", name}
+    swapped = make_model().select_out_keys("action", "latent_action")(data.clone())
+    assert torch.equal(swapped["latent_action"], whole["latent_action"])
 
 
 def test_bad_fits_are_explained():
