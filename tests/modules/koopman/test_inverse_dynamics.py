@@ -17,6 +17,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     ridge,
 )
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.ridge import INPUT_NOISE
 
 STATE_NORMALIZER = {"offset": torch.tensor([1.0, -2.0, 0.5]), "scale": torch.tensor([2.0, 0.1, 5.0])}
@@ -226,6 +227,16 @@ def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held()
 def test_parts_that_do_not_fit_are_refused(parts, message):
     with pytest.raises(ValueError, match=message):
         make_model(normalizers=False, parts=parts)
+
+
+def test_parts_are_called_with_tensors_as_well():
+    model, state = make_model(), windows(4)
+    lifted, latent = model.lifting(state), model.latent_action(state)
+    torch.testing.assert_close(lifted, model.lifting.encode(state))
+    torch.testing.assert_close(model.operator(lifted, latent), model.operator.step(lifted, latent))
+    torch.testing.assert_close(model.action_decoder(latent_action=latent), model.decode(latent))
+    compact = CompactLifting(3, 4)
+    torch.testing.assert_close(compact(state=state), compact.encode(state))
 
 
 def test_the_inference_path_compiles():

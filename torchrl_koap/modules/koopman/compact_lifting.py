@@ -10,7 +10,7 @@ import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
 from torchrl_koap.keys import LIFTED_STATE, STATE, read_entry
@@ -269,6 +269,7 @@ class CompactLifting(TensorDictModuleBase):
         large = bool(sums[1].sqrt() < GAIN * sums[0].sqrt())
         self.kept[: self.coordinates], self.kept[self.coordinates :] = float(not large), float(large)
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the lifted states."""
         return tensordict.set(self.out_keys[0], self.encode(read_entry(self, tensordict, self.in_keys[0])))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torchrl.modules import LSTM, MLP
 
@@ -94,6 +94,7 @@ class LatentActionModule(TensorDictModuleBase):
     def finish(self, windows: Tensor) -> None:
         """Fits to windows ``[*B, T, d]`` without labels what is fitted after training; most have nothing."""
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the latent action of every frame of the window."""
         return tensordict.set(self.out_keys[0], self.infer(self.gather(read_entry(self, tensordict, self.in_keys[0]))))
@@ -266,6 +267,7 @@ class LinearActionDecoder(TensorDictModuleBase):
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.linear = nn.Linear(latent_dim, action_dim)
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the decoded actions."""
         return tensordict.set(self.out_keys[0], self.linear(read_entry(self, tensordict, self.in_keys[0])))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
@@ -116,6 +116,7 @@ class KoopmanLifting(TensorDictModuleBase):
         """Computes the mean squared error ``[*B, T]`` of states mapped back from lifted ones ``[*B, T, m]``."""
         return (self.decode(lifted) - state).square().mean(-1)
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the lifted states."""
         return tensordict.set(self.out_keys[0], self.encode(read_entry(self, tensordict, self.in_keys[0])))
@@ -178,6 +179,7 @@ class KoopmanOperator(TensorDictModuleBase):
         following = lifted @ self.weight.mT
         return following + (latent_action if self.input is None else latent_action @ self.input.mT)
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the predicted next lifted state."""
         lifted, latent_action = (read_entry(self, tensordict, key, "in_keys=...") for key in self.in_keys)
