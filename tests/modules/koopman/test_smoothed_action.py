@@ -63,6 +63,14 @@ def test_the_choice_is_kept_by_the_weights():
     assert other.chosen == RAW and make_infer().chosen == LIFTED
 
 
+def test_the_choice_comes_with_weights_that_are_copied_as_tensors():
+    windows, infer, other = torch.randn(6, 17, 2).cumsum(1), make_infer(), make_infer()
+    infer.finish(windows)
+    infer.choose(RAW)
+    TensorDict.from_module(other).data.update_(TensorDict.from_module(infer).data)
+    assert torch.equal(other(state=windows), infer(state=windows))
+
+
 def test_the_raw_block_may_not_reach_further():
     with pytest.raises(ValueError, match="reads 4 frames back and 5 ahead: .* got 3 and 8"):
         make_infer(num_past=3)

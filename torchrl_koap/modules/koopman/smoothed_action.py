@@ -108,33 +108,31 @@ class LatentActionSmoothed(LatentActionModule):
         self.smoother = WienerSmoother(self.reader.num_frames, dim)
         self.register_buffer("spread", torch.ones(dim))
         self.register_buffer("gates", torch.tensor([1.0, 0.0]))
-        self.chosen = LIFTED
 
     @torch.no_grad()
     def choose(self, block: str) -> None:
         """Reads one block; the other is 0."""
-        self.gates.copy_(torch.tensor([float(name == block) for name in self.blocks]))
-        self.chosen = block
+        self.gates.copy_(torch.tensor([float(block == LIFTED), float(block == RAW)]))
 
-    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        self.chosen = self.blocks[int(self.gates.argmax())]  # kept beside the gates, which a compiled graph cannot read
+    @property
+    def chosen(self) -> str:
+        """The block that is read."""
+        return RAW if self.gates[1] else LIFTED
 
     def _lift(self, state: Tensor) -> Tensor:
         return self._lifting[0].encode(state) / self.spread
 
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Reads for the chosen block: smoothed steps and present frame ``[*B, T, F, m]``, or raw ``[*B, T, 9, d]``."""
-        if self.chosen == RAW:
-            return self.raw.gather(state, frames)
+        """Reads for both blocks: smoothed steps and present frame, then raw ones, flat: ``[*B, T, 1, F m + 9 d]``."""
         smoothed = self.smoother(self.reader.gather(self._lift(state), frames))
-        return self.reader.steps(smoothed) / self.lifted.reader.scales
+        lifted = self.reader.steps(smoothed) / self.lifted.reader.scales
+        return torch.cat([lifted.flatten(-2), self.raw.gather(state, frames).flatten(-2)], -1).unsqueeze(-2)
 
     def infer(self, read: Tensor) -> Tensor:
-        """Evaluates the observables of the chosen block ``[*B, T, m]``; the other is 0."""
-        if self.chosen == RAW:
-            return nn.functional.pad(self.raw.infer(read), (self.lifted.latent_dim, 0))
-        return nn.functional.pad(self.lifted.infer(read), (0, self.raw.latent_dim))
+        """Evaluates the observables of both blocks ``[*B, T, m]``; those of the one not chosen are 0."""
+        networks, frames = (self.lifted, self.raw), read.squeeze(-2).tensor_split((self.reader.num_features,), -1)
+        parts = [net.infer(own.unflatten(-1, (-1, net.state_dim))) for net, own in zip(networks, frames, strict=True)]
+        return torch.cat([gate * part for gate, part in zip(self.gates, parts, strict=True)], -1)
 
     def prepare(self, windows: Tensor) -> None:
         """Fits as :meth:`finish` does, to the lifting as it is before training."""
