@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,9 +100,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
-        task,
+        replace(task, modes=where.modes),
         interval=policy.execution.replan_interval,
-        elsewhere=config.env is not None,
     )
     if where.contexts is not None:  # in full precision: a film of the same episode starts from it
         rollouts["context"] = torch.from_numpy(where.contexts)

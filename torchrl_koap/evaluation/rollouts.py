@@ -20,7 +20,7 @@ from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, policy_transforms
 from torchrl_koap.modules.execution.policy_env import NOISE, NoiseStreams
-from torchrl_koap.tasks import Modes, Task
+from torchrl_koap.tasks import Task
 
 SHOWN = 6  # columns of plans that are drawn where nobody knows what lies in a plane
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
@@ -101,24 +101,22 @@ class _SeedsEpisodes(Protocol):
     def seed_episodes(self, seeds: Sequence[int]) -> None: ...
 
 
-def rollouts_to_tensors(
-    episodes: Sequence[TensorDict], task: Task, *, interval: int, elsewhere: bool = False
-) -> dict[str, Tensor]:
+def rollouts_to_tensors(episodes: Sequence[TensorDict], task: Task, *, interval: int) -> dict[str, Tensor]:
     """Stacks what the pictures need, padded to the longest episode.
 
-    A plan was made every ``interval`` steps. ``elsewhere`` are rollouts in another environment than the task's own:
-    they have neither modes nor bodies. For a task without an environment the columns that actions are about are kept.
+    A plan was made every ``interval`` steps. For a task without an environment the columns that actions are about are
+    kept.
 
     Returns:
         dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``
         ``[E, T, act]``, ``plan`` ``[E, P, H, 2]`` and ``plan_step`` ``[E, P]`` (NaN and -1 padding; empty for open-loop
-        execution, whose cache holds actions); for a task with objects ``object_position`` ``[E, T, objects, 2]`` and
-        ``context`` ``[E, objects, 3]``; without an environment ``column`` ``[k]``, ``state`` ``[E, T, k]`` and
+        execution, whose cache holds actions); where episodes have a context ``object_position`` ``[E, T, objects, 2]``
+        and ``context`` ``[E, objects, 3]``; without an environment ``column`` ``[k]``, ``state`` ``[E, T, k]`` and
         ``state_plan`` ``[E, P, H, k]``, NaN behind the end.
     """
     pad, last = partial(pad_sequence, batch_first=True), [episode[-1]["next"] for episode in episodes]
     frames = [torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]) for episode in episodes]
-    modes, bodies = (Modes(), ()) if elsewhere else (task.modes, task.bodies)
+    bodies = task.bodies if CONTEXT in last[0].keys() else ()  # other environments than the task's tell nothing of them
     starts = [task.observation[part].start for part in (task.position, *(body.position for body in bodies))]
     columns = [slice(start, start + 2) for start in starts]
     paths = [torch.stack([seen[:, part] for part in columns], 1).float() for seen in frames]
@@ -129,7 +127,7 @@ def rollouts_to_tensors(
     tensors = {
         "position": path[:, :, 0].contiguous(),
         "length": torch.tensor([len(episode) for episode in episodes]),
-        "mode": torch.stack([modes.index_of(end[MODE]) for end in last]),
+        "mode": torch.stack([task.modes.index_of(end[MODE]) for end in last]),
         "outcome": torch.tensor([OUTCOMES.index(outcome_of(episode)) for episode in episodes]),
         "plan": pad(plans, padding_value=torch.nan),
         "action": pad([episode[ACTION] for episode in episodes], padding_value=torch.nan),
