@@ -23,6 +23,8 @@ from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
 
+_REPEATS = 30  # of a plan and of a step without one, of whose times the medians are
+
 
 @dataclass
 class LatencyConfig:
@@ -44,7 +46,7 @@ class LatencyConfig:
 
 
 @torch.no_grad()
-def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
+def measure_latency(policy: PlanningPolicy, observation_dim: int) -> dict[str, float]:
     """Measures median times of a plan and of a control step between plans, at batch 1; three of each come before.
 
     In ms what a step with a plan takes longer, ``plan_ms``, and ``control_ms``; ``control_hz`` is the rate of control
@@ -53,7 +55,7 @@ def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: in
     device = device_of(policy)
     td = TensorDict({policy.in_keys[0]: torch.zeros(1, policy.history, observation_dim)}, [1], device=device)
     took: dict[bool, list[float]] = {True: [], False: []}  # with a plan, and without
-    for _ in range(repeats + 3):
+    for _ in range(_REPEATS + 3):
         for begins, times in took.items():
             td["is_init"] = torch.full((1, 1), begins, device=device)
             began = time.perf_counter()
