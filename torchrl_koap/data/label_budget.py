@@ -249,11 +249,11 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
     return result
 
 
-def subsample_trajectories(data: TensorDictBase, fraction: float, *, seed: int = 0) -> TensorDictBase:
+def subsample_trajectories(data: TensorDictBase, fraction: float) -> TensorDictBase:
     """Drops whole trajectories without a label until a share of all trajectories is left.
 
-    Trajectories with a label always stay. Of one seed, a smaller share is part of every larger one. Data ``[N]`` have
-    the label budget applied; what is left keeps its order.
+    Trajectories with a label always stay; a smaller share is part of every larger one. Data ``[N]`` have the label
+    budget applied; what is left keeps its order.
 
     Raises:
         ValueError: if the share is outside (0, 1], or smaller than that of the trajectories with labels.
@@ -270,7 +270,7 @@ def subsample_trajectories(data: TensorDictBase, fraction: float, *, seed: int =
         )
     if number == len(lengths):
         return data
-    order = torch.randperm(len(lengths), generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(len(lengths), generator=torch.Generator().manual_seed(0))
     order = torch.cat([order[labelled[order]], order[~labelled[order]]])
     kept = torch.zeros(len(lengths), dtype=torch.bool)
     kept[order[:number]] = True
