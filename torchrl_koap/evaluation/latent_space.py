@@ -62,7 +62,7 @@ def prediction_errors(
     fit_on: Tensor,
     parts: Mapping[str, Sequence[int]],
     *,
-    horizon: int = 10,
+    horizon: int,
 ) -> dict[str, dict[str, list[float]]]:
     r"""Measures how far predicted states are from recorded ones, ``1 .. horizon`` steps ahead, for three models.
 
