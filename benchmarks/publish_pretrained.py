@@ -121,13 +121,13 @@ def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
     low, high = wilson_interval(len(won), len(rows))
     shown = [row for row in won if row["mode"] >= 0]
     if rows[0].get("context") is None:
-        entropy = mode_entropy([row["mode"] for row in shown], task.num_modes)
+        entropy = mode_entropy([row["mode"] for row in shown], task.modes.number)
     else:  # several rollouts in each context
         groups: dict[int, list[int]] = {row["context"]: [] for row in rows}
         for row in shown:
             groups[row["context"]].append(row["mode"])
         unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
-        entropy = conditional_entropy(list(groups.values()), task.num_modes, unsolved=unsolved)
+        entropy = conditional_entropy(list(groups.values()), task.modes.number, unsolved=unsolved)
     labels = summary["labels"]
     commands = [config["command"]] if source == run else [trained["command"], config["command"]]
     disturbance = disturbance_of(Path(trained["dataset"]))

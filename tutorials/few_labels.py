@@ -113,7 +113,7 @@ rollouts = {name: tensor.numpy() for name, tensor in rollouts.items()}
 draw_rollouts(rollouts, RunFacts(Path(), task)).savefig("few_labels.png", dpi=150)
 rate, low, high = (100 * result["rates"]["success"][name] for name in ("rate", "low", "high"))
 print(f"success {rate:.1f} % ({low:.0f}-{high:.0f}) of {len(seeds)} rollouts")
-print(f"{result['distinct_modes']} of {task.num_modes} ways taken, entropy {result['mode_entropy']:.2f}")
+print(f"{result['distinct_modes']} of {task.modes.number} ways taken, entropy {result['mode_entropy']:.2f}")
 
 # %%
 # Every module works alone as well, for example to compute latent actions of a window.

@@ -47,7 +47,7 @@ def write_task_pages() -> None:
             ", ".join(
                 f"{column} ({unit or '1'})" for column, unit in zip(task.actions, task.action_units, strict=True)
             ),
-            task.num_modes,
+            task.modes.number,
             f"{task.max_steps} steps, {task.max_steps / task.control_hz:.0f} s",
         )
         for name, task in ((name, TASKS[name]) for name in names)
@@ -153,9 +153,9 @@ def mode_blocks(task: Task) -> list[str]:
     names = {"all": "all successful episodes", "contexts": "contexts", "solved_contexts": "contexts with a success"}
     among = names.get(task.modes.entropy, task.modes.entropy)
     return [
-        heading(f"{task.num_modes} modes", 1),
+        heading(f"{task.modes.number} modes", 1),
         table(("choice", "values"), [(choice, ", ".join(names)) for choice, names in task.modes.choices]),
-        f"Their entropy is taken over {among}, to the base {task.num_modes}.",
+        f"Their entropy is taken over {among}, to the base {task.modes.number}.",
     ]
 
 

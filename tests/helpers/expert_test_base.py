@@ -74,7 +74,7 @@ class ContextExpertTestBase(ExpertTestBase):
     @pytest.mark.timeout(900)
     def test_nine_of_ten_first_attempts_succeed_in_the_asked_mode(self):
         for task, share in ({self.TASK: 0.9} | self.VARIANTS).items():
-            modes = get_task(task).num_modes
+            modes = get_task(task).modes.number
             for contexts in (evaluation_contexts(task), draw_contexts(task, 60, 11)):
                 wanted = np.arange(60) % modes
                 found, _ = first_attempts(task, wanted, contexts, [(2, row) for row in range(60)])

@@ -56,7 +56,7 @@ def test_the_environment_is_what_torchrl_expects():
 def test_the_expert_records_both_modes(demonstrations):
     data, report = demonstrations
     validate(data)
-    assert report.each("mode") == [0, 1] * 6 and report.task.num_modes == 2
+    assert report.each("mode") == [0, 1] * 6 and report.task.modes.number == 2
     assert trajectory_lengths(data).tolist() == report.each("rows")  # every step is kept, none lost to a conversion
     # the robot moves as told, inside every trajectory
     moved = data["next", "observation"][:, :2] - data["observation"][:, :2]
@@ -101,7 +101,7 @@ def test_it_is_drawn():
 
 def test_a_robot_without_simulator():
     task = register_task(plain_task(9, 7))
-    assert task.tool_columns is None and task.tool_position is None and task.gripper is None and task.num_modes == 1
+    assert task.tool_columns is None and task.tool_position is None and task.gripper is None and task.modes.number == 1
     for ask in (make_env, lambda known: record_demonstrations(known.name, episodes=1)):
         with pytest.raises(ValueError, match="task 'plain' has no (environment|scripted expert)"):
             ask(task)

@@ -73,7 +73,7 @@ def test_modes_of_recorded_paths_are_those_of_the_rule(tmp_path):
 
 @pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.modes.choices])
 def test_every_mode_has_its_color(task):
-    colors, number = mode_colors(TASKS[task].modes), TASKS[task].num_modes
+    colors, number = mode_colors(TASKS[task].modes), TASKS[task].modes.number
     apart = np.abs(colors[:, None] - colors[None]).sum(-1) + 10 * np.eye(number)
     assert colors.shape == (number, 3) and apart.min() > 0.08
     assert len(mode_colors(Modes())) == 1

@@ -208,11 +208,6 @@ class Task(Columns):
         return ActionRule(self.gripper, self.distances, constants) if told else None
 
     @property
-    def num_modes(self) -> int:
-        """Number of modes, base of the logarithm of their entropy."""
-        return self.modes.number
-
-    @property
     def bodies(self) -> tuple[Body, ...]:
         """What a context places."""
         return self.scene.bodies

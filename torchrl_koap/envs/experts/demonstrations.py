@@ -82,7 +82,7 @@ class RecordingReport:
     def __str__(self) -> str:
         notes, modes, rows = self.notes, self.each("mode"), self.each("rows")
         discarded = ", ".join(f"{count} {reason}" for reason, count in notes["discarded_attempts"].items() if count)
-        counts = ", ".join(str(modes.count(mode)) for mode in range(self.task.num_modes))
+        counts = ", ".join(str(modes.count(mode)) for mode in range(self.task.modes.number))
         said = (
             f"{len(modes)} demonstrations of {self.task.name} in {len(set(modes))} modes ({counts}), {min(rows)} to"
             f" {max(rows)} rows, {self.seconds:.1f} s; {notes['attempts'].count(1)} good at the first attempt;"
@@ -153,7 +153,7 @@ def iterate_takes(
     disturbed = choose_disturbed(episodes, disturbance, seed)
     if disturbance:
         disturbed_columns(task)
-    modes = balanced_modes(episodes, task.num_modes, seed)
+    modes = balanced_modes(episodes, task.modes.number, seed)
     return _play_batches(task, modes, seed, num_threads, progress, batch_size, disturbed, frozenset(done))
 
 

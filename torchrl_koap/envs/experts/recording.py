@@ -65,9 +65,9 @@ class Expert(abc.ABC):
                 f"as many seeds as modes are needed, at least one, and contexts {list(wanted)}, got {len(modes)} modes,"
                 f" {len(seeds)} seeds and contexts {list(shape)}"
             )
-        wrong = [mode for mode in modes if mode not in range(self.task.num_modes)]
+        wrong = [mode for mode in modes if mode not in range(self.task.modes.number)]
         if wrong:
-            raise ValueError(f"modes of task {self.task.name!r} are 0 to {self.task.num_modes - 1}, got {wrong[0]}")
+            raise ValueError(f"modes of task {self.task.name!r} are 0 to {self.task.modes.number - 1}, got {wrong[0]}")
 
     @abc.abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
