@@ -31,7 +31,7 @@ EPISODES = 26
 def recording():
     calls = []
     data, report = record_demonstrations(
-        "avoiding", EPISODES, seed=5, progress=lambda done, total: calls.append((done, total)), dtype=torch.float64
+        "avoiding", EPISODES, seed=5, progress=lambda done, total: calls.append((done, total))
     )
     return data, report, calls
 
@@ -52,7 +52,8 @@ def test_takes_are_the_rows_of_the_original_recorder(recording):
     for take in iterate_takes("avoiding", EPISODES, seed=5, done=range(2, EPISODES)):
         assert len(take.frames) == len(take.actions) + 1 == take.log["rows"]
         assert np.allclose(take.frames[0, 2:], (0.524928, -0.279737), atol=1e-5)
-        np.testing.assert_array_equal(take.frames[:-1], data["observation"][data["episode"] == take.number])
+        recorded = data["observation"][data["episode"] == take.number]
+        np.testing.assert_array_equal(take.frames[:-1].astype(np.float32), recorded)
 
 
 def test_demonstrations_are_successes_with_clearance(recording):
@@ -66,16 +67,14 @@ def test_demonstrations_are_successes_with_clearance(recording):
 
 def test_replayed_actions_give_the_same_episode(recording):
     """Recorded actions, sent to a fresh environment, reproduce the rows, outcome and mode."""
-    data, report, _ = recording
-    for index in (0, 13, 25):
-        part = data[data["episode"] == index]
-        frames = torch.cat([part["observation"], part["next", "observation"][-1:]]).numpy()
+    report = recording[1]
+    for take in iterate_takes("avoiding", EPISODES, seed=5, done={*range(EPISODES)} - {0, 13, 25}):
+        frames, actions = take.frames, torch.from_numpy(take.actions)
         env = AvoidingEnv(1, dtype=torch.float64)
         step = env.reset()
-        first = (
-            part["observation"][:1, :2] - step["observation"][:, :2]
-        )  # the command of row 0 is a step from the start
-        for row, action in enumerate(torch.cat([first, part["action"]])):
+        # the command of row 0 is a step from the start
+        first = torch.from_numpy(frames[:1, :2]) - step["observation"][:, :2]
+        for row, action in enumerate(torch.cat([first, actions])):
             step = env.step(step.set("action", action[None]))["next"]
             assert np.allclose(env.raw_log()[0]["c_pos"][0, :2], frames[row, 2:], atol=1e-9, rtol=0)
             seen = step["observation"][0].numpy()
@@ -83,7 +82,7 @@ def test_replayed_actions_give_the_same_episode(recording):
             # the environment hands out the position of 1 ms before the recorder's
             assert np.allclose(seen[2:], frames[row, 2:], atol=1e-3, rtol=0)
         assert step["success"].item() and not step["collision"].item()
-        assert env.task.modes.index_of(step["mode"]).item() == report.each("mode")[index]
+        assert env.task.modes.index_of(step["mode"]).item() == report.each("mode")[take.number]
 
 
 def test_modes_are_balanced():

@@ -3,11 +3,10 @@
 
 import numpy as np
 import pytest
-import torch
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.envs.experts import demonstrations
-from torchrl_koap.envs.experts.demonstrations import record_demonstrations
+from torchrl_koap.envs.experts.demonstrations import iterate_takes, record_demonstrations
 from torchrl_koap.envs.experts.disturbances import (
     KINDS,
     Disturbances,
@@ -121,10 +120,10 @@ def test_recorded_actions_are_those_that_were_executed(disturbed, monkeypatch):
             return done[-1][None]
 
     monkeypatch.setattr(demonstrations, "Disturbances", Watched)
-    data, report = record_demonstrations("avoiding", 1, seed=1, num_threads=1, disturbance=1.0, dtype=torch.float64)
-    recorded = data["action"].numpy()
+    (take,) = iterate_takes("avoiding", 1, seed=1, num_threads=1, disturbance=1.0)
+    recorded = take.actions
     last = np.array(done[-len(recorded) - 1 :])[1:]  # the first action is the state that the log begins with
-    assert report.each("attempts")[0] >= 1 and np.allclose(recorded, last, atol=1e-12)
+    assert take.log["attempts"] >= 1 and np.allclose(recorded, last, atol=1e-12)
 
 
 def test_a_task_brings_its_share_of_disturbed_demonstrations():
@@ -134,9 +133,9 @@ def test_a_task_brings_its_share_of_disturbed_demonstrations():
 
 
 def test_an_operator_brings_the_tool_back_to_its_height():
-    data, report = record_demonstrations("aligning", 1, seed=2, num_threads=1, disturbance=1.0, dtype=torch.float64)
-    drifts, restored = [spell for spell in report.each("spells")[0] if spell[2] == "drift"], []
-    command = torch.cat([data["observation"], data["next", "observation"][-1:]])[:, 2].numpy()
+    (take,) = iterate_takes("aligning", 1, seed=2, num_threads=1, disturbance=1.0)
+    drifts, restored = [spell for spell in take.log["spells"] if spell[2] == "drift"], []
+    command = take.frames[:, 2]
     for (begin, end, _), (later, _, _) in zip(drifts, [*drifts[1:], (len(command), 0, "")], strict=True):
         if begin > 60 and end + 15 < later:  # after the descent
             assert np.ptp(command[begin - 1 : end + 1]) > 0.004

@@ -102,21 +102,19 @@ def record_demonstrations(
     episodes: int = 96,
     seed: int = 0,
     *,
-    dtype: torch.dtype = torch.float32,
     disturbance: float | None = None,
     **options: Any,
 ) -> tuple[TensorDict, RecordingReport]:
     """Records demonstrations of a scripted expert as flat TED data ``[N]``, every action labelled, with a report.
 
-    Everything is computed in float64; ``dtype`` is the floating type of the entries. Other arguments, and errors, are
-    those of :func:`iterate_takes`.
+    Everything is computed in float64, the entries are float32. Arguments and errors are those of :func:`iterate_takes`.
     """
     task, start = get_task(task), time.perf_counter()
     takes = list(iterate_takes(task, episodes, seed, disturbance=disturbance, **options))
     seconds, share = time.perf_counter() - start, _share(task, disturbance)
     report = RecordingReport(get_task(task.source), seed, [take.log for take in takes], seconds, share)
     frames, actions = [take.frames for take in takes], [take.actions for take in takes]
-    return flatten_trajectories(frames, actions, dtype=dtype), report
+    return flatten_trajectories(frames, actions), report
 
 
 def iterate_takes(
