@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchrl_koap.evaluation.config import EvalConfig, check_options, environment_arguments
+from torchrl_koap.evaluation.config import EvalConfig, environment_arguments
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.loop_on_labels import limited_commands
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
@@ -48,7 +48,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         ``kind`` ``"offline"``, errors of plans and actions, and no success.
 
     Raises:
-        ValueError: for unknown options or fewer than one episode.
+        ValueError: for options that do not fit the task.
         RunDirectoryError, CheckpointError, PluginError: as :meth:`Trained.load`.
 
     Examples:
@@ -62,7 +62,6 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         2
     """
     config = EvalConfig() if config is None else config
-    check_options(config)
     set_up_torch(config.threads, config.device)
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task

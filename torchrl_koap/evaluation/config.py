@@ -41,9 +41,8 @@ class EvalConfig:
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL, instead of the 60 contexts of the library.
 
-    Examples:
-        >>> from torchrl_koap.evaluation import EvalConfig, evaluate
-        >>> evaluate("runs/koap", EvalConfig(episodes=20))["rates"]["success"]  # doctest: +SKIP
+    Raises:
+        ValueError: for a number out of range, or options that do not go together.
     """
 
     episodes: int = 60
@@ -62,6 +61,26 @@ class EvalConfig:
     batch_size: int | None = None
     contexts_file: Path | None = None
 
+    def __post_init__(self):
+        for name in ("episodes", "num_envs", "batch_size", "rollouts_per_context"):
+            value = vars(self)[name]
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be >= 1, got {value}")
+        if self.episodes > MOST_EPISODES:
+            raise ValueError(
+                f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {self.episodes:,}"
+            )
+        check_machine(self.threads, self.device)
+        if self.seed < 0:
+            raise ValueError(f"seed must be >= 0, got {self.seed}")
+        environment_arguments(self.env_kwargs)
+        about_env = {"success_key": self.success_key, "env_kwargs": self.env_kwargs, "num_envs": self.num_envs}
+        given = [name for name, value in about_env.items() if value]
+        if given and self.env is None:
+            raise ValueError(f"{given[0]} was given, but no env: name an environment of Gymnasium with --env")
+        if self.num_envs is not None and self.batch_size is not None:
+            raise ValueError("num_envs and batch_size both say how many episodes run at a time: give one of them")
+
 
 def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
     """Reads ``key=value`` words: numbers, lists, true, false and null as such, anything else as text."""
@@ -75,25 +94,3 @@ def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
         except ValueError:
             found[name] = value
     return found
-
-
-def check_options(config: EvalConfig) -> None:
-    """Refuses options that fit no run, before a run is loaded; the message names the option."""
-    for name in ("episodes", "num_envs", "batch_size", "rollouts_per_context"):
-        value = vars(config)[name]
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be >= 1, got {value}")
-    if config.episodes > MOST_EPISODES:
-        raise ValueError(
-            f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {config.episodes:,}"
-        )
-    check_machine(config.threads, config.device)
-    if config.seed < 0:
-        raise ValueError(f"seed must be >= 0, got {config.seed}")
-    environment_arguments(config.env_kwargs)
-    about_env = {"success_key": config.success_key, "env_kwargs": config.env_kwargs, "num_envs": config.num_envs}
-    given = [name for name, value in about_env.items() if value]
-    if given and config.env is None:
-        raise ValueError(f"{given[0]} was given, but no env: name an environment of Gymnasium with --env")
-    if config.num_envs is not None and config.batch_size is not None:
-        raise ValueError("num_envs and batch_size both say how many episodes run at a time: give one of them")

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.closed_loop import RolloutEnvironment, find_environment
-from torchrl_koap.evaluation.config import EvalConfig, check_options
+from torchrl_koap.evaluation.config import EvalConfig
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
     follow_recordings,
@@ -65,7 +65,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         dict: what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, and ``findings``.
 
     Raises:
-        ValueError: for fewer than one episode, or a run without a planner.
+        ValueError: for a run without a planner, or a task without an environment.
         RunDirectoryError: if the folder is no finished run.
 
     Examples:
@@ -73,7 +73,6 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
     """
     config = InspectConfig() if config is None else config
-    check_options(config)
     set_up_torch(config.threads, config.device)
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task

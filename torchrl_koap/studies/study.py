@@ -12,7 +12,6 @@ from typing import Any
 from torchrl_koap.data.sources import DEFAULT_TASK, find_task_of
 from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.closed_loop import find_environment
-from torchrl_koap.evaluation.config import check_options
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.config import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
@@ -291,7 +290,6 @@ def check_study(study: Study) -> list[Cell]:
     ):
         if given:
             raise ValueError(f"{name} is not for a study: {why}")
-    check_options(study.evaluation)
     contexts = study.evaluation.contexts_file
     if contexts is not None and not Path(contexts).is_file():
         raise ValueError(f"contexts_file: there is no file {contexts}")
