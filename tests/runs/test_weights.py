@@ -7,7 +7,7 @@ from torch import nn
 
 from torchrl_koap.modules import Normalizer
 from torchrl_koap.runs import weights
-from torchrl_koap.runs.weights import CheckpointError, load_tensors, load_weights, save_tensors, save_weights
+from torchrl_koap.runs.weights import CheckpointError, load_tensors, load_weights, save_tensors
 
 
 class Model(nn.Module):
@@ -27,7 +27,7 @@ class Model(nn.Module):
 def saved(tmp_path):
     path = tmp_path / "model.safetensors"
     model = Model()
-    save_weights(path, model, {"task": "avoiding", "kind": "planner"})
+    save_tensors(path, model.state_dict(), {"task": "avoiding", "kind": "planner"})
     return path, model
 
 

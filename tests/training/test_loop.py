@@ -12,7 +12,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_koap.modules import MLPDenoiser, StatePlanner, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_weights
+from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 from torchrl_koap.training import loop as loop_file
 from torchrl_koap.training.loop import SETTLED, DivergedError, OutlierLimit, moving_average, train_phase, warmup_cosine
 
@@ -203,7 +203,8 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path):
     (tmp_path / "checkpoints" / "planner.safetensors").rename(tmp_path / "checkpoints" / "controller.safetensors")
     with pytest.raises(CheckpointError, match="controller.safetensors holds the state of another model"):
         run_training(Controller, tmp_path, resume=True)
-    save_weights(tmp_path / "checkpoints" / "controller.safetensors", nn.Linear(2, 2), {"task": "avoiding"})
+    weights = nn.Linear(2, 2).state_dict()
+    save_tensors(tmp_path / "checkpoints" / "controller.safetensors", weights, {"task": "avoiding"})
     with pytest.raises(CheckpointError, match="is no state of a training"):
         run_training(Controller, tmp_path, resume=True)
 

@@ -25,13 +25,8 @@ class CheckpointError(ValueError):
     """A file of weights that cannot be used: damaged, of another task, or without its statistics."""
 
 
-def save_weights(path: str | Path, module: nn.Module, about: Mapping[str, Any]) -> None:
-    """Writes the state dict of a module, normaliser statistics included, and facts for :func:`load_weights`."""
-    save_tensors(path, module.state_dict(), about)
-
-
 def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any]) -> dict[str, Any]:
-    """Loads weights into a module of the same architecture; returns the facts in the header.
+    """Loads weights, normaliser statistics included, into a module of the same architecture; returns the facts.
 
     ``expected`` are facts that it must hold: the task, and the options that build the module. A CheckpointError says
     what is missing, damaged, or of another task, other options or other shapes.

@@ -25,7 +25,7 @@ from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, progress_bar
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
 from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory
-from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
+from torchrl_koap.runs.weights import load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.controller import check_lengths, learn_controller
@@ -123,7 +123,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
                 return Trained(task, config, planner, None, found, tuple(held_out), run.path, cameras)
             torch.manual_seed(config.run.seed)  # the controller does not depend on where the planner is from
             controller, results = learn_controller(task, config, data, loop)
-            save_weights(run.path / "controller.safetensors", controller, facts_of("controller", task, config))
+            facts = facts_of("controller", task, config)
+            save_tensors(run.path / "controller.safetensors", controller.state_dict(), facts)
         summary = {
             "labels": asdict(report),
             "plan_covers": covers,
@@ -214,5 +215,5 @@ def _planner(
         load_weights(config.planner.source / "planner.safetensors", planner, _facts_of_source(task, config))
     else:
         planner, losses = learn_planner(task, config, data, loop, held_out=held_out)
-    save_weights(path, planner, facts)
+    save_tensors(path, planner.state_dict(), facts)
     return planner, losses
