@@ -8,8 +8,6 @@ import warnings
 
 import torch
 
-from torchrl_koap.lookup import lookup
-
 # matrix products of a denoiser in training; None leaves them as its weights are
 DTYPES = {"float32": None, "bfloat16": torch.bfloat16}
 PRECISIONS = (*DTYPES, "auto")
@@ -20,9 +18,8 @@ _BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat1
 def find_precision(precision: str, device: str | torch.device = "cpu") -> str:
     """Says what "auto" means on a device: "bfloat16" where it has units for it, else "float32".
 
-    Another precision is refused; a warning says where bfloat16, asked for by name, is emulated.
+    A warning says where bfloat16, asked for by name, is emulated.
     """
-    lookup(PRECISIONS, precision, "precision")
     if precision == "float32":
         return precision
     quick = has_bfloat16_units(device)
