@@ -43,7 +43,8 @@ def _read_stored(
     source: str, *, resample: float | None = None, action_kind: str | Sequence[str] = "delta"
 ) -> Recordings:
     """All observation columns of a data set of this library, the command included, and the labels that there are."""
-    data, task = load_ted(stored_folder(source) or source)
+    folder = stored_folder(source)
+    data, task = load_ted(folder)
     lengths = trajectory_lengths(data).tolist()
     origin, added = (torch.tensor(part, dtype=torch.float64) for part in task.origins or (0.0, 0.0))
     observed, behind = (data[key].double() + origin for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION))
@@ -56,7 +57,7 @@ def _read_stored(
         action_names=task.action_names,
         sources=np.arange(len(lengths)).astype(str),
         control_hz=task.control_hz,
-        cameras=stored_clips(read_about(stored_folder(source) or source)["notes"]),
+        cameras=stored_clips(read_about(folder)["notes"]),
         source=source,
     )
     if resample is None:
