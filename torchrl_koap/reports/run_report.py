@@ -6,6 +6,7 @@ from __future__ import annotations
 import shlex
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +44,7 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
         tiles=evaluation_rows(run),
         evaluated=bool(evaluation),
         commands={name: _filled(command, run) for name, command in commands.items()},
-        advice=[
-            {"finding": item.finding, "proposal": item.proposal, "command": _filled(item.command, run)}
-            for item in advice(run)
-        ],
+        advice=[replace(item, command=_filled(item.command, run)) for item in advice(run)],
         training=training_rows(run),
         labels_read=run.evaluated("labels_read_outside_budget"),
         label_figure=next((item for item in figures if item["name"] == _BESIDE_LABELS), None),
