@@ -193,7 +193,7 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
 )
 def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws errors of sampled plans over the horizon beside those of baselines that need no learning."""
-    plan = mapping(mapping(result).get("plan_errors"))
+    plan = mapping(result.get("plan_errors"))
     if "unit" not in plan:
         raise NothingToDraw("no plan was evaluated on recorded data")
     rows = plan["unit"]
@@ -231,7 +231,7 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
 )
 def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws errors of decoded actions by column and unit, beside a ridge's and those of always the mean action."""
-    parts = [(name, part) for name, part in mapping(mapping(result).get("action_errors")).items() if "column" in part]
+    parts = [(name, part) for name, part in mapping(result.get("action_errors")).items() if "column" in part]
     if not parts:
         raise NothingToDraw("no action was evaluated on recorded data")
     units = list(dict.fromkeys(row["unit"] for _, part in parts for row in part["column"]))

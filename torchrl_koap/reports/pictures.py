@@ -16,7 +16,6 @@ returns a figure (or a :class:`Film`), which the register writes aside first: an
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from importlib import import_module
@@ -29,7 +28,7 @@ from PIL import Image
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from torchrl_koap.files import replacing_file
+from torchrl_koap.files import read_json, replacing_file
 from torchrl_koap.reports.run_facts import RunFacts
 
 FOLDER = "plots"
@@ -173,6 +172,6 @@ def _load(source: Path) -> Any:
     if source.suffix == ".safetensors":
         return load_file(source)
     if source.suffix == ".json":
-        return json.loads(source.read_text(encoding="utf-8"))
+        return read_json(source)
     with source.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
