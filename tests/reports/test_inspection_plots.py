@@ -4,8 +4,8 @@
 import pytest
 from run_files import run_of, titles
 
-from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET
-from torchrl_koap.reports.inspection_plots import EXPERIMENTS, draw_experiments, draw_latent
+from torchrl_koap.evaluation.findings import EXPERIMENTS, MODELS, OUTSIDE_THE_BUDGET
+from torchrl_koap.reports.inspection_plots import draw_experiments, draw_latent
 from torchrl_koap.reports.pictures import NothingToDraw
 
 RUN = run_of("avoiding")

@@ -11,15 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, error_unit
+from torchrl_koap.evaluation.findings import OUTSIDE_THE_BUDGET, error_unit
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, WARNING, put_legend, tidy
 from torchrl_koap.tasks import Task
 
 ON_THE_CIRCLE = 1e-3  # eigenvalues whose magnitude is nearer to 1 lie on the unit circle
-SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
-EXPERIMENTS = {
+_SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
+_EXPERIMENTS = {
     "planner_alone": "planner alone\n(plans that come true)",
     "controller_alone": "controller alone\n(recorded states)",
     "both": "both\n(closed loop)",
@@ -80,7 +80,7 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
         raise NothingToDraw("the experiments in the simulator were left out")
     figure = Figure(figsize=(9.8, 4.1), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
-    made = {name: words for name, words in EXPERIMENTS.items() if name in result}
+    made = {name: words for name, words in _EXPERIMENTS.items() if name in result}
     for index, name in enumerate(made):
         value = result[name]
         left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "both" else PALE_BLUE)
@@ -130,11 +130,11 @@ def _draw_plane(axes: Axes, values: np.ndarray) -> None:
         panels.append(inset)
     for panel in panels:
         panel.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1, zorder=1)
-        for name, color in SIDES.items():
+        for name, color in _SIDES.items():
             here = values[side == name]
-            style = {"s": 20, "color": color, "alpha": 0.7, "linewidths": 0, "zorder": 2 + list(SIDES).index(name)}
+            style = {"s": 20, "color": color, "alpha": 0.7, "linewidths": 0, "zorder": 2 + list(_SIDES).index(name)}
             panel.scatter(here.real, here.imag, **style)
-    counts = [f"{int((side == name).sum())} {name}" for name in SIDES]
+    counts = [f"{int((side == name).sum())} {name}" for name in _SIDES]
     radius = f"{len(values)} eigenvalues, radius {size.max():.5g}"
     tidy(axes, f"{radius}\n{', '.join(counts)} the unit circle")
 
@@ -143,9 +143,8 @@ def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     part = next(iter(errors["koopman"]))
     shown, factor = error_unit(part, task)
     steps = np.arange(1, errors["steps"] + 1)
-    for model in MODELS:
+    for model, (label, color) in _MODELS.items():
         values = factor * np.asarray(errors[model][part], dtype=float)
-        label, color = _MODELS[model]
         axes.plot(steps, np.where((values > 0) & (values < _DIVERGED), values, np.nan), ".-", color=color, label=label)
     axes.set_yscale("log")
     axes.margins(y=0.1)
