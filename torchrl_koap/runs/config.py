@@ -169,11 +169,6 @@ class TrainConfig:
         controller: its variant and training (default: the method's).
         execution: how plans become actions (default: the task's).
         run: seed, machine, log.
-
-    Examples:
-        >>> from torchrl_koap import LabelConfig, TrainConfig, train
-        >>> config = TrainConfig(dataset="demos", out="runs/koap", labels=LabelConfig(fraction=0.05))
-        >>> trained = train(config)  # doctest: +SKIP
     """
 
     dataset: str | None = None

@@ -104,11 +104,6 @@ class Study:
         execution: how plans become actions.
         evaluation: rollouts of every cell, one thread each; cells with the same seed have the same contexts and noise.
         run: processor, precision and plugins of every training.
-
-    Examples:
-        >>> from torchrl_koap.studies import Study, run_study
-        >>> study = Study(out="study", methods=("koap", "dd"), labels=(0.01, 0.1), seeds=2)
-        >>> run_study(study)  # doctest: +SKIP
     """
 
     out: Path
