@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from torchrl_koap.commands.options import Command
-from torchrl_koap.runs.config_files import version_of
+from torchrl_koap.runs.config_files import version_of, versions
 from torchrl_koap.runs.device import has_bfloat16_units
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
@@ -29,7 +29,7 @@ _EXTRAS = {"lerobot": "pyarrow", "hdf5": "h5py", "minari": "minari", "video": "a
     "wandb": "wandb",
     "tensorboard": "tensorboard",
 }
-_PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium-robotics", "numba")
+_SIMULATORS = ("dm-control", "gymnasium-robotics", "numba")
 _LATER = ("eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
 
@@ -52,8 +52,7 @@ class Doctor(Command):
 
 def machine_facts() -> dict[str, str]:
     """Facts about this machine, name to value."""
-    facts = {"python": platform.python_version(), "platform": platform.platform()}
-    facts |= {name: version_of(name) for name in _PACKAGES}
+    facts = {"platform": platform.platform()} | versions() | {name: version_of(name) for name in _SIMULATORS}
     facts["processors"] = str(os.cpu_count())
     facts["torch threads"] = str(torch.get_num_threads())
     quick = has_bfloat16_units()
