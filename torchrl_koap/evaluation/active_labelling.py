@@ -23,7 +23,7 @@ from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 
-_FEW = 5  # suggestions that are made unasked
+_FEW = 5  # trajectories that are chosen unasked
 _MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free
 
 
@@ -59,7 +59,7 @@ def rank_trajectories(
     labelled: Tensor,
     *,
     penalty: float,
-    count: int = 5,
+    count: int | None = None,
     bias: bool = False,
     score: Callable[[Tensor, Tensor, Tensor], float] = variance_reduction,
 ) -> list[Suggestion]:
@@ -78,7 +78,7 @@ def rank_trajectories(
     Keyword Args:
         penalty (float): the ridge, in units of the mean square norm of the labelled latent actions (of all, where none
             is labelled), as in :class:`~torchrl_koap.modules.RidgeFit`.
-        count (int): trajectories to choose.
+        count (int, optional): trajectories to choose. Default: 5, or all that are left.
         bias (bool): the decoder has a fitted mean.
         score (callable): what a trajectory is chosen by, with the arguments of :func:`variance_reduction`.
 
@@ -111,6 +111,7 @@ def rank_trajectories(
     names = episode[~labelled].unique().tolist()
     if not names:
         raise ValueError("nothing is left to suggest: every step is labelled")
+    count = min(_FEW, len(names)) if count is None else count
     if not 1 <= count <= len(names):
         raise ValueError(f"count must be in 1..{len(names)}, the trajectories that are not labelled yet, got {count}")
     rows, scale = _rows(latent.double(), labelled, penalty, bias)
@@ -195,13 +196,12 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         )
     data, report = trained.hide_labels(trained.data(config.dataset))
     steps = infer_steps(controller, trained.seen(data))
-    left = len(steps[EPISODE][~steps[HAS_ACTION]].unique())
     choices = rank_trajectories(
         steps["latent_action"],
         steps[EPISODE],
         steps[HAS_ACTION],
         penalty=penalty,
-        count=max(1, min(_FEW, left)) if config.count is None else config.count,
+        count=config.count,
         bias=bool(controller.action_decoder.linear.bias.any()),
     )
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
