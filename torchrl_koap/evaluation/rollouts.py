@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -57,8 +57,8 @@ def roll_out(
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
-        for module in env.modules():  # transforms, and the environment itself
-            if isinstance(module, _SeedsEpisodes):
+        for module in env.modules():  # transforms, and the environment itself, with a generator per episode
+            if hasattr(module, "seed_episodes"):
                 module.seed_episodes(part)
         transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
@@ -92,13 +92,6 @@ def roll_out(
 def device_of(module: nn.Module) -> torch.device:
     """Returns the device of a module's parameters and buffers, the processor for one without any."""
     return next(itertools.chain(module.parameters(), module.buffers()), torch.empty(0)).device
-
-
-@runtime_checkable
-class _SeedsEpisodes(Protocol):
-    """An environment or transform in which what is random has a generator per episode."""
-
-    def seed_episodes(self, seeds: Sequence[int]) -> None: ...
 
 
 def rollouts_to_tensors(episodes: Sequence[TensorDict], task: Task, *, interval: int) -> dict[str, Tensor]:
