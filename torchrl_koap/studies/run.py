@@ -182,18 +182,14 @@ class _Table:
         self.rows: dict[Cell, dict[str, Any]] = {}
         self.outcomes: dict[str, Mapping[tuple[int, int], float]] = {}
         for cell in cells:
-            self._read(cell, None)
+            self.read(cell)
 
-    def _read(self, cell: Cell, reason: str | None) -> None:
+    def read(self, cell: Cell, reason: str | None = None) -> None:
+        """Reads a cell, and why it failed, if it did."""
         row, outcomes = cell_row(self.study.out, cell, label_unit=self.study.label_unit, reason=reason)
         self.rows[cell] = row
         if outcomes:
             self.outcomes[cell.folder] = outcomes
-
-    def ended(self, cell: Cell, reason: str | None) -> None:
-        """Reads a cell that has just ended, and writes the file."""
-        self._read(cell, reason)
-        self.write()
 
     def write(self) -> None:
         """Writes the file."""
@@ -227,7 +223,8 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
                 bar.update()
                 bar.set_postfix_str(job.folder.name + (" FAILED" if reason else ""))
                 if job.folder in places:
-                    table.ended(places[job.folder], reason)
+                    table.read(places[job.folder], reason)
+                    table.write()
 
 
 def _is_trained(folder: Path) -> bool:
