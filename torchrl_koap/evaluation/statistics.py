@@ -61,17 +61,14 @@ def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsol
     return sum(values) / len(values) if values else None
 
 
-def bootstrap_interval(units: Sequence, statistic: Callable[[Sequence], float | None]) -> tuple[float, float] | None:
+def bootstrap_interval(units: Sequence, statistic: Callable[[Sequence], float | None]) -> tuple[float, float]:
     """Percentile interval (95 %) of a statistic under resampling of independent units, shifted by the bias.
 
     Resamples hold fewer distinct units than the sample; an entropy is lower on them. The interval is moved by as much
-    as their mean lies beside the statistic of the sample. None if the statistic is never defined.
+    as their mean lies beside the statistic of the sample, which must be defined; of a resample it may be None.
     """
     generator = random.Random(0)
     values = [statistic(generator.choices(units, k=len(units))) for _ in range(_RESAMPLES)]
     values = sorted(value for value in values if value is not None)
-    if not values:
-        return None
-    estimate = statistic(units)
-    shift = 0.0 if estimate is None else estimate - sum(values) / len(values)
+    shift = statistic(units) - sum(values) / len(values)
     return values[int(_TAIL * (len(values) - 1))] + shift, values[round((1 - _TAIL) * (len(values) - 1))] + shift
