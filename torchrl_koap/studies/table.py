@@ -248,8 +248,6 @@ def cell_name(row: Mapping[str, Any]) -> str:
     return f"{row['task']}, {row['method']}, {percent(row['labels'])} labels, {used}seed {row['seed']}"
 
 
-def percent(share: float | None, digits: int | None = None) -> str:
-    """A share in percent, with as few digits as it has if ``digits`` is not given; None gives a dash."""
-    if share is None:
-        return "–"
+def percent(share: float, digits: int | None = None) -> str:
+    """A share in percent, with as few digits as it has if ``digits`` is not given."""
     return f"{100 * share:.6g} %" if digits is None else f"{100 * share:.{digits}f} %"
