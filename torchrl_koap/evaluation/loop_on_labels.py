@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data.windows import spread_evenly
+from torchrl_koap.evaluation.findings import MORE
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
 from torchrl_koap.modules.execution.command_limits import ends_of
@@ -124,7 +125,7 @@ def _faults(found: Mapping[str, Any]) -> list[str]:
     if distance > FAR:
         faults.append(
             f"this policy leaves its demonstrations: on a linear model of the robot it ends {distance:.3g} standard"
-            " deviations from the nearest recorded state; train longer (--steps) or record more"
+            f" deviations from the nearest recorded state; {MORE}"
         )
     if found["share_of_way"] < STAYS:
         faults.append(
