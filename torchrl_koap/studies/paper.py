@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.files import replacing_file
+from torchrl_koap.reports.pictures import FOLDER
 from torchrl_koap.studies.plots import plot_average
 from torchrl_koap.studies.table import Summary, as_markdown, percent, summarise
 from torchrl_koap.tasks import TASKS
 
-AVERAGE = "plots/average.png"
+AVERAGE = f"{FOLDER}/average.png"
 
 
 @dataclass(frozen=True)

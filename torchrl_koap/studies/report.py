@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from torchrl_koap.data.label_budget import plural_of
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.html import write_page
+from torchrl_koap.reports.pictures import FOLDER
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, REFERENCE, Outcome, compare_cells
 from torchrl_koap.studies.paper import paper_points, write_paper_layout
 from torchrl_koap.studies.plots import plot_measure
@@ -18,7 +20,6 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training.methods import METHODS
 
-FOLDER = "plots"
 _CAPTIONS = {
     "success": (
         "Success against the labels",
@@ -52,8 +53,6 @@ _CAPTIONS = {
         " demonstrations known at all.",
     ),
 }
-
-
 _MIXED = (
     ' Points of one line are of different recordings here: see "action errors on" in the table. Compare methods at one'
     " share of labels, not shares of labels."
@@ -102,7 +101,7 @@ def write_study_report(
 
 def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Two sentences on the cells, and what their methods are."""
-    count = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
+    count = Counter(row["status"] for row in rows)
     names = {name: list(dict.fromkeys(row.get(name) for row in rows)) for name in ("task", "method", "seed")}
     unit = list(dict.fromkeys(plural_of(row.get("label_unit") or "") for row in rows))
     text = ", ".join(
