@@ -25,8 +25,8 @@ class CheckpointError(ValueError):
     """A file of weights that cannot be used: damaged, of another task, or without its statistics."""
 
 
-def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any]) -> dict[str, Any]:
-    """Loads weights, normaliser statistics included, into a module of the same architecture; returns the facts.
+def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any]) -> None:
+    """Loads weights, normaliser statistics included, into a module of the same architecture.
 
     ``expected`` are facts that it must hold: the task, and the options that build the module. A CheckpointError says
     what is missing, damaged, or of another task, other options or other shapes.
@@ -36,7 +36,6 @@ def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any
         if about.get(name) != value:
             raise CheckpointError(f"{path} was trained on {name} {about.get(name)!r}, not on {value!r}")
     _load(path, module, expand(tensors))
-    return about
 
 
 def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[str, nn.Module | None]) -> None:
