@@ -116,7 +116,8 @@ def draw_bench_average(name: str, path: Path) -> Path:
     """Draws the success of a comparison averaged over the tasks on which KOAP was run at every level."""
     entries = paper_cells_beside(name)
     gaps = {entry.task for entry in entries if entry.method == "koap" and entry.success is None}
-    return draw_average([entry for entry in entries if entry.task not in gaps], path)
+    draw_average([entry for entry in entries if entry.task not in gaps], path)
+    return path
 
 
 def few_labels_table(name: str, all_labels: str, human: str) -> str:

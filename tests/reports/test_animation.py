@@ -20,7 +20,8 @@ RUN = run_of("avoiding")
 
 
 def test_animation_shows_every_step_and_holds_the_end(tmp_path):
-    path = save_film(animate_rollouts(make_rollouts(), RUN), tmp_path / "a.gif")
+    path = tmp_path / "a.gif"
+    save_film(animate_rollouts(make_rollouts(), RUN), path)
     with Image.open(path) as film:
         assert film.n_frames == 11 and film.info["duration"] == 70  # steps 0, 2, ..., 18, 19; 2 x 35 ms
         first = np.asarray(film.convert("L")).astype(int)

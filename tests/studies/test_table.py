@@ -32,7 +32,8 @@ def failed(reason="RuntimeError: loss | not finite", **more):
 
 def test_reasons_become_one_line_and_nan_becomes_empty(tmp_path):
     rows = [failed(reason='first "line"\n  second, line'), cell(seed=1, action_error=math.nan)]
-    first, second = read_csv(write_csv(tmp_path / "cells.csv", CELL_COLUMNS, rows))
+    write_csv(tmp_path / "cells.csv", CELL_COLUMNS, rows)
+    first, second = read_csv(tmp_path / "cells.csv")
     assert (first["reason"], first["success_rate"]) == ('first "line" second, line', "")
     assert (second["action_error"], second["successes"], tuple(second)) == ("", "20", CELL_COLUMNS)
     before = (tmp_path / "cells.csv").read_bytes()

@@ -85,10 +85,11 @@ class Picture:
         """Returns the caption for a run."""
         return self.caption if isinstance(self.caption, str) else self.caption(run)
 
-    def write(self, run: RunFacts) -> Path:
-        """Draws the picture of a run, whose directory holds the source, and returns the file."""
-        path, drawn = run.folder / FOLDER / self.name, self.draw(_load(run.folder / self.source), run)
-        return save_figure(drawn, path) if isinstance(drawn, Figure) else save_film(drawn, path)
+    def write(self, run: RunFacts) -> None:
+        """Draws the picture of a run, whose directory holds the source."""
+        drawn = self.draw(_load(run.folder / self.source), run)
+        save = save_figure if isinstance(drawn, Figure) else save_film
+        save(drawn, run.folder / FOLDER / self.name)
 
 
 _PICTURES: dict[str, Picture] = {}
@@ -147,17 +148,15 @@ def draw_pictures(
     return problems
 
 
-def save_figure(figure: Figure, path: str | Path) -> Path:
-    """Writes a figure as png and returns the file."""
-    path = Path(path)
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Writes a figure as png."""
     with replacing_file(path) as aside:
         figure.savefig(aside, format="png", dpi=150, facecolor="white", metadata={"Software": None})
-    return path
 
 
-def save_film(film: Film, path: str | Path) -> Path:
-    """Writes a film as gif and returns the file."""
-    path, frames = Path(path), list(film.frames)
+def save_film(film: Film, path: str | Path) -> None:
+    """Writes a film as gif."""
+    frames = list(film.frames)
     with replacing_file(path) as aside:
         # one palette for all, without dithering: what stands still does not flicker and costs nothing
         some = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
@@ -165,7 +164,6 @@ def save_film(film: Film, path: str | Path) -> Path:
         images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
         times = [round(1000 * film.seconds)] * (len(images) - 1) + [round(1000 * HOLD_SECONDS)]
         images[0].save(aside, "GIF", save_all=True, append_images=images[1:], duration=times, loop=0)
-    return path
 
 
 def _load(source: Path) -> Any:

@@ -166,7 +166,7 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
     return lines
 
 
-def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
+def draw_average(entries: Sequence[Entry], path: str | Path) -> None:
     """Draws success averaged over tasks against the label level; tasks' default methods together have a line too."""
     averages = average_over_tasks(entries)
     paper: dict[str, list[tuple[int, float]]] = {}
@@ -175,7 +175,7 @@ def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
             cells = [entry.paper for entry in entries if (entry.method, entry.level) == (method, level)]
             if all(cells):
                 paper.setdefault(method, []).append((level, sum(cell.success for cell in cells) / len(cells)))
-    return plot_average(averages, paper, list(dict.fromkeys(entry.task for entry in entries)), path)
+    plot_average(averages, paper, list(dict.fromkeys(entry.task for entry in entries)), path)
 
 
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

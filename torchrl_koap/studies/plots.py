@@ -74,7 +74,7 @@ def plot_measure(
     methods: Sequence[str] | None = None,
     unit: str = "",
     label_unit: str = "",
-) -> Path:
+) -> None:
     """Draws a measure of every method with its ends, a panel per entry of ``by``.
 
     The measure is one of :data:`MEASURES`, in a ``unit``; the horizontal axes are of :data:`AXES`, labels counted in
@@ -107,7 +107,7 @@ def plot_measure(
             _scale_shares(axes, 100 if measure == "success" else 1)
         tidy(axes)
     _name_lines(figure, [line for lines in panels.values() for line in lines])
-    return save_figure(figure, path)
+    save_figure(figure, path)
 
 
 def plot_average(
@@ -115,7 +115,7 @@ def plot_average(
     paper: Mapping[str, Sequence[tuple[int, float]]],
     tasks: Sequence[str],
     path: str | Path,
-) -> Path:
+) -> None:
     """Draws success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
 
     By method ``averages`` has level, mean and the ends of its interval, the ``paper`` level and mean, all in 0..1.
@@ -136,7 +136,7 @@ def plot_average(
     hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
     tidy(axes, title + hollow)
     _name_lines(figure, lines)
-    return save_figure(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_lines(

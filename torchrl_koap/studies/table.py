@@ -77,13 +77,12 @@ class Summary:
         return self.measures[name].mean if name in self.measures else None
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Path:
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes rows as csv, aside first; what a row lacks, and what is not a finite number, stays empty."""
     with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows({name: _written(value) for name, value in row.items()} for row in rows)
-    return path
 
 
 def _written(value: Any) -> Any:
