@@ -60,9 +60,7 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
         ],
         episodes=evaluation.get("episode") or evaluation.get("trajectory"),
         again=[config.get("command")] * _given(config, "command") + [_eval_command(run)] * bool(evaluation),
-        configured=bool(config),
-        has_command=_given(config, "command"),
-        versions=config.get("versions"),
+        config=config,
         options={key: value for key, value in config.items() if key not in _CONFIG_ELSEWHERE},
     )
 
