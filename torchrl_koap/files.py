@@ -14,6 +14,7 @@ import os
 import secrets
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
@@ -122,6 +123,17 @@ def sha256_of(path: str | Path) -> str:
         while part := file.read(1 << 20):
             digest.update(part)
     return digest.hexdigest()
+
+
+def check_folder(path: str | Path) -> None:
+    """Tries whether a folder, which need not exist, takes files; the OSError names it and what is in the way."""
+    there = next(above for above in (Path(path), *Path(path).absolute().parents) if above.exists())
+    if not there.is_dir():
+        raise NotADirectoryError(f"{path} cannot be made: {there} is no folder")
+    try:
+        tempfile.TemporaryDirectory(prefix=".", dir=there).cleanup()
+    except OSError as error:
+        raise OSError(f"{path} cannot be written to: {there} takes no files ({error.strerror})") from error
 
 
 @contextlib.contextmanager

@@ -4,12 +4,15 @@
 import errno
 import json
 import os
+from pathlib import Path
 
+import numpy as np
 import pytest
 from command_calls import contents, fails
 from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.commands.cli import HINT
+from torchrl_koap.data import save_demonstrations
 from torchrl_koap.runs import weights
 
 
@@ -28,6 +31,23 @@ def test_a_training_that_cannot_be_done_leaves_nothing_behind(options, message, 
     out = tmp_path / "run"
     assert message in fails(capsys, "train", "--out", out, "--dataset", demonstrations, *TINY, *options)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("words", [("train", "--dataset", "DATA", *TINY), ("eval", "RUN"), ("inspect", "RUN")])
+def test_a_run_is_not_written_into_a_data_set(words, copied_run, demonstrations, tmp_path, capsys):
+    arm = save_demonstrations(tmp_path / "arm", [np.eye(20)], control_hz=30, action_dim=2)
+    before, places = contents(arm), {"RUN": copied_run, "DATA": demonstrations}
+    line = fails(capsys, *(places.get(word, word) for word in words), "--out", arm)
+    assert f"{arm / 'ted'} holds a data set: a run needs a folder of its own" in line
+    assert contents(arm) == before
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="a folder that takes no files, from root neither")
+@pytest.mark.parametrize("command", ["train", "convert", "eval"])
+def test_a_folder_that_takes_no_files_is_named_before_any_work(command, copied_run, demonstrations, capsys):
+    what = {"train": ("--dataset", demonstrations), "convert": ("nowhere",), "eval": (copied_run,)}[command]
+    line = fails(capsys, command, *what, "--out", "/proc/run")
+    assert "--out /proc/run cannot be written to: /proc takes no files (No such file or directory)" in line
 
 
 def test_trajectories_too_short_for_a_window_are_named_before_the_planner_is_trained(tmp_path, capsys):

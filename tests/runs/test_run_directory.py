@@ -1,9 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Plain files of a run: read back as written, rewound exactly, never half-written."""
 
+import errno
+import tempfile
+
 import pytest
 
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, writable_folder
 
 
 @pytest.fixture
@@ -66,6 +69,16 @@ def test_without_metrics_there_is_nothing_to_read_or_rewind(tmp_path):
     assert run.read_metrics() == [] and run.last_metrics("planner") == {}
     run.rewind_metrics("planner", 0)
     assert not run.path.exists()
+
+
+def test_a_folder_that_takes_no_files_is_refused_before_there_are_results(run, monkeypatch):
+    def refuse(**options):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    assert writable_folder(run.path) == run.path
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", refuse)
+    with pytest.raises(OSError, match=r"run cannot be written to: .*run takes no files \(Permission denied\)"):
+        writable_folder(run.path)
 
 
 def test_numbers_that_json_does_not_know_become_null(run):

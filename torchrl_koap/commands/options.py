@@ -23,7 +23,7 @@ from tyro.constructors import (
 )
 
 from torchrl_koap.evaluation.config import EvalConfig
-from torchrl_koap.files import read_json
+from torchrl_koap.files import check_folder, read_json
 from torchrl_koap.lookup import lookup
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
@@ -72,7 +72,7 @@ class Command:
 
 
 def check_options(options: Any) -> None:
-    """Refuses numbers that are NaN, infinite (but for limits) or beyond 2^53, and an ``out`` that lies below a file."""
+    """Refuses numbers that are NaN, infinite (but for limits) or beyond 2^53, and an ``out`` that takes no files."""
     for field in fields(options):
         value, option = getattr(options, field.name), f"--{field.name.replace('_', '-')}"
         if is_dataclass(value):
@@ -85,13 +85,10 @@ def check_options(options: Any) -> None:
             if isinstance(number, (int, float)) and abs(number) > LARGEST:
                 raise ValueError(f"{option} must be at most {LARGEST:,}, got {number:,}")
         if field.name == "out" and value is not None:
-            _check_folder(Path(value), option)
-
-
-def _check_folder(path: Path, option: str) -> None:
-    there = next((above for above in (path, *path.parents) if above.exists()), None)
-    if there is not None and not there.is_dir():
-        raise ValueError(f"{option} {path} cannot be made: {there} is no folder")
+            try:
+                check_folder(value)
+            except OSError as error:
+                raise ValueError(f"{option} {error}") from error
 
 
 def expand(words: Sequence[str]) -> list[str]:

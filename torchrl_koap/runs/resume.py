@@ -35,6 +35,7 @@ def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
 def check_resume(run: RunDirectory, config: TrainConfig) -> None:
     """Refuses a folder that holds another run than what is to be trained, or was not asked to be resumed."""
     if not (run.path / "config.json").exists():
+        run.refuse_data()
         names = ("planner.safetensors", "controller.safetensors", "checkpoints")
         if left := [name for name in names if (run.path / name).exists()]:
             raise RunDirectoryError(f"{run.path} holds {', '.join(left)} but no config.json; choose another --out")

@@ -13,7 +13,16 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.files import DataError, LockedError, check_file, one_at_a_time, read_json, replacing_file
+from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.files import (
+    DataError,
+    LockedError,
+    check_file,
+    check_folder,
+    one_at_a_time,
+    read_json,
+    replacing_file,
+)
 from torchrl_koap.lookup import lookup
 
 PREFIX = "pretrained:"
@@ -52,6 +61,11 @@ class RunDirectory:
             return read_json(path)
         except DataError as error:
             raise RunDirectoryError(f"{path} is damaged: {error.problems[0]}") from error
+
+    def refuse_data(self) -> None:
+        """Raises a RunDirectoryError where the folder holds a data set: whoever removes the run would remove it too."""
+        if (stored := stored_folder(self.path)) is not None:
+            raise RunDirectoryError(f"{stored} holds a data set: a run needs a folder of its own; choose another --out")
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``: the values (losses, learning rate, speed) after a step of a phase.
@@ -177,6 +191,7 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
     """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run."""
     source, target = Path(source), Path(target)
     config = RunDirectory(source).read_json("config.json")
+    RunDirectory(target).refuse_data()
     if (target / "config.json").exists() and RunDirectory(target).read_json("config.json") != config:
         raise RunDirectoryError(f"{target} holds another run than {source}; choose another --out")
     target.mkdir(parents=True, exist_ok=True)
@@ -198,4 +213,5 @@ def writable_folder(run: str | Path, out: str | Path | None = None) -> Path:
         return copy_run(source, out)
     if str(run).startswith(PREFIX):
         raise ValueError(f"nothing is written into {run}: name a folder of your own with --out")
+    check_folder(source)
     return source
