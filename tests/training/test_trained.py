@@ -11,6 +11,7 @@ from offline_runs import fit_walks
 from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, load_policy
+from torchrl_koap.commands.doctor import check_run
 from torchrl_koap.runs.run_directory import RunDirectoryError, copy_run
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
@@ -58,8 +59,10 @@ def test_an_unfinished_training_is_told_from_a_damaged_one(trained_run, tmp_path
     with pytest.raises(CheckpointError, match="planner.safetensors is missing"):
         Trained.load(run)
     (run / "summary.json").unlink()
-    with pytest.raises(RunDirectoryError, match="run is not finished: go on with `koap train --out .*run --resume`"):
-        Trained.load(run)
+    said = r"run is not finished \(no summary.json\): go on with `koap train --out .*run --resume`"
+    for unfinished in (Trained.load, check_run):
+        with pytest.raises(RunDirectoryError, match=said):
+            unfinished(run)
 
 
 def test_a_policy_follows_plans_as_it_was_trained_for_unless_asked(own):

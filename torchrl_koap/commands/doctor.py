@@ -30,7 +30,7 @@ _EXTRAS = {"lerobot": "pyarrow", "hdf5": "h5py", "minari": "minari", "video": "a
     "tensorboard": "tensorboard",
 }
 _SIMULATORS = ("dm-control", "gymnasium-robotics", "numba")
-_LATER = ("eval.json", "inspect.json", "suggestions.json")  # files that a run may have
+_LATER = ("summary.json", "eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
 
 @dataclass(kw_only=True)
@@ -75,7 +75,7 @@ def check_run(folder: Path) -> dict[str, str]:
         except (ValueError, OSError, RuntimeError) as error:
             problems[str(error)] = None
 
-    files = ["config.json", "summary.json", *(name for name in _LATER if (folder / name).exists())]
+    files = ["config.json", *(name for name in _LATER if (folder / name).exists())]
     for name in files:
         look(run.read_json, name)
     if not problems:  # its networks are made of what config.json says

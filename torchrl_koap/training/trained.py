@@ -100,15 +100,13 @@ class Trained:
         except (KeyError, TypeError, ValueError) as error:
             problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error
             raise RunDirectoryError(f"{path / 'config.json'} cannot be used: {problem}") from error
-        finished = (path / "summary.json").exists()  # it is written last
+        if not (path / "summary.json").exists():  # it is written last
+            how = f"`koap train --out {shlex.quote(str(path))} --resume`"
+            raise RunDirectoryError(f"the training of {path} is not finished (no summary.json): go on with {how}")
         for name, module in {"planner": planner, "controller": controller}.items():
             if module is not None:
-                file = path / f"{name}.safetensors"
-                if not (finished or file.exists()):
-                    how = f"`koap train --out {shlex.quote(str(path))} --resume`"
-                    raise RunDirectoryError(f"the training of {path} is not finished: go on with {how}")
-                load_weights(file, module, facts_of(name, task, config))
-        results = run.read_json("summary.json") if finished else {}
+                load_weights(path / f"{name}.safetensors", module, facts_of(name, task, config))
+        results = run.read_json("summary.json")
         held_out, cameras = tuple(content.get("held_out_episodes") or ()), load_cameras(path / CAMERAS)
         return cls(task, config, planner, controller, results, held_out, path, cameras)
 
