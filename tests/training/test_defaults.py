@@ -137,8 +137,10 @@ class TestExecution:
         assert execution(own).temperature == 0.9
 
     def test_of_plans_is_refused_where_there_are_none(self):
-        with pytest.raises(ValueError, match="execution.strategy 'feedback' was asked of method 'dp', which samples"):
+        with pytest.raises(ValueError, match="strategy 'feedback' was asked of method 'dp', which samples"):
             resolved(method="dp", execution=ExecutionConfig(strategy="feedback"))
+        with pytest.raises(ValueError, match=r"blend 0\.2 was asked of method 'dp', which samples actions"):
+            resolved(method="dp", execution=ExecutionConfig(blend=0.2))
         with pytest.raises(ValueError, match="'oracle' reads a simulation: it is for `koap eval`"):
             resolved(execution=ExecutionConfig(strategy="oracle"))
 

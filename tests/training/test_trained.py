@@ -75,6 +75,8 @@ def test_a_method_that_samples_actions(demonstrations, tmp_path):
     assert koap("train", "--out", tmp_path / "dp", "--dataset", demonstrations, "--method", "dp", *TINY) == 0
     with pytest.raises(ValueError, match="strategy 'feedback' was asked of method 'dp', which samples actions"):
         load_policy(tmp_path / "dp", strategy="feedback")
+    with pytest.raises(ValueError, match=r"blend 0\.2 was asked of method 'dp', which samples actions"):
+        load_policy(tmp_path / "dp", blend=0.2)
     loaded = load_policy(Trained.load(tmp_path / "dp").save(tmp_path / "dp.safetensors"), replan_interval=3)
     assert loaded.follower is None and loaded.execution == Execution("open_loop", replan_interval=3)
     np.testing.assert_array_equal(actions(loaded), actions(load_policy(tmp_path / "dp", replan_interval=3)))

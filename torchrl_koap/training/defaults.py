@@ -117,13 +117,9 @@ def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionC
     if asked.strategy == "oracle":
         raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
     if not method.plans:
-        if asked.strategy not in (None, "open_loop"):
-            raise ValueError(
-                f"execution.strategy {asked.strategy!r} was asked of method {method.name!r}, which samples actions and"
-                " executes chunks of them: there is no plan to follow"
-            )
         own["strategy"] = "open_loop"
     own |= method.execution
+    method.check_execution(asked, Execution().replaced(**own))
     if asked.on(Execution().replaced(**own)).strategy == "feedback":
         own = {"replan_interval": min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), MOST_FOLLOWED)} | own
     return ExecutionConfig(**vars(asked.on(Execution().replaced(**own))))

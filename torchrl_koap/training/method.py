@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.execution.execution import Execution
+from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
 
 
 class Batch(NamedTuple):
@@ -142,3 +142,12 @@ class Method:
     def phases_of(self, preset: str) -> tuple[Phase, ...]:
         """Returns how it is trained with a preset."""
         return self.phases_by_preset.get(preset, self.phases)
+
+    def check_execution(self, asked: Execution | ExecutionConfig, usual: Execution) -> None:
+        """Raises a ValueError for options of plans that are asked, other than usual, of a method that has none."""
+        for name in () if self.plans else ("strategy", "blend"):
+            if getattr(asked, name) not in (None, getattr(usual, name)):
+                raise ValueError(
+                    f"{name} {getattr(asked, name)!r} was asked of method {self.name!r}, which samples actions and"
+                    " executes chunks of them: there is no plan to follow"
+                )

@@ -215,11 +215,9 @@ class Trained:
         facts["observe"] = Observer.of(self.task, self.cameras)
         if self.method.plans:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
-        if execution.strategy != "open_loop" or follower is not None:
-            raise ValueError(
-                f"strategy {execution.strategy!r} was asked of method {self.method.name!r}, which samples actions and"
-                " executes chunks of them: there is no plan to follow"
-            )
+        self.method.check_execution(execution, self.execution)
+        if follower is not None:
+            raise ValueError(f"method {self.method.name!r} samples actions: there is no plan for a follower")
         return make_policy(self.controller, **facts, execution=execution)
 
     def data(self, dataset: str | None = None) -> TensorDictBase:
