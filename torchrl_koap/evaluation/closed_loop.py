@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -96,7 +97,13 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     result |= where.facts
     if where.record is not None:
         result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
+        result["mean_return"] = statistics.fmean(float(episode["next", "reward"].sum()) for episode in episodes)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
+        if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
+            result["faults"].append(
+                "no episode ended with a positive reward, and info does not say at the first step what success is:"
+                " name its entry with --success-key, or compare mean returns"
+            )
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
         replace(task, modes=where.modes),

@@ -188,7 +188,9 @@ def _environment(run: RunFacts) -> Row | None:
         return None
     success = f"success: info[{made['success_key']!r}]" if made.get("success_key") else made.get("success")
     limit = f"at most {made['step_limit']}" if made.get("step_limit") else None
-    return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, success))))
+    total = number(made.get("mean_return"))
+    gained = None if total is None else f"mean return {total:.4g}"
+    return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, success, gained))))
 
 
 def _speed(run: RunFacts) -> Row | None:
