@@ -4,11 +4,13 @@
 import json
 import re
 
+import numpy as np
 import pytest
 import torch
 from command_calls import fails
 from tiny_runs import TINY, koap
 
+from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, TrainConfig, save_demonstrations, train
 from torchrl_koap.evaluation import active_labelling
 from torchrl_koap.evaluation.active_labelling import SuggestConfig, rank_trajectories, suggest
 from torchrl_koap.training import trained
@@ -100,6 +102,16 @@ def test_bad_arguments(change, message):
     arguments = {"latent": latents(), "episode": EPISODE, "labelled": KNOWN, "penalty": 0.1} | change
     with pytest.raises(ValueError, match=message):
         rank_trajectories(**arguments)
+
+
+def test_recordings_without_actions_are_to_get_them_first(tmp_path):
+    states = [np.random.default_rng(index).normal(size=(30, 2)).cumsum(0) for index in range(4)]
+    actions = [np.diff(states[0], axis=0), None, None, np.diff(states[3], axis=0)]
+    data = save_demonstrations(tmp_path / "arm", states, actions, control_hz=30)
+    few = {"planner": PlannerConfig(steps=2, width=8), "controller": ControllerConfig(steps=2)}
+    train(TrainConfig(dataset=str(data), out=tmp_path / "run", labels=LabelConfig(episodes=(0,)), **few))
+    said = suggest(tmp_path / "run", SuggestConfig(count=3))["next"]
+    assert re.match(r"add actions to recordings (1, 2|2, 1) and convert them again, then koap train --task arm", said)
 
 
 def test_suggest_from_the_shell(copied_run, capsys):

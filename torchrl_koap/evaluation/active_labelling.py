@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchrl_koap.evaluation.latent_space import infer_steps
+from torchrl_koap.files import some
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
@@ -194,7 +195,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
             f"the decoder of {trained.folder} was not fitted in closed form and knows no uncertainty:"
             " train with `--method koap`"
         )
-    data, report = trained.hide_labels(trained.data(config.dataset))
+    recorded = trained.data(config.dataset)
+    data, report = trained.hide_labels(recorded)
     steps = infer_steps(controller, trained.seen(data))
     choices = rank_trajectories(
         steps["latent_action"],
@@ -212,10 +214,13 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
     again = ["koap", "train", "--task", task.name, "--dataset", config.dataset or trained.config.dataset]
     every = [*labelled, *(choice.episode for choice in choices)]
+    known = recorded[EPISODE][recorded[HAS_ACTION].squeeze(-1)].unique().tolist()
+    without = [episode for episode in every if episode not in known]
+    first = f"add actions to recordings {some(without)} and convert them again, then " if without else ""
     return {
         "penalty": penalty,
         "labelled_steps": report.labelled_transitions,
         "labelled_episodes": labelled,
         "suggestions": rows,
-        "next": f"{shlex.join([*again, '--labels.episodes', *map(str, every)])} --out NEW",
+        "next": f"{first}{shlex.join([*again, '--labels.episodes', *map(str, every)])} --out NEW",
     }
