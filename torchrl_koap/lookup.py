@@ -56,7 +56,7 @@ def resolve(reference: Any, what: str) -> Any:
     if not (module and colon and name):
         raise ValueError(f"{what}: wanted an import string 'package.module:name', got {reference!r}")
     try:
-        found = _run_file(module) if module.endswith(".py") else importlib.import_module(module)
+        found = import_code(module)
     except (ImportError, OSError) as error:
         raise ValueError(f"{what}: module {module!r} cannot be imported: {error}") from error
     try:
@@ -65,9 +65,13 @@ def resolve(reference: Any, what: str) -> Any:
         raise ValueError(f"{what}: module {module!r} has no {name!r} (asked for as {reference!r})") from None
 
 
+def import_code(module: str) -> ModuleType:
+    """Imports a module by its dotted name, or runs a file ``*.py``, which no import finds, once."""
+    return _run_file(module) if module.endswith(".py") else importlib.import_module(module)
+
+
 @functools.cache
 def _run_file(path: str) -> ModuleType:
-    """The module in a file that no import finds."""
     spec = importlib.util.spec_from_file_location(Path(path).stem, Path(path).expanduser().resolve())
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} is no Python file")

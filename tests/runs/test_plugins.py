@@ -112,6 +112,14 @@ def test_a_plugin_that_fails_is_named_with_its_error(tmp_path, monkeypatch):
         load_plugins(["no_package.inside"])
 
 
+def test_a_plugin_may_be_a_file_that_no_import_finds(tmp_path):
+    (tmp_path / "mine.py").write_text("raise SystemError('it was run')")
+    with pytest.raises(PluginError, match="mine.py' failed when it was imported: SystemError: it was run"):
+        load_plugins([str(tmp_path / "mine.py")])
+    with pytest.raises(PluginError, match="none.py' failed when it was imported: FileNotFoundError"):
+        load_plugins([str(tmp_path / "none.py")])
+
+
 def test_what_is_no_method_is_refused():
     loss, build = METHODS["dd"].phases[0].loss, METHODS["dd"].build
     register_method(Method("mine", "of mine", build))

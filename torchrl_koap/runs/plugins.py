@@ -11,6 +11,8 @@ from typing import Annotated
 
 import tyro
 
+from torchrl_koap.lookup import import_code
+
 # a field of options: tuple of module names, on the command line `--plugin NAME`, as often as there are any
 Plugins = Annotated[tuple[str, ...], tyro.conf.arg(name="plugin", metavar="MODULE"), tyro.conf.UseAppendAction]
 
@@ -20,7 +22,7 @@ class PluginError(ValueError):
 
 
 def load_plugins(names: Sequence[str]) -> None:
-    """Imports modules, by their dotted names, that register something when they are imported; later calls do nothing.
+    """Imports modules, dotted names or files ``*.py``, that register something then; later calls do nothing.
 
     The current directory is searched after the Python path, so that a file beside the data is found. A PluginError
     names a module that is not found, and where it was looked for, or what went wrong in its import.
@@ -37,7 +39,7 @@ def load_plugins(names: Sequence[str]) -> None:
 
 def _load(name: str) -> None:
     try:
-        importlib.import_module(name)
+        import_code(name)
     except Exception as error:
         absent = error.name if isinstance(error, ModuleNotFoundError) else None
         if absent is not None and (name == absent or name.startswith(f"{absent}.")):
