@@ -160,8 +160,8 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
     ("options", "message"),
     [
         ({"methods": ("kaop",)}, "unknown method 'kaop'; did you mean 'koap'?"),
-        ({"labels": (0,)}, "labels must be in (0, 1], got 0"),
-        ({"labels": (0.1, 1.5)}, "labels must be in (0, 1], got 1.5"),
+        ({"labels": (0,)}, "labels must be shares in (0, 1], got 0"),
+        ({"labels": (0.1, 1.5)}, "labels must be shares in (0, 1], got 1.5"),
         ({"labels": ("nan",)}, "--labels must be a finite number, got nan"),
         ({"labels": (0.25, 0.01)}, "a label fraction of 0.01 selects none of the 8 trajectories"),
         ({"demonstrations": (0.05,)}, "an observation fraction of 0.05 keeps 0 of 8 trajectories"),

@@ -91,7 +91,7 @@ class Study:
             recorded in the folder, once for all cells).
         record: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS.
-        labels: shares of the units that keep their labels.
+        labels: shares of the units that keep their labels; 1 is all of them, not one as for `koap train`.
         levels: label levels of the paper for every task (1: fewest labels) instead of shares.
         first_seed_only: levels that are trained with seed 0 alone (default: those of the preset).
         label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
@@ -160,7 +160,7 @@ class Study:
         for name, shares in (("labels", self.labels), ("demonstrations", self.demonstrations)):
             for value in shares:
                 if not 0 < value <= 1:
-                    raise ValueError(f"{name} must be in (0, 1], got {value:g}")
+                    raise ValueError(f"{name} must be shares in (0, 1], got {value:g}")
         return [
             Cell(task, method, labels, share, seed)
             for task in dict.fromkeys(self.tasks)
