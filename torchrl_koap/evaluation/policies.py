@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_koap.modules import ExecutionConfig, PlanningPolicy, blend_plan
+from torchrl_koap.modules import Execution, ExecutionConfig, PlanningPolicy, blend_plan
 from torchrl_koap.modules.execution.followers import Follower, command_rest
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.trained import Trained
@@ -53,7 +53,7 @@ def load_policy(
         PlanningPolicy: in evaluation mode, on the device asked for.
 
     Raises:
-        ValueError: for an unknown strategy, or a number out of range.
+        ValueError: for an unknown option or strategy, or a number out of range.
         RunDirectoryError, CheckpointError, PluginError: as :meth:`Trained.load`.
 
     Examples:
@@ -64,9 +64,9 @@ def load_policy(
         >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded and measured xy to a change of xy (m)
         (2,)
     """
-    wanted = ExecutionConfig(**asked)
+    Execution().replaced(**asked)  # an unknown name suggests the nearest
     trained = where if isinstance(where, Trained) else Trained.load(where, plugins=plugins)
-    return trained_policy(trained, wanted).to(device)
+    return trained_policy(trained, ExecutionConfig(**asked)).to(device)
 
 
 def trained_policy(trained: Trained, asked: ExecutionConfig) -> PlanningPolicy:
