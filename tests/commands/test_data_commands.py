@@ -6,9 +6,10 @@ import shutil
 
 import numpy as np
 import pytest
+from command_calls import fails
 from tiny_runs import koap, write_demonstrations
 
-from torchrl_koap.data import save_demonstrations
+from torchrl_koap.data import formats, save_demonstrations
 from torchrl_koap.data.ted import load_ted
 
 
@@ -59,3 +60,24 @@ def test_validate_names_the_files(tmp_path, capsys):
     assert koap("validate", folder) == 0
     said = capsys.readouterr().out
     assert "env_900_00.pkl repeats" in said and "no problem found, 1 warning(s)" in said
+
+
+READER = """
+import numpy as np
+from torchrl_koap.data.formats import FORMATS, Format, make_recordings
+
+FORMATS["text"] = Format(
+    "a text of numbers", lambda source: source.endswith(".txt"),
+    lambda source: make_recordings([np.loadtxt(source)], action_dim=1, control_hz=30.0),
+)
+"""
+
+
+def test_a_plugin_adds_a_format(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
+    (tmp_path / "reader.py").write_text(READER)
+    np.savetxt(tmp_path / "walk.txt", np.random.default_rng(0).normal(size=(30, 2)))
+    words = ("convert", tmp_path / "walk.txt", "--out", tmp_path / "walk")
+    assert "holds no recordings that can be read" in fails(capsys, *words)
+    assert koap(*words, "--plugin", tmp_path / "reader.py") == 0
+    assert load_ted(tmp_path / "walk" / "ted")[0]["observation"].shape == (29, 2)

@@ -142,6 +142,7 @@ class Convert(Command):
         action_units: unit of each action column, or one for all.
         state_units: unit of each state column, or one for all.
         max_steps: steps after which an episode counts as failed (default: 1.5 times the longest demonstration).
+        plugins: modules that add a format of their own to torchrl_koap.data.formats.FORMATS.
     """
 
     source: tyro.conf.Positional[str]
@@ -165,9 +166,11 @@ class Convert(Command):
     action_units: tuple[str, ...] = ()
     state_units: tuple[str, ...] = ()
     max_steps: int | None = None
+    plugins: Plugins = ()
 
     def __call__(self) -> dict[str, Any]:
         """Reads, checks and writes."""
+        load_plugins(self.plugins)
         return self._bring_in() if self.to is None else self._take_out(self.to)
 
     def _bring_in(self) -> dict[str, Any]:
