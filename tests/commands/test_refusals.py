@@ -42,6 +42,14 @@ def test_a_run_is_not_written_into_a_data_set(words, copied_run, demonstrations,
     assert contents(arm) == before
 
 
+@pytest.mark.parametrize("words", [("convert", "nowhere"), ("embed", "nowhere"), ("demos",)])
+def test_a_data_set_is_not_written_into_a_run(words, copied_run, capsys):
+    before = contents(copied_run)
+    line = fails(capsys, *words, "--out", copied_run)
+    assert f"{copied_run / 'config.json'} exists already; choose another --out" in line
+    assert contents(copied_run) == before
+
+
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="a folder that takes no files, from root neither")
 @pytest.mark.parametrize("command", ["train", "convert", "eval"])
 def test_a_folder_that_takes_no_files_is_named_before_any_work(command, copied_run, demonstrations, capsys):

@@ -20,7 +20,7 @@ from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings, write_recordings
 from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
 from torchrl_koap.data.sources import find_task_of
-from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.data.ted import check_new, stored_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport, record_to_folder
 from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.scooping.recording import VideoReport, record_videos
@@ -177,8 +177,7 @@ class Convert(Command):
         if stored_folder(self.source) is not None:
             again = " (and convert that with the roles of its columns)" if self.resample is not None else ""
             raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
-        if (self.out / "ted").exists():
-            raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
+        check_new(self.out)
         recordings = self._read()
         with warnings.catch_warnings(record=True) as unlikely:
             warnings.simplefilter("always")

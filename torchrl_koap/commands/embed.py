@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_koap.commands.options import Command
-from torchrl_koap.data.ted import read_about
+from torchrl_koap.data.ted import check_new, read_about
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import get_task
@@ -58,8 +58,7 @@ class Embed(Command):
         load_plugins(self.plugins)
         if self.components < 1:
             raise ValueError(f"--components must be at least 1, got {self.components}")
-        if (self.out / "ted").exists():
-            raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
+        check_new(self.out)
         asked = None if self.task is None else get_task(self.task)
         file = self.projection
         if file is None and asked is not None:

@@ -29,6 +29,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import flatten_trajectories, save_ted
+from torchrl_koap.data.ted import check_new
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.experts.disturbances import KINDS, Disturbances, choose_disturbed, disturbed_columns
 from torchrl_koap.envs.experts.recording import FAULTS, Attempt, expert_of, play
@@ -264,8 +265,7 @@ def record_to_folder(
     iterating()  # looks at the arguments before anything is written
     ted, unfinished = Path(folder) / "ted", Path(folder) / "unfinished"
     begun, files = unfinished / "request.json", [unfinished / f"{number:05d}.npz" for number in range(episodes)]
-    if ted.exists():
-        raise FileExistsError(f"{ted} exists already; choose another --out")
+    check_new(folder)
     there = json.loads(begun.read_text()) if begun.exists() else request
     other = [f"{key} {there.get(key)!r}, not {value!r}" for key, value in request.items() if there.get(key) != value]
     if other:
