@@ -3,6 +3,7 @@
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 
 from torchrl_koap import ControllerConfig, Execution, ExecutionConfig, LabelConfig, PlannerConfig, TrainConfig
@@ -47,6 +48,19 @@ class TestTheTasksPreset:
     )
     def test_is_not_that_of_other_methods(self, method, own):
         assert resolved("po_sorting", method).controller.preset == own
+
+    @pytest.mark.parametrize("method", ["koap", "linear_steps", "dd", "koap_untrained"])
+    def test_looks_further_ahead_where_actions_are_targets(self, method):
+        states = [np.random.default_rng(0).normal(size=(20, 2)).cumsum(0)]
+        kinds = {"absolute": ("delayed", 7), "delta": ("default", 10)}
+        for kind, (preset, most) in kinds.items():
+            actions = [states[0][1:] if kind == "absolute" else np.diff(states[0], axis=0)]
+            targets = [0, 1] if kind == "absolute" else None
+            _, own = make_demonstrations(states, actions, control_hz=100, action_kind=kind, targets=targets)
+            config = resolve(TrainConfig(out="run", method=method), own)
+            assert config.controller.preset == preset
+            # what the last action of a plan reads is in the plan
+            assert config.execution.replan_interval == (4 if method == "dd" else most)
 
     @pytest.mark.parametrize("method", ["koap", "linear_steps", "dd", "koap_untrained"])
     def test_is_absolute_for_every_method_that_decodes_commands(self, method):

@@ -99,7 +99,7 @@ class ControllerConfig:
     """The controller, which turns states into actions. None: the method's default, else the task's.
 
     Attributes:
-        preset: variant of KOAP: "default", "absolute", "semi_supervised", "scene" or "paper".
+        preset: variant of KOAP: "default", "delayed", "absolute", "semi_supervised", "scene" or "paper".
         steps: updates (default: 500); with 0 only a closed form is fitted.
         columns: state columns that it reads: those of the "robot", "all" as in the paper, or "related" (all, and the
             relative positions that the planner reads).

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
+import numpy as np
+
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
@@ -14,7 +16,7 @@ from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, TrainConfi
 from torchrl_koap.runs.config_files import read_config
 from torchrl_koap.runs.device import default_threads, find_precision
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, Task
+from torchrl_koap.tasks import HISTORY, HORIZON, REPLAN_INTERVAL, Task
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import NETWORKS
@@ -22,11 +24,11 @@ from torchrl_koap.training.policy_facts import tells_commands
 
 CONTROLLER_UPDATES = 500
 PLACES = "absolute"  # the default preset where decoded actions are places
+FOLLOWED = "delayed"  # where they are targets of state columns, which a robot takes its time to reach
 # a planner for the hundred or so demonstrations that people record: one that does not overfit them
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.4  # of plans where no figure counts the modes
 PLAN_SECONDS = 0.1  # with feedback, at least: plans made anew every few ms begin where the robot lags behind the last
-MOST_FOLLOWED = 10  # frames of a plan: actions of later ones would need frames beyond its end
 Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 
 
@@ -44,14 +46,15 @@ def resolve(config: TrainConfig, task: Task) -> TrainConfig:
     labels = config.labels
     if labels.fraction is None and labels.count is None and not labels.episodes:
         labels = replace(labels, fraction=1.0)
+    controller = _controller(config.controller, method, task)
     return replace(
         config,
         task=task.name,
         method=method.name,
         labels=labels,
         planner=_planner(config.planner, method, task),
-        controller=_controller(config.controller, method, task),
-        execution=_execution(config.execution, method, task),
+        controller=controller,
+        execution=_execution(config.execution, method, task, controller.preset),
         run=replace(
             config.run,
             threads=config.run.threads or default_threads(),
@@ -101,8 +104,10 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
     if method.name != task.defaults.method or own.get("preset") not in method.presets:
         own.pop("preset", None)  # of the task's own method
     places = tells_commands(task, method) or not (task.delta_actions or task.targets)
-    presets = method.presets + ((PLACES,) if "default" in method.presets else ())
-    usual = PLACES if places and method.presets[0] == "default" else method.presets[0]
+    presets, usual = method.presets, method.presets[0]
+    if usual == "default":
+        presets += (PLACES, FOLLOWED)
+        usual = PLACES if places else FOLLOWED if task.targets else usual
     declared = {"columns": method.columns, "steps": method.updates}
     library = {"preset": usual, "steps": CONTROLLER_UPDATES, "columns": "robot"}
     section = _filled(asked, {k: v for k, v in declared.items() if v is not None}, own, library)
@@ -112,7 +117,7 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
     return section
 
 
-def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionConfig:
+def _execution(asked: ExecutionConfig, method: Method, task: Task, preset: str) -> ExecutionConfig:
     own = ({"temperature": OWN_TEMPERATURE} if task.env is None else {}) | dict(task.defaults.execution)
     if asked.strategy == "oracle":
         raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
@@ -121,7 +126,9 @@ def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionC
     own |= method.execution
     method.check_execution(asked, Execution().replaced(**own))
     if asked.on(Execution().replaced(**own)).strategy == "feedback":
-        own = {"replan_interval": min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), MOST_FOLLOWED)} | own
+        # actions of later frames would need frames beyond the plan's end
+        most = HORIZON + 1 - np.max(PRESETS[preset]["look_ahead"]).item()
+        own = {"replan_interval": min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), most)} | own
     return ExecutionConfig(**vars(asked.on(Execution().replaced(**own))))
 
 

@@ -57,7 +57,7 @@ def test_options_override_the_preset_and_reach_the_parts():
     ("options", "message"),
     [
         ({"preset": "paperr"}, "unknown preset 'paperr'; did you mean 'paper'"),
-        ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, absolute, semi_supervised, scene, paper"),
+        ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, delayed, absolute, semi_supervised, scene, paper"),
         ({"preset": None}, "unknown preset None"),
         ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
         ({"preset": "paper", "curvature": 0.1}, "option .* preset 'paper': 'curvature'"),

@@ -26,12 +26,21 @@ _DEFAULT: dict[str, Any] = {
     "penalty": 0.15,
 }
 
+_FOURIER: dict[str, Any] = {
+    "num_features": 512,
+    "curvature": 0.1,
+    "motion_scale": 1.0,
+    "position_scale": 4.0,
+    "position_weight": 0.0,
+}
+
 # everything that a variant is; what only its network takes stands last
 PRESETS: dict[str, dict[str, Any]] = {
     # observables of the frames relative to the current one, an input matrix B, no clamped look-ahead, a
     # decoder in closed form
-    "default": _DEFAULT
-    | {"num_features": 512, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "position_weight": 0.0},
+    "default": _DEFAULT | _FOURIER,
+    # robots that respond late: the state 8 steps ahead is read, too, as in the paper
+    "delayed": _DEFAULT | {"look_ahead": (2, 3, 4, 5, 8)} | _FOURIER,
     # actions, or commands, that say where the robot is to be: what is read off the present frame counts more than the
     # steps around it
     "absolute": _DEFAULT
@@ -103,7 +112,7 @@ def make_koopman_inverse_dynamics(
         action_dim (int): size of an action.
 
     Keyword Args:
-        preset (str): ``"default"``, ``"absolute"``, ``"semi_supervised"``, ``"scene"`` or ``"paper"``.
+        preset (str): a name in :data:`PRESETS`.
         **overrides: any entry of ``PRESETS[preset]`` but its network.
 
     Returns:
