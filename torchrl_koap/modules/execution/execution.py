@@ -74,7 +74,8 @@ class ExecutionConfig:
     Attributes:
         strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (inverse dynamics of
             the simulator, which follow plans closely: remaining failures are the planner's).
-        replan_interval: control steps per plan (default with feedback: those of 0.1 s, at least 4 and at most 10).
+        replan_interval: control steps per plan (default with feedback: those of 0.1 s, 4 to 10, or 7 where actions are
+            targets).
         blend: share of the distance between robot and plan that remains after each step; 0: plans are not shifted.
         lead: largest distance of the command from the robot along each axis, in the units of the actions; 0: no limit.
         gain: factor of actions that are changes of a command: above 1 the robot is faster than planned.
