@@ -138,6 +138,8 @@ def draw_grounds(path: Path) -> Path:
     judged = [ground for ground in TITLES if ground not in rolled]
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[max(2, len(rolled)), 2 * max(1, len(judged))])
+    left.set(ylim=(0, 1.12), ylabel="largest reward, or success")
+    right.set(ylim=(0, 1.6), ylabel="error on recordings")
     for number, (method, (name, color)) in enumerate(COMPARED.items()):
         for place, ground in enumerate(rolled):
             score = ground_score(ground, method)
@@ -150,12 +152,10 @@ def draw_grounds(path: Path) -> Path:
                     _bar(right, 2 * place + step + STEP * number, share, share, share, color, name)
     texts = [f"{TITLES[ground].replace(' ', chr(10), 1)}\n{usual_labels(ground)} labelled" for ground in rolled]
     left.set_xticks([place + 0.4 for place in range(len(rolled))], texts, fontsize=8)
-    left.set(ylim=(0, 1.12), ylabel="largest reward, or success")
     kinds = ("actions,\nridge = 1", "plans,\nstanding still = 1")
     texts = [f"{TITLES[ground]}\n{kind}" for ground in judged for kind in kinds]
     right.set_xticks([place + 0.4 for place in range(len(texts))], texts, fontsize=8)
     right.axhline(1, color=MUTED, linewidth=0.7, linestyle=":")
-    right.set_ylabel("error on recordings")
     handles = {text: handle for handle, text in zip(*left.get_legend_handles_labels(), strict=True)}
     figure.legend(
         handles.values(), handles.keys(), loc="outside lower center", ncols=len(COMPARED), frameon=False, fontsize=9
@@ -169,4 +169,6 @@ def draw_grounds(path: Path) -> Path:
 def _bar(axes, place: float, mean: float, low: float, high: float, color: str, name: str) -> None:
     axes.bar(place, mean, width=0.9 * STEP, color=color, label=name)
     axes.plot([place, place], [low, high], color=INK, linewidth=1)
-    axes.annotate(f"{mean:.2f}", (place, high), ha="center", va="bottom", fontsize=6, color=INK, rotation=90)
+    top = min(high, 0.9 * axes.get_ylim()[1])  # a bar that is cut off keeps its number
+    ink = INK if top == high else "white"
+    axes.annotate(f"{mean:.2f}", (place, top), ha="center", va="bottom", fontsize=6, color=ink, rotation=90)
