@@ -201,6 +201,7 @@ class Export(Command):
         set_up_torch(self.threads, "cpu")
         trained = Trained.load(self.run)
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
+        RunDirectory(out).refuse_data()
         if suffix is None:
             return write_lerobot_folder(trained, out)
         out.mkdir(parents=True, exist_ok=True)

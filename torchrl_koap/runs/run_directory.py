@@ -63,9 +63,9 @@ class RunDirectory:
             raise RunDirectoryError(f"{path} is damaged: {error.problems[0]}") from error
 
     def refuse_data(self) -> None:
-        """Raises a RunDirectoryError where the folder holds a data set: whoever removes the run would remove it too."""
+        """Raises a RunDirectoryError where the folder holds a data set, which has a folder of its own."""
         if (stored := stored_folder(self.path)) is not None:
-            raise RunDirectoryError(f"{stored} holds a data set: a run needs a folder of its own; choose another --out")
+            raise RunDirectoryError(f"{stored} holds a data set, which needs a folder of its own; choose another --out")
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``: the values (losses, learning rate, speed) after a step of a phase.
