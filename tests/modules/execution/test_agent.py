@@ -122,9 +122,9 @@ def test_what_is_no_observation(given, says):
         ready().act(given)
 
 
-@pytest.mark.parametrize("seed", ["1", None, 1.5, True])
+@pytest.mark.parametrize("seed", ["1", None, 1.5, True, -1])
 def test_what_is_no_seed(seed):
-    with pytest.raises(ValueError, match=f"seed must be a whole number, got {seed!r}"):
+    with pytest.raises(ValueError, match=f"seed must be a whole number >= 0, got {seed!r}"):
         ready(seed=seed)
 
 

@@ -41,8 +41,8 @@ class Agent:
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
-        ValueError: for a seed that is no whole number; for observations of another width, batch or number of axes than
-            before, that are not finite, or from which no finite action follows.
+        ValueError: for a seed that is no whole number >= 0; for observations of another width, batch or number of axes
+            than before, that are not finite, or from which no finite action follows.
 
     Examples:
         >>> import numpy as np
@@ -59,8 +59,8 @@ class Agent:
     _frames: Tensor | None  # [n, history, obs]
 
     def __init__(self, policy: PlanningPolicy, *, seed: int = 0):
-        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-            raise ValueError(f"seed must be a whole number, got {seed!r}")
+        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+            raise ValueError(f"seed must be a whole number >= 0, got {seed!r}")
         self.policy, self.seed = policy, int(seed)
         example = next(policy.parameters(), torch.empty(0))
         self.device, self.dtype = example.device, example.dtype
