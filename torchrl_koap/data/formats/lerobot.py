@@ -115,6 +115,8 @@ def read_info(root: str | Path) -> dict[str, Any]:
     features = info.get("features") or {}
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
         raise DataError(file, "its features must be dictionaries by name")
+    if (version := str(info.get("codebase_version", "v3.0")))[:3] not in ("v2.", "v3."):
+        raise DataError(file, f"its codebase_version is {version}; formats 2.x and 3.x are read")
     return info | {"features": features}
 
 
