@@ -24,7 +24,7 @@ from torchrl_koap.runs import weights
         (("--labels", "9"), "9 labelled trajectories asked for, there are 8"),
         (("--labels.count", "9"), "give one of --labels, --labels.fraction, --labels.count, --labels.episodes, got"),
         (("--dataset", "nowhere"), "dataset 'nowhere' is no folder"),
-        (("--planner.source", "nowhere"), "config.json is missing: is nowhere the folder of a finished"),
+        (("--planner.source", "nowhere"), "koap: nowhere is missing: wanted the folder of a finished `koap train`"),
     ],
 )
 def test_a_training_that_cannot_be_done_leaves_nothing_behind(options, message, demonstrations, tmp_path, capsys):

@@ -95,8 +95,10 @@ def test_damaged_json_is_named(run, text):
 
 
 def test_missing_json_says_what_was_wanted(tmp_path):
-    with pytest.raises(RunDirectoryError, match="config.json is missing: is .* the folder of a finished `koap train`"):
+    with pytest.raises(RunDirectoryError, match="config.json is missing: wanted the folder of a finished `koap train`"):
         RunDirectory(tmp_path).read_json("config.json")
+    with pytest.raises(RunDirectoryError, match="^nope.safetensors is missing: wanted the folder"):
+        RunDirectory("nope.safetensors").read_json("config.json")
 
 
 def test_content_that_json_cannot_hold_leaves_what_was_there(run):

@@ -56,7 +56,8 @@ class RunDirectory:
         """Reads a JSON file; a RunDirectoryError names one that is not there or damaged."""
         path = self.path / name
         if not path.exists():
-            raise RunDirectoryError(f"{path} is missing: is {self.path} the folder of a finished `koap train`?")
+            missing = path if self.path.is_dir() else self.path
+            raise RunDirectoryError(f"{missing} is missing: wanted the folder of a finished `koap train`")
         try:
             return read_json(path)
         except DataError as error:
