@@ -19,8 +19,8 @@ from torchrl_koap.data.action_kinds import describe_likely, likely_kinds
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings, write_recordings
 from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
-from torchrl_koap.data.sources import find_task_of
-from torchrl_koap.data.ted import check_new, stored_folder
+from torchrl_koap.data.sources import check_new, find_task_of
+from torchrl_koap.data.ted import stored_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport, record_to_folder
 from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.scooping.recording import VideoReport, record_videos

@@ -12,7 +12,8 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_koap.commands.options import Command
-from torchrl_koap.data.ted import check_new, read_about
+from torchrl_koap.data.sources import check_new
+from torchrl_koap.data.ted import read_about
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import get_task

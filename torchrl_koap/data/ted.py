@@ -88,13 +88,6 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     return folder
 
 
-def check_new(folder: str | Path) -> None:
-    """Raises a FileExistsError where a folder holds a data set or a run already."""
-    for path in (Path(folder) / "ted", Path(folder) / "config.json"):
-        if path.exists():
-            raise FileExistsError(f"{path} exists already; choose another --out")
-
-
 def is_ted(folder: str | Path) -> bool:
     """Whether a folder holds a data set of this library."""
     return (Path(folder) / _ABOUT).is_file()

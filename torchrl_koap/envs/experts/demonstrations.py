@@ -29,7 +29,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import flatten_trajectories, save_ted
-from torchrl_koap.data.ted import check_new
+from torchrl_koap.data.sources import check_new
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.experts.disturbances import KINDS, Disturbances, choose_disturbed, disturbed_columns
 from torchrl_koap.envs.experts.recording import FAULTS, Attempt, expert_of, play
