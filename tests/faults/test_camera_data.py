@@ -175,7 +175,7 @@ def faults() -> Iterator[Fault]:
     yield Fault("seen nothing wrong", SEEN, damage=seen(lambda folder: None), accepted=True)
     unharmed = seen(lambda folder: None)
     yield Fault("another camera", (*SEEN, "--camera", "tip"), "unknown camera 'tip'; did you mean 'top'", unharmed)
-    yield Fault("too many components", (*SEEN[:-1], "99"), "99 components need more", unharmed)
+    yield Fault("too many components", (*SEEN[:-1], "99"), "--components.* must be below frames", unharmed)
     for name, says, change in in_projection():
         yield Fault(f"projection {name}", EMBED, says, projection(change))
 

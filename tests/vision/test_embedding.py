@@ -90,6 +90,13 @@ def test_an_interrupted_embedding_goes_on(tmp_path, monkeypatch):
     assert torch.equal(one["observation"], other["observation"])
 
 
+def test_without_components_there_is_nothing_to_embed_into(tmp_path):
+    recordings, task = read_sources([write_own(tmp_path)], None)
+    with pytest.raises(ValueError, match=r"components \(--components\) must be at least 1, got 0"):
+        embed_recordings(recordings, task, tmp_path / "seen", network=OWN, components=0)
+    assert not (tmp_path / "seen").exists()
+
+
 def test_a_task_with_embeddings_of_its_own_takes_several_sources(tmp_path):
     pytest.importorskip("pyarrow")
     robot, hand = (write(tmp_path / who, who) for who in ("robot", "hand"))

@@ -57,8 +57,6 @@ class Embed(Command):
     def __call__(self) -> dict[str, Any]:
         """Reads, embeds and writes."""
         load_plugins(self.plugins)
-        if self.components < 1:
-            raise ValueError(f"--components must be at least 1, got {self.components}")
         check_new(self.out)
         asked = None if self.task is None else get_task(self.task)
         file = self.projection

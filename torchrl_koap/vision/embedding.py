@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted
 from torchrl_koap.data.formats import Recordings
 from torchrl_koap.data.ted import stored_folder, stored_task
-from torchrl_koap.files import DataError, replacing_file
+from torchrl_koap.files import DataError, option, replacing_file
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task
 from torchrl_koap.vision.backbones import load_backbone
@@ -101,6 +101,8 @@ def embed_recordings(
     of frames that are done, and that of all. Frames that are missing, damaged or unlike the others are refused by
     camera, trajectory and frame.
     """
+    if components < 1:
+        raise ValueError(f"{option('components')} must be at least 1, got {components}")
     out, chosen = Path(out), list(cameras) or list(recordings.cameras)
     if not chosen:
         raise DataError(out, "there are no cameras: the data have no frames, or were converted before these were kept")

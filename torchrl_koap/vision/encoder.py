@@ -17,7 +17,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import ObservationTransform
 
 from torchrl_koap.data.ted import stored_folder
-from torchrl_koap.files import check_file, replacing_file
+from torchrl_koap.files import check_file, option, replacing_file
 from torchrl_koap.keys import read_entry
 from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
 
@@ -187,7 +187,7 @@ class Projection(nn.Module):
     def fit(cls, features: Tensor, dim: int, about: Mapping[str, str] | None = None) -> Projection:
         """Fits ``dim`` components to features ``[N, F]``, more of both, of frames that are not all alike."""
         if min(features.shape) <= dim:
-            raise ValueError(f"{dim} components need more frames and features than that, got {list(features.shape)}")
+            raise ValueError(f"{option('components')} must be below frames and features {[*features.shape]}, got {dim}")
         features = features.double()
         if bool((features == features[:1]).all()):
             raise ValueError(f"all {len(features)} frames look the same to the network: there is nothing to embed")
