@@ -175,7 +175,9 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
         ({"run.seed": 3}, "run.seed is not for a study: cells have the seeds 0, 1, ..., as many as --seeds says"),
         ({"planner.source": "x"}, "planner.source is not for a study: name runs with --planners"),
         ({"preset": "table3"}, "unknown preset 'table3'; did you mean 'table"),
-        ({"execution.strategy": "open_loop"}, "strategy 'open_loop' was asked of dp"),
+        ({"methods": ("koap", "dp"), "execution.blend": 0.5}, "blend 0.5 was asked of method 'dp', which samples"),
+        ({"methods": ("koap", "dp"), "evaluation.blend": 0.5}, "blend 0.5 was asked of method 'dp', which samples"),
+        ({"evaluation.replan-interval": 15}, "replan_interval must be in 1..14"),
         ({"tasks": ("avoiding", "sorting")}, "datasets must be TASK=FOLDER where there are several tasks"),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any
 from torchrl_koap.data.sources import DEFAULT_TASK, find_task_of
 from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.closed_loop import find_environment
+from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.config import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
@@ -22,7 +23,7 @@ from torchrl_koap.studies.cells import NOISE_STEP, Cell
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.trained import build_networks
+from torchrl_koap.training.trained import Trained, build_networks
 from torchrl_koap.vision import Observer
 from torchrl_koap.vision.encoder import cameras_of
 
@@ -293,12 +294,6 @@ def check_study(study: Study) -> list[Cell]:
             observe = Observer.of(study.task(task), cameras_of(study.given_dataset(task)))
             find_environment(study.task(task), study.evaluation, observe)
     cells = study.cells()
-    sampling = [name for name in study.methods if not get_method(name).plans]
-    if study.execution.strategy == "open_loop" and sampling:
-        raise ValueError(
-            f"strategy 'open_loop' was asked of {', '.join(sampling)}: they execute chunks of actions and"
-            " have no other strategy; leave them out of --methods"
-        )
     for task in study.tasks:
         for method in study.methods:
             _check_networks(study, Cell(task, method, 1.0, 1.0, 0))
@@ -306,13 +301,14 @@ def check_study(study: Study) -> list[Cell]:
 
 
 def _check_networks(study: Study, cell: Cell) -> None:
-    """Refuses a method whose networks cannot be built for a task, or for the planner that is to be shared."""
+    """Refuses a method whose networks, or policy, cannot be built for a task, or for the planner to be shared."""
     task, config = study.task(cell.task), study.train_config(cell)
     if config.planner.source is not None and study.given_planner(cell.task) is None:  # not trained yet
         config = replace(config, planner=study.planner)
     config = resolve(config, task)
     try:
-        build_networks(task, config)
+        networks = build_networks(task, config)
     except ValueError as error:
         read = f"the columns {config.controller.columns!r} of " if get_method(cell.method).plans else ""
         raise ValueError(f"method {cell.method!r} cannot read {read}task {task.name!r}: {error}") from error
+    trained_policy(Trained(task, config, *networks), study.evaluation.execution)
