@@ -3,6 +3,7 @@
 
 import json
 import math
+import shutil
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from tiny_runs import TINY, koap
 from torch import nn
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.evaluation import InspectConfig, inspect
 from torchrl_koap.evaluation.findings import OUTSIDE_THE_BUDGET, describe_inspection
 from torchrl_koap.evaluation.latent_space import (
     analyse_latent,
@@ -29,6 +31,7 @@ from torchrl_koap.modules import (
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule
 from torchrl_koap.reports.inspection_plots import draw_latent
 from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.tasks import get_task
 
 
@@ -213,6 +216,16 @@ def test_inspect_the_latent_space_alone(copied_run):
     assert "for evaluation only" in written["findings"]
     assert (copied_run / "plots" / "latent.png").exists()
     assert not (copied_run / "plots" / "inspect.png").exists()
+
+
+def test_labels_of_a_data_set_that_was_moved_are_in_the_budget_still(copied_run, demonstrations, tmp_path):
+    here = inspect(copied_run, InspectConfig(latent_only=True, threads=1))
+    shutil.copytree(demonstrations, tmp_path / "moved")
+    moved = InspectConfig(latent_only=True, threads=1, dataset=str(tmp_path / "moved"))
+    assert inspect(copied_run, moved) == here
+    next((tmp_path / "moved").glob("*.pkl")).unlink()
+    with pytest.raises(RunDirectoryError, match="is not the one that .* was trained on"):
+        inspect(copied_run, moved)
 
 
 def test_a_method_without_latent_actions_gets_a_note(demonstrations, tmp_path):

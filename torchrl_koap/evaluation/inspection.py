@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.closed_loop import RolloutEnvironment, find_environment
@@ -26,6 +27,7 @@ from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
+from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.progress import progress_bar
@@ -66,7 +68,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
 
     Raises:
         ValueError: for a run without a planner, or a task without an environment.
-        RunDirectoryError: if the folder is no finished run.
+        RunDirectoryError: if the folder is no finished run, or its demonstrations are not there or others.
 
     Examples:
         >>> from torchrl_koap.evaluation import InspectConfig, inspect
@@ -87,13 +89,14 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
     if config.out is None:
         writable_folder(run)  # a pretrained run is refused before its data are looked for
     data = trained.data(config.dataset)
+    labelled = trained.hide_labels(data)[0][HAS_ACTION].squeeze(-1)
     where = None if config.latent_only else find_environment(task, config, Observer.of(task, trained.cameras))
     directory = RunDirectory(writable_folder(run, config.out))  # a wrong call leaves no copy
     if where is not None:
         result = _experiments(config, trained, data, where)
     else:  # what earlier experiments found stays
         result = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
-    result["latent"] = _look_into(config, trained, data)
+    result["latent"] = _look_into(trained, data, labelled)
     result["findings"] = describe_inspection(result, task)
     directory.write_json("inspect.json", result)
     return result
@@ -138,13 +141,10 @@ def _experiments(
     return found
 
 
-def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:
+def _look_into(trained: Trained, data: TensorDictBase, labelled: Tensor) -> dict[str, Any]:
     controller, task = trained.controller.cpu(), trained.task
     if not isinstance(controller, KoopmanInverseDynamics):
         return {"note": f"method {trained.config.method!r} has no latent actions to look into"}
-    labelled = torch.zeros(len(data), dtype=torch.bool)
-    if config.dataset is None:
-        labelled = trained.config.labels.budget(trained.config.run.seed).apply(data)[0]["has_action"].squeeze(-1)
     parts = {
         name: places
         for name, part in task.state_slices.items()
