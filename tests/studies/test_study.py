@@ -10,6 +10,7 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig, RunConfig
 from torchrl_koap.runs.run_directory import RunDirectoryError, pretrained_folders
+from torchrl_koap.runs.weights import CheckpointError
 from torchrl_koap.studies import Study, run_study
 from torchrl_koap.studies.study import PRESETS, check_study, complete
 from torchrl_koap.tasks import TASKS, Action, Task, get_task
@@ -75,6 +76,9 @@ def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations
     assert {study.planner_folder(cell) for cell in cells} == {run}
     with pytest.raises(RunDirectoryError):
         asked(methods=("koap",), planners=(str(tmp_path / "none"),))
+    sorting = f"avoiding={pretrained_folders()['sorting']}"
+    with pytest.raises(CheckpointError, match="was trained on task 'sorting', not on 'avoiding'"):
+        asked(methods=("koap",), planners=(sorting,))
     assert not study.out.exists()
     named, _ = asked(methods=("koap",), planners=("pretrained:avoiding",))
     assert named.planners == (f"avoiding={pretrained_folders()['avoiding'].absolute()}",)

@@ -23,6 +23,7 @@ from torchrl_koap.studies.cells import NOISE_STEP, Cell
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.on_disk import planner_of_source
 from torchrl_koap.training.trained import Trained, build_networks
 from torchrl_koap.vision import Observer
 from torchrl_koap.vision.encoder import cameras_of
@@ -311,4 +312,6 @@ def _check_networks(study: Study, cell: Cell) -> None:
     except ValueError as error:
         read = f"the columns {config.controller.columns!r} of " if get_method(cell.method).plans else ""
         raise ValueError(f"method {cell.method!r} cannot read {read}task {task.name!r}: {error}") from error
+    if config.planner.source is not None:
+        planner_of_source(task, config)
     trained_policy(Trained(task, config, *networks), study.evaluation.execution)

@@ -7,7 +7,6 @@ import time
 import warnings
 from contextlib import ExitStack
 from dataclasses import asdict
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -142,26 +141,26 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
 
 def _check_networks(task: Task, config: TrainConfig) -> None:
     """Finds networks that cannot read the task's state, and weights to take over that do not fit, before any work."""
+    done = config.run.resume and (config.out / "planner.safetensors").exists()
     with torch.random.fork_rng(devices=[]):
-        planner, _ = build_networks(task, config)
-    source = config.planner.source
-    if (
-        planner is not None
-        and source is not None
-        and not (config.run.resume and (config.out / "planner.safetensors").exists())
-    ):
-        load_weights(source / "planner.safetensors", planner, _facts_of_source(task, config))
+        build_networks(task, config)
+        if config.planner.source is not None and not done:
+            planner_of_source(task, config)
 
 
-def _facts_of_source(task: Task, config: TrainConfig) -> dict[str, Any]:
-    """What the planner that is taken over was trained for: this task, or another one of the same columns and rate."""
-    facts = facts_of("planner", task, config)
-    source = RunDirectory(config.planner.source).read_json("config.json")
-    theirs = task_from(source["task"], source.get("task_definition"))
+def planner_of_source(task: Task, config: TrainConfig) -> StatePlanner:
+    """Loads the planner of ``planner.source``, a run on this task or on another one of the same columns and rate.
+
+    A CheckpointError says what does not fit.
+    """
+    facts, source = facts_of("planner", task, config), RunDirectory(config.planner.source)
+    about, planner = source.read_json("config.json"), build_planner(task, config.planner)
+    theirs = task_from(about["task"], about.get("task_definition"))
     same = ("state_names", "state_units", "observation_origin", "control_hz", "env")
     if all(getattr(theirs, name) == getattr(task, name) for name in same):
         facts["task"] = theirs.name
-    return facts
+    load_weights(source.path / "planner.safetensors", planner, facts)
+    return planner
 
 
 def _read_data(
@@ -211,8 +210,7 @@ def _planner(
         load_weights(path, planner, facts)
         return planner, run.last_metrics("planner")
     if config.planner.source is not None:
-        planner, losses = build_planner(task, config.planner).to(config.run.device), dict[str, float]()
-        load_weights(config.planner.source / "planner.safetensors", planner, _facts_of_source(task, config))
+        planner, losses = planner_of_source(task, config).to(config.run.device), dict[str, float]()
     else:
         planner, losses = learn_planner(task, config, data, loop, held_out=held_out)
     save_tensors(path, planner.state_dict(), facts)
