@@ -2,6 +2,7 @@
 """Jobs in processes: their order, every way in which one can die, what they print, and none that stays behind."""
 
 import importlib.util
+import multiprocessing
 import os
 import re
 import secrets
@@ -29,6 +30,12 @@ def say(folder):
 def sleep(folder):
     (Path(folder) / "pid").write_text(str(os.getpid()))
     time.sleep(600)
+
+
+def hold_a_lock(folder):
+    held = multiprocessing.RLock()  # a semaphore of the system, as those of progress bars and replay buffers
+    sleep(folder)
+    return held
 
 
 def print_in_every_way():
@@ -163,6 +170,25 @@ def test_closing_the_iterator_stops_what_is_running(tmp_path):
     assert is_alive(pid)
     ended.close()
     wait_until(lambda: not is_alive(pid))
+
+
+def test_jobs_that_are_stopped_give_back_what_they_hold_and_nothing_is_said_of_it(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        f"import sys; sys.path[:0] = {IMPORTED_FROM}\n"
+        "from pathlib import Path\n"
+        "from late_files import wait_until\n"
+        "from torchrl_koap.studies import launchers\n"
+        "from test_launchers import hold_a_lock\n"
+        "if __name__ == '__main__':\n"
+        f"    job = launchers.Job(Path({str(tmp_path)!r}) / 'a')\n"
+        "    pool = launchers.LocalPool(hold_a_lock, 1)\n"
+        "    pool.start(job)\n"
+        "    wait_until((job.folder / 'pid').exists, 60)\n"
+        "    pool.stop()\n"
+    )
+    ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=100)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):

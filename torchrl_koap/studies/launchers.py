@@ -25,6 +25,7 @@ from torchrl_koap.lookup import lookup
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _LONGEST = 500  # characters of a reason
+_PATIENCE = 3  # seconds in which a process may give back what it holds of the system, such as semaphores
 LAUNCHERS = ("local", "ray")
 
 
@@ -184,11 +185,13 @@ class LocalPool:
         return ended
 
     def stop(self) -> None:
-        """Kills what is running."""
+        """Ends what is running, and kills what does not end."""
         processes = [process for _, process, _ in self.running.values()]
         for process in processes:
-            process.kill()
+            process.terminate()
         for process in processes:
+            process.join(_PATIENCE)
+            process.kill()
             process.join()
         self.running.clear()
 
@@ -204,6 +207,7 @@ def _child(writer: Any, function: Callable[[str], None], folder: str) -> None:
     # ends with a killed parent: else the next `koap curve` in the folder would find it still writing
     threading.Thread(target=_die_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     with contextlib.suppress(OSError), _open_log(folder) as file:  # what is not Python prints past sys.stdout
         for descriptor in (1, 2):
             os.dup2(file.fileno(), descriptor)
