@@ -9,6 +9,7 @@ from html_pages import Page
 from PIL import Image
 from tiny_runs import read_csv
 
+from torchrl_koap.studies import plots
 from torchrl_koap.studies.plots import method_styles
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.table import summarise
@@ -155,6 +156,22 @@ def test_methods_differ_without_colour():
     styles = list(method_styles([f"method {number}" for number in range(27)]).values())
     assert len({str(style) for style in styles}) == 27 and len({style["marker"] for style in styles[:12]}) == 12
     assert len({(style["color"], str(style["linestyle"])) for style in styles[:12]}) == 12
+
+
+@pytest.mark.parametrize("errors", [(0.6, 0.7), (2.8, 3.1), (0.9, 5.0), (0.3, 30.0)])
+def test_every_line_across_errors_has_its_number_and_there_are_two(errors, monkeypatch, tmp_path):
+    rows = make_cells(methods={"koap": 1.0}, seeds=1)
+    for row, error in zip(rows, errors, strict=True):
+        row["action_error"] = error
+    drawn = []
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
+    plots.plot_measure(summarise(rows), tmp_path / "x.png", "action_error")
+    drawn[0].draw_without_rendering()
+    axes = drawn[0].axes[0]
+    low, high = axes.get_ylim()
+    named = [tick for tick in axes.yaxis.get_major_ticks() if low <= tick.get_loc() <= high]
+    assert len(named) >= 2 and all(tick.label1.get_text() for tick in named)
+    assert not any(tick.gridline.get_visible() for tick in axes.yaxis.get_minor_ticks())
 
 
 @pytest.mark.parametrize(

@@ -199,10 +199,11 @@ def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
     low, high = min(ends), max(ends)
     wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend
     axes.set_ylim(low / wide, high * wide)
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low * wide**2 < 100 else (1,)))
+    span = high / low * wide**2
+    axes.yaxis.set_major_locator(LogLocator(subs=range(1, 10) if span < 5 else (1, 2, 5) if span < 100 else (1,)))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(axis="y", which="both", color=FAINT, linewidth=0.5)
+    axes.grid(axis="y", color=FAINT, linewidth=0.5)
 
 
 def _log_x(axes: Axes, lines: Sequence[_Line], *, ticks: bool) -> None:
