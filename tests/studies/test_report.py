@@ -158,6 +158,19 @@ def test_methods_differ_without_colour():
     assert len({(style["color"], str(style["linestyle"])) for style in styles[:12]}) == 12
 
 
+def test_whiskers_are_a_little_beside_each_other_however_short_the_axis_is(monkeypatch, tmp_path):
+    rows = make_cells(methods=dict.fromkeys("abcde", 0.5), seeds=1)
+    for row in rows:
+        row["labelled_transitions"] = 880 if row["labels"] == 0.1 else 800
+    drawn = []
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
+    plots.plot_measure(summarise(rows), tmp_path / "x.png", by=("labels", "labelled_transitions"))
+    drawn[0].draw_without_rendering()
+    for axes in drawn[0].axes:
+        left, right = (line.get_transform().transform(line.get_xydata()[0])[0] for line in axes.lines[::4])
+        assert 0.05 < (right - left) / drawn[0].dpi < 0.15  # inches
+
+
 @pytest.mark.parametrize("errors", [(0.6, 0.7), (2.8, 3.1), (0.9, 5.0), (0.3, 30.0)])
 def test_every_line_across_errors_has_its_number_and_there_are_two(errors, monkeypatch, tmp_path):
     rows = make_cells(methods={"koap": 1.0}, seeds=1)

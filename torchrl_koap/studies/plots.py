@@ -6,7 +6,7 @@ Colours stay apart for colour-blind readers; markers and dashes tell the lines a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
+from matplotlib.transforms import ScaledTranslation
 
 from torchrl_koap.reports.pictures import save_figure
 from torchrl_koap.reports.style import FAINT, INK, set_title, tidy
@@ -36,6 +37,7 @@ _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#5
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 _DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
 _BANDS = 3  # more bands than these hide each other: whiskers instead
+_ASIDE = 0.025  # inches between those of two methods
 
 
 @dataclass
@@ -127,7 +129,7 @@ def plot_average(
         lines.append(_Line(method, styles[method], shown, beside))
     figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     axes = figure.add_subplot()
-    _draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
+    _draw_lines(axes, lines)
     levels = sorted({level for line in lines for level in line.positions})
     axes.set(xlim=(levels[0] - 0.25, levels[-1] + 0.25), xticks=levels)
     axes.set(xlabel="label level (1: fewest labels)", ylabel="success (%)")
@@ -139,22 +141,21 @@ def plot_average(
     save_figure(figure, path)
 
 
-def _draw_lines(
-    axes: Axes, lines: Sequence[_Line], *, beside: Callable[[float, float], float] = lambda x, step: x * 1.014**step
-) -> None:
-    """Draws bands, or whiskers where there are many lines or each has one point; ``beside`` moves whiskers apart."""
+def _draw_lines(axes: Axes, lines: Sequence[_Line]) -> None:
+    """Draws bands, or whiskers beside each other where there are many lines or each has one point."""
     whiskers = len(lines) > _BANDS or all(len(line.points) == 1 for line in lines)
     for index, line in enumerate(lines):
         (x, y, low, high), order = zip(*line.points, strict=True), 3 + (len(lines) - index) / 100
-        color = line.style["color"]
-        if whiskers:  # beside each other
-            x = tuple(beside(value, index - (len(lines) - 1) / 2) for value in x)
-            axes.vlines(x, low, high, color=color, linewidth=0.9, alpha=0.55, zorder=order - 1)
+        color, where = line.style["color"], axes.transData
+        if whiskers:  # moved on the page, not along the axis: the same distance at every scale
+            aside = _ASIDE * (index - (len(lines) - 1) / 2)
+            where = where + ScaledTranslation(aside, 0, axes.figure.dpi_scale_trans)
+            axes.vlines(x, low, high, color=color, linewidth=0.9, alpha=0.55, zorder=order - 1, transform=where)
         else:
             axes.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0, zorder=order - 1)
             if len(x) == 1:  # a band needs two places
                 axes.vlines(x, low, high, color=color, linewidth=2.5, alpha=0.3, zorder=order - 1)
-        axes.plot(x, y, **line.style, markersize=5, linewidth=1.6, markeredgewidth=0, zorder=order)
+        axes.plot(x, y, **line.style, markersize=5, linewidth=1.6, markeredgewidth=0, zorder=order, transform=where)
         if line.paper:
             style = {**line.style, "linestyle": (0, (2, 2)), "markerfacecolor": "white", "markeredgewidth": 1.3}
             axes.plot(*zip(*sorted(line.paper), strict=True), **style, markersize=6.5, linewidth=1, zorder=order + 0.5)
