@@ -130,7 +130,9 @@ def test_doctor_lists_versions(capsys):
 def test_demonstrations_are_recorded_once_and_are_sound(tmp_path, capsys):
     assert koap("demos", "--out", tmp_path / "demos", "--episodes", 2, "--seed", 4) == 0
     assert "2 demonstrations of avoiding" in capsys.readouterr().out
-    assert "ted exists already; choose another --out" in fails(capsys, "demos", "--out", tmp_path / "demos")
+    assert "holds a data set, recordings or a run already; choose another --out" in fails(
+        capsys, "demos", "--out", tmp_path / "demos"
+    )
     assert koap("validate", tmp_path / "demos") == 0
     assert "no problem found" in capsys.readouterr().out
 

@@ -32,7 +32,9 @@ def test_a_data_set_is_not_written_among_recordings(tmp_path, capsys):
     rows = np.random.default_rng(0).normal(size=(30, 2))
     np.savez(tmp_path / "a.npz", states=rows, actions=rows[:-1])
     for words in (("convert", tmp_path, "--control-hz", "30"), ("embed", tmp_path), ("demos",)):
-        assert "holds recordings already; choose another --out" in fails(capsys, *words, "--out", tmp_path)
+        assert "holds a data set, recordings or a run already; choose another --out" in fails(
+            capsys, *words, "--out", tmp_path
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
 
 

@@ -48,7 +48,7 @@ def test_a_run_is_not_written_into_a_data_set(words, copied_run, demonstrations,
 def test_a_data_set_is_not_written_into_a_run(words, copied_run, capsys):
     before = contents(copied_run)
     line = fails(capsys, *words, "--out", copied_run)
-    assert f"{copied_run / 'config.json'} exists already; choose another --out" in line
+    assert f"{copied_run} holds a data set, recordings or a run already; choose another --out" in line
     assert contents(copied_run) == before
 
 

@@ -101,11 +101,8 @@ def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
 
 def check_new(folder: str | Path) -> None:
     """Raises a FileExistsError where a folder holds a data set, recordings or a run already."""
-    for path in (Path(folder) / "ted", Path(folder) / "config.json"):
-        if path.exists():
-            raise FileExistsError(f"{path} exists already; choose another --out")
-    if find_format(folder) is not None:
-        raise FileExistsError(f"{folder} holds recordings already; choose another --out")
+    if find_format(folder) is not None or (Path(folder) / "config.json").exists():
+        raise FileExistsError(f"{folder} holds a data set, recordings or a run already; choose another --out")
 
 
 def _find_stored(source: str | Path) -> Path | None:

@@ -74,8 +74,7 @@ class EvalConfig:
         if self.seed < 0:
             raise ValueError(f"seed must be >= 0, got {self.seed}")
         environment_arguments(self.env_kwargs)
-        about_env = {"success_key": self.success_key, "env_kwargs": self.env_kwargs, "num_envs": self.num_envs}
-        given = [name for name, value in about_env.items() if value]
+        given = [name for name in ("success_key", "env_kwargs", "num_envs") if vars(self)[name]]
         if given and self.env is None:
             raise ValueError(f"{given[0]} was given, but no env: name an environment of Gymnasium with --env")
         if self.num_envs is not None and self.batch_size is not None:

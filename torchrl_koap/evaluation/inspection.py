@@ -84,8 +84,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
             " into the latent space alone; `koap eval` judges plans and actions on recorded data"
         )
     if trained.planner is None and not config.latent_only:
-        method = trained.config.method
-        raise ValueError(f"method {method!r} samples actions: it has no planner and controller to compare")
+        raise ValueError(f"method {trained.method.name!r} samples actions: it has no planner and controller to compare")
     if config.out is None:
         writable_folder(run)  # a pretrained run is refused before its data are looked for
     data = trained.data(config.dataset)

@@ -186,10 +186,9 @@ class LocalPool:
 
     def stop(self) -> None:
         """Ends what is running, and kills what does not end."""
-        processes = [process for _, process, _ in self.running.values()]
-        for process in processes:
+        for _, process, _ in self.running.values():
             process.terminate()
-        for process in processes:
+        for _, process, _ in self.running.values():
             process.join(_PATIENCE)
             process.kill()
             process.join()

@@ -146,15 +146,14 @@ def _draw_lines(axes: Axes, lines: Sequence[_Line]) -> None:
     whiskers = len(lines) > _BANDS or all(len(line.points) == 1 for line in lines)
     for index, line in enumerate(lines):
         (x, y, low, high), order = zip(*line.points, strict=True), 3 + (len(lines) - index) / 100
-        color, where = line.style["color"], axes.transData
-        if whiskers:  # moved on the page, not along the axis: the same distance at every scale
-            aside = _ASIDE * (index - (len(lines) - 1) / 2)
-            where = where + ScaledTranslation(aside, 0, axes.figure.dpi_scale_trans)
+        color = line.style["color"]
+        # moved on the page, not along the axis: the same distance at every scale
+        aside = _ASIDE * (index - (len(lines) - 1) / 2) if whiskers else 0
+        where = axes.transData + ScaledTranslation(aside, 0, axes.figure.dpi_scale_trans)
+        if whiskers or len(x) == 1:  # a band needs two places
             axes.vlines(x, low, high, color=color, linewidth=0.9, alpha=0.55, zorder=order - 1, transform=where)
         else:
             axes.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0, zorder=order - 1)
-            if len(x) == 1:  # a band needs two places
-                axes.vlines(x, low, high, color=color, linewidth=2.5, alpha=0.3, zorder=order - 1)
         axes.plot(x, y, **line.style, markersize=5, linewidth=1.6, markeredgewidth=0, zorder=order, transform=where)
         if line.paper:
             style = {**line.style, "linestyle": (0, (2, 2)), "markerfacecolor": "white", "markeredgewidth": 1.3}

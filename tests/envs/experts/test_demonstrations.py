@@ -185,7 +185,7 @@ def test_an_interrupted_recording_goes_on(whole, tmp_path, monkeypatch):
 
 def test_other_demonstrations_are_left_alone(whole, tmp_path, monkeypatch):
     before = contents(whole[0])
-    with pytest.raises(FileExistsError, match="ted exists already; choose another --out"):
+    with pytest.raises(FileExistsError, match="holds a data set, recordings or a run already; choose another --out"):
         record_to_folder(whole[0], TASK, COUNT, seed=3)
     assert contents(whole[0]) == before
     interrupt_after(monkeypatch, 1)
