@@ -118,7 +118,9 @@ def test_objects_get_a_panel(task):
 
 
 def test_plans_lie_over_their_path():
-    axes = draw_plans(ROLLOUTS, run_of("avoiding")).axes[3]
+    figure = draw_plans(ROLLOUTS, run_of("avoiding"))
+    assert {(axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes} == {("x (m)", "y (m)")}
+    axes = figure.axes[3]
     assert axes.get_title(loc="left") == "episode 1: left, left, gap 2\noff the path: median 0.0, 95 % within 0.0 mm"
     lines = drawn_lines(axes)
     assert len(lines) == 4 and all(len(line) == 4 for line in lines)

@@ -275,7 +275,6 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         if won and run.modes.number > 1:
             what = run.modes.name_of(int(mode[index]))
         set_title(axes, f"episode {index}: {what}\n{note}")
-        axes.label_outer()
     return figure
 
 
