@@ -203,7 +203,7 @@ def test_two_curves_do_not_work_in_one_folder(curve, demonstrations, capsys):
         assert f"another `koap curve` is working in {curve}" in fails(capsys, *command_of(curve, demonstrations))
 
 
-def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations):
+def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations, capsys):
     before = marks(curve)
     blocked = curve / "cells/avoiding/dd-0.25-1-seed0"
     blocked.write_text("in the way")
@@ -213,6 +213,10 @@ def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations):
     assert row["status"] == "failed" and "FileExistsError" in row["reason"]
     assert row["reason"] in (curve / "table.md").read_text()
     assert "FileExistsError" in (curve / "index.html").read_text()
+    capsys.readouterr()
+    assert koap(*command_of(curve, demonstrations, methods=("dd",)), "--quiet") == 1
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("koap: avoiding, dd, 25 % labels, seed 0: failed: FileExistsError")
     blocked.unlink()
     assert run(curve, demonstrations, methods=("linear", "dp", "dd", "pretrain"))["done"] == 4
     after = marks(curve)

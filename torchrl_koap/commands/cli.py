@@ -81,10 +81,13 @@ def _run(arguments: Sequence[str]) -> int:
     options.check_options(command)
     with without_progress_bars() if command.quiet else nullcontext():
         result = command()
+    failed = result.pop("failed", "") if isinstance(result, dict) else ""  # said once, and whatever is quiet
     if not command.quiet:
         with written_output():
             _show(result)
-    return 1 if isinstance(result, Mapping) and result.get("failed") else 0
+    if failed:
+        _complain(failed)
+    return 1 if failed else 0
 
 
 def _parsed(options: Any, kind: Any, arguments: Sequence[str]) -> Any:

@@ -14,6 +14,7 @@ import tyro
 from torchrl_koap.commands.options import Command, Options
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, load_policy, suggest
 from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
+from torchrl_koap.files import some
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.export import SUFFIXES, export_policy, exportable
 from torchrl_koap.reports.pictures import draw_pictures
@@ -24,7 +25,7 @@ from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.studies import Machines, Study, run_study
-from torchrl_koap.studies.table import result_rows
+from torchrl_koap.studies.table import not_done, result_rows
 from torchrl_koap.training import TrainConfig, Trained, train
 from torchrl_koap.training.lerobot_folder import write_lerobot_folder
 
@@ -237,7 +238,7 @@ class Curve(Command):
         """Does what is missing of the study and writes its report."""
         result = run_study(self.config, self.machines)
         cells = ", ".join(f"{count} {status}" for status, count in result.counts.items())
-        failed = {"failed": result.counts["failed"]} if result.counts["failed"] else {}
+        failed = {"failed": some(not_done(result.rows))} if result.counts["failed"] else {}
         return {**result_rows(result.rows), "trainings": cells, **failed, "report": str(result.report)}
 
 
