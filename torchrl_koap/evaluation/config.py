@@ -67,9 +67,7 @@ class EvalConfig:
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be >= 1, got {value}")
         if self.episodes > MOST_EPISODES:
-            raise ValueError(
-                f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {self.episodes:,}"
-            )
+            raise ValueError(f"episodes must be at most {MOST_EPISODES:,}, all kept in memory, got {self.episodes:,}")
         check_machine(self.threads, self.device)
         if self.seed < 0:
             raise ValueError(f"seed must be >= 0, got {self.seed}")

@@ -57,8 +57,7 @@ def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | Non
     run = RunDirectory(folder)
     if (folder / ASKED).exists():
         changed = changed_options(read_asked(folder)[0], config)
-        changed = [name for name in changed if name not in _MAY_CHANGE]
-        if changed:
+        if changed := [name for name in changed if name not in _MAY_CHANGE]:
             raise RunDirectoryError(f"{folder} was started with another {', '.join(changed)}")
     content = {"train": to_json(config), "evaluation": None if evaluation is None else to_json(evaluation)}
     run.write_json(ASKED, content)

@@ -112,15 +112,13 @@ def _check_folder(study: Study) -> None:
     """Refuses a folder that holds something else, or a study with other settings, and names what differs."""
     path, earlier = study.out, _read_study(study.out)
     if earlier is None:
-        if path.exists() and not path.is_dir():
-            raise RunDirectoryError(f"{path} is a file; choose another --out")
         # what a study leaves that was killed before it came to write its options
         own = ("lock", "demonstrations", f".{_FILE}.")
         if path.exists() and not all(entry.name.startswith(own) for entry in path.iterdir()):
             raise RunDirectoryError(f"{path} is not empty and no folder of `koap curve`; choose another --out")
         return
-    changed = [name for name in changed_options(earlier, study) if name not in _MAY_CHANGE]
-    told = [f"{name} ({attrgetter(name)(earlier)})" for name in changed]
+    changed = changed_options(earlier, study)
+    told = [f"{name} ({attrgetter(name)(earlier)})" for name in changed if name not in _MAY_CHANGE]
     for name, before, after in (
         ("datasets", earlier.given_dataset, study.given_dataset),
         ("planners", earlier.given_planner, study.given_planner),
