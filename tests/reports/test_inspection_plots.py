@@ -14,7 +14,7 @@ RUN = run_of("avoiding")
 @pytest.mark.parametrize(
     ("outside", "panels", "said"),
     [
-        ({"labels_read": 50, "held_out_trajectories": 4}, 3, "reads 50 labels, outside the budget"),
+        ({"labels_read": 50, "held_out_trajectories": 4}, 3, "reads 50 labels, also outside the budget"),
         ({"labels_read": 50, "held_out_trajectories": 4, "held_out_in_budget": 4}, 3, "the decoder has seen"),
         ({"note": "no label lies outside the budget"}, 2, ""),
     ],

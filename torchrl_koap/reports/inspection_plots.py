@@ -58,9 +58,8 @@ def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
     _draw_errors(axes["errors"], latent["multi_step"], run.task)
     if "probe" in axes:
         _draw_probe(axes["probe"], outside, list(run.task.actions))
-        shared = outside.get("held_out_in_budget")
-        inside = bool(shared) and shared == outside.get("held_out_trajectories")
-        which = "of the budget, which the decoder has seen" if inside else "outside the budget"
+        inside = outside.get("held_out_in_budget") == outside["held_out_trajectories"]
+        which = "of the budget, which the decoder has seen" if inside else "also outside the budget"
         head = f"probe and decoder: for evaluation only, reads {outside['labels_read']:,} labels, {which}"
         figure.suptitle(head, fontsize=10, color=WARNING, x=0.99, ha="right")
     return figure
