@@ -53,7 +53,7 @@ def test_impulses_add_up_to_the_prediction():
 def test_bad_columns_and_intervals_are_refused():
     with pytest.raises(ValueError, match="'commands': 1"):
         ResponseModel([0, 1], [0], [0, 1])
-    with pytest.raises(ValueError, match="look_ahead must be at least 2"):
+    with pytest.raises(ValueError, match="look_ahead must be at least 2, got .*: lower replan_interval"):
         policy_of(replan_interval=14)
 
 

@@ -196,7 +196,7 @@ class MPC(Follower):
     def __init__(self, response: ResponseModel, *, look_ahead: int, **options: Any):
         super().__init__(response, num_frames=response.history, **options)
         if look_ahead < 2:
-            raise ValueError(f"look_ahead must be at least 2, got {look_ahead}")
+            raise ValueError(f"look_ahead must be at least 2, got {look_ahead}: lower replan_interval")
         self.look_ahead = look_ahead
         for name in ("follow_gain", "keep_gain"):
             self.register_buffer(name, None, persistent=False)
