@@ -8,7 +8,7 @@ import torch
 from offline_runs import save_arm, train_arm
 
 from torchrl_koap import PlannerConfig, RunConfig
-from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted
+from torchrl_koap.data import LabelBudget, flatten_trajectories, open_dataset, save_ted
 from torchrl_koap.data.ted import load_ted
 from torchrl_koap.training.datasets import choose_held_out, held_out_by, split_held_out
 
@@ -60,7 +60,12 @@ def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
     train_arm(run, arm, method="linear", run=RunConfig(resume=True))
     assert (run / "planner.safetensors").read_bytes() == weights
     assert json.loads((run / "config.json").read_text())["held_out_episodes"] == [8, 9]
-    assert held_out_by(run, str(arm)) == [8, 9] and held_out_by(run, str(tmp_path)) == []
+    data, _ = open_dataset(arm)
+    assert held_out_by(run, data) == [8, 9]
+    data["has_action"] = torch.ones_like(data["has_action"])  # labels that are added change nothing
+    assert held_out_by(run, data) == [8, 9]
+    data["state"] += 1.0  # others have these numbers now
+    assert held_out_by(run, data) == []
     again = train_arm(
         tmp_path / "again", arm, method="linear", planner=PlannerConfig(source=run), run=RunConfig(seed=3)
     )

@@ -18,7 +18,8 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 Config = TypeVar("Config")
-FACTS = ("task_definition", "data", "held_out_episodes", "versions", "command")  # beside the options in config.json
+# beside the options in config.json
+FACTS = ("task_definition", "data", "held_out_episodes", "held_out_states", "versions", "command")
 _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
 
 

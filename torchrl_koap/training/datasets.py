@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.runs.config_files import read_config
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import digest_of
 
@@ -50,11 +48,19 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
     return sorted(episodes[order[:number]].tolist())
 
 
-def held_out_by(source: Path, dataset: str) -> list[int]:
-    """Reads which trajectories the planner of a run has never seen; none of another data set than its own."""
-    run = RunDirectory(source)
-    same = os.path.abspath(str(read_config(run).dataset)) == os.path.abspath(dataset)
-    return list(run.read_json("config.json").get("held_out_episodes") or ()) if same else []
+def held_out_facts(data: TensorDictBase, episodes: Sequence[int]) -> dict[str, Any]:
+    """What ``config.json`` says of the trajectories that a planner does not see: numbers and a checksum of states."""
+    if not len(episodes):
+        return {}
+    states = data["state"][torch.isin(data["episode"].cpu(), torch.tensor(list(episodes)))]
+    return {"held_out_episodes": list(episodes), "held_out_states": digest_of([("state", states)])}
+
+
+def held_out_by(source: Path, data: TensorDictBase) -> list[int]:
+    """Numbers of the trajectories that the planner of a run has never seen; none where flat data hold others there."""
+    content = RunDirectory(source).read_json("config.json")
+    episodes = content.get("held_out_episodes") or []
+    return episodes if held_out_facts(data, episodes).items() <= content.items() else []
 
 
 def split_held_out(

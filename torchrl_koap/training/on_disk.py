@@ -28,7 +28,7 @@ from torchrl_koap.runs.weights import load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.controller import check_lengths, learn_controller
-from torchrl_koap.training.datasets import choose_held_out, fingerprint, held_out_by, split_held_out
+from torchrl_koap.training.datasets import choose_held_out, fingerprint, held_out_by, held_out_facts, split_held_out
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.methods import get_method
@@ -92,8 +92,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         check_data(run, content)
         if (definition := task.definition()) is not None:
             content["task_definition"] = definition
-        if held_out:
-            content["held_out_episodes"] = held_out
+        content |= held_out_facts(used, held_out)
         if not planner_only:
             check_lengths(task, config, used)
         for_planner, unseen, data = split_held_out(used, held_out)
@@ -181,7 +180,7 @@ def _read_data(
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:
-        return labelled, held_out_by(planner.source, config.dataset), report
+        return labelled, held_out_by(planner.source, labelled), report
     return labelled, choose_held_out(labelled, planner.held_out, seed=seed), report
 
 
