@@ -248,7 +248,7 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     episodes = choose_episodes(mode, outcome, 6)
     across = min(len(episodes), 3)
     down = math.ceil(len(episodes) / max(across, 1))
-    figure = Figure(figsize=(3.8 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
+    figure = Figure(figsize=(4.4 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
     for panel, index in enumerate(episodes, 1):
         axes, path = draw_scene(figure.add_subplot(down, across, panel), run.task), paths[index]
         won = outcome[index] == SUCCESS
