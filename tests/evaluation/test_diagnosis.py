@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from command_calls import fails
+from pretended_gpu import pretended_gpu
 from tensordict import TensorDict
 from tiny_runs import koap
 from toy_policies import EchoController
@@ -110,6 +111,17 @@ def test_states_beside_the_demonstrations_are_far():
     far["observation"][:, 2:] = shown[:8] + 5
     assert coverage(AVOIDING, [near], data)["visited_95"] < 1.5 * coverage(AVOIDING, [near], data)["demonstrated_95"]
     assert coverage(AVOIDING, [far], data)["visited_95"] > 5
+
+
+@pytest.mark.parametrize("command", ["eval --no-report", "eval --no-report --strategy oracle", "inspect"])
+def test_on_a_gpu_all_is_as_on_the_processor(command, copied_run, tmp_path, monkeypatch):
+    name, *options = command.split()
+    call = (name, copied_run, *options, "--episodes", 2, "--threads", 1)
+    file = {"eval": "rollouts.safetensors", "inspect": "inspect.json"}[name]
+    assert koap(*call, "--out", tmp_path / "cpu") == 0
+    with pretended_gpu(monkeypatch):
+        assert koap(*call, "--out", tmp_path / "gpu", "--device", "cuda:0") == 0
+    assert (tmp_path / "gpu" / file).read_bytes() == (tmp_path / "cpu" / file).read_bytes()
 
 
 def test_inspect_from_the_shell(copied_run, capsys):

@@ -44,6 +44,21 @@ def test_the_tool_goes_where_the_plan_says():
     assert (planned[-1] - planned[0]).norm() > 0.15
 
 
+def test_episodes_that_are_over_leave_the_others_alone():
+    start = AvoidingEnv(1).reset()["observation"][0, 2:]
+    ahead = torch.arange(1, STEPS + HORIZON)[:, None]
+    paths = [start + ahead * torch.tensor(step) for step in ((0.0, 0.02), (0.0005, 0.001))]  # the first one collides
+    futures = torch.stack([path.unfold(0, HORIZON, 1).mT for path in paths])
+
+    def followed(rows):
+        given = lambda part: hand_on(futures[rows][part])  # noqa: E731
+        return roll_out(policy_of(RecordedPlanner(small_planner())), AvoidingEnv, rows, max_steps=STEPS, given=given)
+
+    first, second = followed([0, 1])
+    assert len(first) < STEPS == len(second)
+    torch.testing.assert_close(second["action"], followed([1])[0]["action"])
+
+
 @torch.no_grad()
 def test_wrong_uses():
     observed, plan = torch.zeros(1, 2, 4), torch.zeros(1, HORIZON, 2)

@@ -105,7 +105,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
                 " name its entry with --success-key, or compare mean returns"
             )
     rollouts = rollouts_to_tensors(
-        [episode.cpu() for episode in episodes],
+        episodes,
         replace(task, modes=where.modes),
         interval=policy.execution.replan_interval,
     )

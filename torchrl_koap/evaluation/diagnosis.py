@@ -54,12 +54,12 @@ def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_
 
     Returned are planned states ``[E, max_steps, d]`` (or a few more), the first one the start ``[E, d]``.
     """
-    generator = torch.Generator(start.device).manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     states = [start] * planner.history
     while len(states) - planner.history < max_steps - 1:
         history = torch.stack(states[-planner.history :], -2)
-        noise = torch.randn(len(start), *planner.noise_shape, generator=generator, device=start.device)
-        states += planner.sample(history, noise)[:, :interval].unbind(1)
+        noise = torch.randn(len(start), *planner.noise_shape, generator=generator)
+        states += planner.sample(history, noise.to(start.device))[:, :interval].unbind(1)
     return torch.stack(states[planner.history - 1 :], 1)
 
 
@@ -111,7 +111,7 @@ def follow_recordings(
         state_of=policy.state_of,
         execution=policy.execution.replaced(temperature=1.0),  # futures come as noise
         limits=policy.limits,
-    )
+    ).to(device_of(policy))
     futures = recorded_futures([paths[index] for index in chosen], planner.horizon)
     followed = roll_out(
         perfect,

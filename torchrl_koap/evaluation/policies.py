@@ -123,13 +123,11 @@ class OracleFollower(Follower):
         if steps != 1:
             raise RuntimeError("the strategy 'oracle' reads the simulation at every step: it decodes nothing ahead")
         bent = blend_plan(states, plan, self.blend)
-        rest = command_rest(self._rule, states, plan, self.task.action_dim, 1)
-        action = rest[:, 0].double().cpu().numpy()
+        rows = np.flatnonzero(~self._env.over)  # the policy leaves out episodes that are over
+        action = command_rest(self._rule, states, plan, self.task.action_dim, 1)[:, 0].double().cpu().numpy()
         action[:, self._changes] = 0.0
-        rows = np.flatnonzero(~self._env.over)
-        if len(rows):
-            wanted = bent[rows, 1 : LOOK_AHEAD + 1][..., self._moved].double().cpu().numpy()
-            action[np.ix_(rows, self._changes)] = self._last[rows] = self._solve(rows, action[rows], wanted)
+        wanted = bent[:, 1 : LOOK_AHEAD + 1][..., self._moved].double().cpu().numpy()
+        action[:, self._changes] = self._last[rows] = self._solve(rows, action, wanted)
         return torch.as_tensor(action, dtype=plan.dtype, device=plan.device).unsqueeze(1)
 
     def _solve(self, rows: np.ndarray, held: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -62,6 +62,7 @@ def roll_out(
                 module.seed_episodes(part)
         transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
+        env = env.to("cpu")  # or it would take actions from any device
         if given is not None:
             noise = given(slice(begin, begin + len(part)))
         else:
@@ -73,6 +74,7 @@ def roll_out(
             rollout = env.rollout(
                 max_steps,
                 TensorDictSequential(noise, policy),
+                auto_cast_to_device=True,
                 auto_reset=False,
                 tensordict=env.reset(**start),
                 break_when_any_done=False,
