@@ -70,6 +70,15 @@ def test_one_rollout_per_context_has_no_entropy_per_context():
     assert result["mode_entropy"] is None and result["pooled_mode_entropy"] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("contexts", [None, [0, 0]])
+def test_without_a_success_no_entropy_is_known(contexts):
+    episodes = [episode_of(5, success=False, mode=mode) for mode in (0, 1)]
+    result = score(episodes, [7, 8], numbered_modes(2), contexts=contexts)
+    entropies = {name: value for name, value in result.items() if "entropy" in name}
+    assert len(entropies) == (3 if contexts is None else 6) and set(entropies.values()) == {None}
+    assert result["distinct_modes"] == 0
+
+
 def stack_of(letters, success):
     episode = episode_of(4, success=success)
     letters = torch.tensor([*letters, -1, -1, -1])[:3]

@@ -191,6 +191,11 @@ def test_what_cannot_be_done_is_said_in_one_line_before_any_work(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_paper_has_two_tables(tmp_path, capsys):
+    assert "table must be 1 or 2, got 3" in fails(capsys, "bench", "--table", 3, "--out", tmp_path / "bench")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_windows_of_every_seed_must_lie_in_the_trajectories_used(tmp_path, demonstrations, capsys):
     """Of which a seed touches more than another: found before any work, and not by the cell."""
     options = {"label_unit": "window", "labels": (0.02,), "demonstrations": (0.25,), "seeds": 10}

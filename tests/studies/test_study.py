@@ -80,6 +80,10 @@ def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations
     with pytest.raises(CheckpointError, match="was trained on task 'sorting', not on 'avoiding'"):
         asked(methods=("koap",), planners=(sorting,))
     assert not study.out.exists()
+    wide = PlannerConfig(width=64)
+    with pytest.raises(ValueError, match="planner options are not for a study that trains no planner"):
+        asked(methods=("koap",), planners=("pretrained:avoiding",), planner=wide)
+    asked(methods=("koap", "dp"), planners=("pretrained:avoiding",), planner=wide)  # of dp
     named, _ = asked(methods=("koap",), planners=("pretrained:avoiding",))
     assert named.planners == (f"avoiding={pretrained_folders()['avoiding'].absolute()}",)
 

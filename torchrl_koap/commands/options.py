@@ -25,6 +25,7 @@ from tyro.constructors import (
 from torchrl_koap.evaluation.config import EvalConfig
 from torchrl_koap.files import check_folder, read_json
 from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import PRESETS
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
 
@@ -49,7 +50,7 @@ FIRST = {
     "task": (str, "name of the task (default: that of the data set)."),
     "method": (str, "koap, linear, dd, dp, mpc, ... (default: the task's)."),
     "labels": (float, "labels that may be seen: 5 trajectories, or 0.02 of them (default: all)."),
-    "preset": (str, "variant of KOAP: default, absolute, semi_supervised, scene or paper (default: the task's)."),
+    "preset": (str, f"variant of KOAP: {', '.join(PRESETS)} (default: the task's)."),
     "steps": (int, "updates of the planner at most (default: the task's)."),
     "seed": (int, "seed of label choice, initialisation and batches (default: 0)."),
     "device": (str, "cpu or cuda (default: cpu)."),

@@ -7,7 +7,7 @@ import shlex
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 
@@ -254,10 +254,12 @@ class Bench(Curve):
         table: 1 (methods) or 2 (variants).
     """
 
-    table: Literal[1, 2]
+    table: int
 
     def __call__(self) -> dict[str, Any]:
         """Does what is missing of the table and writes its report."""
+        if self.table not in (1, 2):
+            raise ValueError(f"table must be 1 or 2, got {self.table}")
         if self.config.preset is not None:
             raise ValueError(f"preset {self.config.preset!r} is for `koap curve`; a table is chosen with --table")
         return Curve(config=replace(self.config, preset=f"table{self.table}"), machines=self.machines)()

@@ -78,10 +78,10 @@ def _mode_scores(rows: Sequence[dict[str, Any]], modes: Modes, contexts: int | N
 
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
-    known = len(units) and statistic(units) is not None
-    interval = bootstrap_interval(units, statistic) if known else (None, None)
+    value = statistic(units) if len(units) else None  # without successes nothing is known
+    interval = (None, None) if value is None else bootstrap_interval(units, statistic)
     low, high = (None if end is None else min(max(end, 0.0), 1.0) for end in interval)
-    return {name: statistic(units), f"{name}_low": low, f"{name}_high": high}
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
 def task_scores(

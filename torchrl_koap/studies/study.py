@@ -226,7 +226,7 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     usual = USUAL | ({} if study.preset is None else lookup(PRESETS, study.preset, "preset"))
     if study.labels or study.levels:  # neither comes on top of the other
         usual |= {"labels": (), "levels": ()}
-    study = fill_in(study, usual)
+    asked, study = study.planner, fill_in(study, usual)
     study = replace(
         study,
         out=study.out.absolute(),
@@ -239,6 +239,9 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     study = replace(study, datasets=tuple(datasets), planners=tuple(runs))
     for name in study.tasks:
         study.task(name)  # there must be one
+    trains = any(study.given_planner(task) is None for task in study.tasks)
+    if asked != PlannerConfig() and not trains and all(get_method(name).plans for name in study.methods):
+        raise ValueError("planner options are not for a study that trains no planner: all are given with --planners")
     return study
 
 
