@@ -245,6 +245,15 @@ def test_frames_of_another_kind_are_refused(frame, says, tmp_path):
         list(Clip(str(tmp_path / "top.npy"), (0,)).read((8, 8)))
 
 
+def test_a_camera_whose_first_frame_is_none_is_refused_when_it_is_read_in(tmp_path):
+    write_tables(tmp_path)
+    for file in tmp_path.glob("run_*/wrist.npy"):
+        np.save(file, np.load(file).transpose(0, 3, 1, 2) / 255)
+    with pytest.raises(DataError, match=r"run_0.npz: camera 'wrist': frame 0 has shape .*: put the colours last"):
+        read_recordings(tmp_path)
+    assert list(read_recordings(tmp_path, drop_columns=["wrist"]).cameras) == ["top"]
+
+
 def test_damaged_pictures_are_named(tmp_path):
     write_tables(tmp_path)
     clip = read_recordings(tmp_path).cameras["top"][0]

@@ -2,10 +2,12 @@
 """LeRobot data sets of robots that no task describes, with labels for a part of the rows or none."""
 
 import importlib.util
+import io
 import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from torchrl_koap.data.formats.lerobot import read_lerobot
 from torchrl_koap.files import DataError
@@ -82,7 +84,9 @@ def test_an_episode_whose_file_has_no_actions(tmp_path):
 @VERSIONS
 def test_pictures_inside_the_tables_are_referred_to(version, tmp_path):
     features = FEATURES | {"observation.images.wrist": {"dtype": "image", "shape": [4, 4, 3], "names": None}}
-    pictures = pa.array([{"bytes": b"png", "path": None}] * 12)
+    picture = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(picture, "png")
+    pictures = pa.array([{"bytes": picture.getvalue(), "path": None}] * 12)
     root = write(tmp_path, features=features, change={"observation.images.wrist": pictures}, version=version)
     recordings = read_lerobot(root)
     assert recordings.skipped == ("observation.images.front (its videos are not here)",)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -304,7 +305,7 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
 
 
 def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:
-    """Pieces that lack a camera that others have, or a frame per row."""
+    """Pieces that lack a camera that others have, or a frame per row, and cameras whose first frame is no picture."""
     for name in dict.fromkeys(name for piece in pieces for name in piece.cameras):
         cure = f"record them, or leave the camera out by {option('drop_columns')} {name}"
         absent = [piece.name for piece in pieces if name not in piece.cameras]
@@ -314,6 +315,12 @@ def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:
             number = len(piece.cameras.get(name, range(piece.frames)))
             if number != piece.frames:
                 yield f"{piece.name}: camera {name!r} has {number} frames for {piece.frames} rows: {cure}"
+        where, clip = next((piece.name, piece.cameras[name]) for piece in pieces if name in piece.cameras)
+        try:
+            with suppress(RuntimeError):  # the extra that reads it is missing; `koap embed` needs it
+                next(clip.take(range(min(len(clip), 1))).read(), None)
+        except ValueError as error:
+            yield f"{where}: camera {name!r}: {error}"
 
 
 def _other_lengths(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
