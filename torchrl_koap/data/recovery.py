@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -57,6 +57,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
             needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
         moved_by (sequence of int, optional): for every action column the state column that it moves: actions are given
             the way back too, ``a'_{t+i} = a_{t+i} + (rho^{i+1} - rho^i) delta``. Default: no action is touched.
+        state_key, action_key (NestedKey): of the windows. Default: ``"state"``, ``"action"``.
 
     Windows of ``state`` ``[*B, T, d]`` are replaced, with ``moved_by`` also ``action`` ``[*B, T, act]``; NaN stays.
 
@@ -84,13 +85,15 @@ class RecoveryAugmentation(TensorDictModuleBase):
         tool: Sequence[int] | None = None,
         kinematics: Callable[[Tensor], Tensor] | None = None,
         moved_by: Sequence[int] | None = None,
+        state_key: NestedKey = STATE,
+        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         if tool is not None and (columns is None or kinematics is None):
             raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
         if bool(torch.as_tensor(sigma < 0).any()) or not 0 <= decay < 1 or (under_way and not decay):
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), 0 without under_way, got {sigma} and {decay}")
-        self.in_keys = self.out_keys = [STATE] if moved_by is None else [STATE, ACTION]
+        self.in_keys = self.out_keys = [state_key] if moved_by is None else [state_key, action_key]
         self.moved_by = None if moved_by is None else list(moved_by)
         self.sigma, self.history, self.decay, self.under_way = sigma, history, decay, under_way
         self.columns = None if columns is None else list(columns)
@@ -99,7 +102,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by shifted ones."""
-        state = tensordict.get(STATE)
+        state = tensordict.get(self.in_keys[0])
         size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
         shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
         sigma = self.sigma.to(state) if isinstance(self.sigma, Tensor) else self.sigma
@@ -113,11 +116,11 @@ class RecoveryAugmentation(TensorDictModuleBase):
         if self.moved_by is not None:
             following = _remaining(state, self.history, self.decay, ahead=1, under_way=self.under_way)
             back = shift[..., self.moved_by] * (following - remaining)
-            tensordict.set(ACTION, tensordict.get(ACTION) + back)
+            tensordict.set(self.in_keys[1], tensordict.get(self.in_keys[1]) + back)
         if self.tool is not None:
             moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
             shifted[..., self.tool] = shifted[..., self.tool] + moved
-        return tensordict.set(STATE, shifted)
+        return tensordict.set(self.out_keys[0], shifted)
 
     def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
         """Shifts ``[*B, 1, d]`` whose joints move the tool, if there is one, by its own columns, with least motion."""
@@ -149,18 +152,19 @@ class GripperRecovery(TensorDictModuleBase):
     Keyword Args:
         share (float): share of the windows it is done to, if their fingers are open, in [0, 1].
         history (int): observed frames of the window.
+        state_key (NestedKey): of the windows. Default: ``"state"``.
     """
 
-    def __init__(self, column: int, *, share: float = 0.1, history: int = 2):
+    def __init__(self, column: int, *, share: float = 0.1, history: int = 2, state_key: NestedKey = STATE):
         super().__init__()
         if not 0 <= share <= 1:
             raise ValueError(f"share must be in [0, 1], got {share}")
-        self.in_keys = self.out_keys = [STATE]
+        self.in_keys = self.out_keys = [state_key]
         self.column, self.share, self.history = column, share, history
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by ones of which some show fingers that open."""
-        state = tensordict.get(STATE)
+        state = tensordict.get(self.in_keys[0])
         width = state[..., self.column]
         kind = {"dtype": width.dtype, "device": width.device}
         chosen, begin = torch.rand(2, *width.shape[:-1], 1, **kind)
@@ -171,7 +175,7 @@ class GripperRecovery(TensorDictModuleBase):
         opening = widest - _LEFT**ahead * (widest - EMPTY * begin)
         state = state.clone()
         state[..., self.column] = torch.where(chosen, torch.minimum(width, opening), width)
-        return tensordict.set(STATE, state)
+        return tensordict.set(self.out_keys[0], state)
 
 
 class NeighborRecovery(TensorDictModuleBase):
@@ -189,19 +193,19 @@ class NeighborRecovery(TensorDictModuleBase):
         share (float): ``s``, farthest share of the way to the neighbour; 0 changes nothing.
 
     Keyword Args:
-        history, decay: as of :class:`RecoveryAugmentation`; windows must be a batch of two or more.
+        history, decay, state_key: as of :class:`RecoveryAugmentation`; windows must be a batch of two or more.
     """
 
-    def __init__(self, share: float, *, history: int = 2, decay: float = 0.85):
+    def __init__(self, share: float, *, history: int = 2, decay: float = 0.85, state_key: NestedKey = STATE):
         super().__init__()
         if not 0 <= share < math.inf or not 0 <= decay < 1:
             raise ValueError(f"share must be >= 0 and decay in [0, 1), got {share} and {decay}")
-        self.in_keys = self.out_keys = [STATE]
+        self.in_keys = self.out_keys = [state_key]
         self.share, self.history, self.decay = share, history, decay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by displaced ones."""
-        state = tensordict.get(STATE)
+        state = tensordict.get(self.in_keys[0])
         if state.ndim != 3 or len(state) < 2:
             raise ValueError(f"neighbours are looked for in a batch [B, T, d] of two or more, got {list(state.shape)}")
         present = state[:, self.history - 1]
@@ -210,4 +214,4 @@ class NeighborRecovery(TensorDictModuleBase):
         way = present[apart.argmin(-1)] - present
         way = self.share * torch.rand(len(state), 1, dtype=state.dtype, device=state.device) * way
         remaining = _remaining(state, self.history, self.decay)
-        return tensordict.set(STATE, state + way[:, None] * remaining)
+        return tensordict.set(self.out_keys[0], state + way[:, None] * remaining)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_koap.keys import ACTION, STATE
@@ -27,6 +27,7 @@ class RandomPlanarTransform(TensorDictModuleBase):
             observed. Defaults to ``0.3``.
         turned_actions (sequence of int, optional): action columns ``(x, y)`` of a displacement, turned with the scene.
         history (int): observed frames of the window. Defaults to ``2``.
+        state_key, action_key (NestedKey): of the windows. Default: ``"state"``, ``"action"``.
 
     Raises:
         ValueError: for a negative shift or turn.
@@ -51,18 +52,20 @@ class RandomPlanarTransform(TensorDictModuleBase):
         turn: float = 0.3,
         history: int = 2,
         turned_actions: Sequence[int] | None = None,
+        state_key: NestedKey = STATE,
+        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         if shift < 0 or turn < 0:
             raise ValueError(f"shift and turn must be >= 0, got {shift} and {turn}")
-        self.in_keys = self.out_keys = [STATE] if turned_actions is None else [STATE, ACTION]
+        self.in_keys = self.out_keys = [state_key] if turned_actions is None else [state_key, action_key]
         self.turned_actions = None if turned_actions is None else list(turned_actions)
         self.points, self.directions = [list(pair) for pair in points], [list(pair) for pair in directions]
         self.shift, self.turn, self.history = shift, turn, history
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by moved ones."""
-        state = tensordict.get(STATE)
+        state = tensordict.get(self.in_keys[0])
         kind = {"dtype": state.dtype, "device": state.device}
         angle = self.turn * torch.randn(state.shape[:-2], **kind)
         cosine, sine = angle.cos(), angle.sin()
@@ -75,10 +78,10 @@ class RandomPlanarTransform(TensorDictModuleBase):
         for pair in self.directions:
             moved[..., pair] = state[..., pair] @ turn
         if self.turned_actions is not None:
-            action = tensordict.get(ACTION).clone()
+            action = tensordict.get(self.in_keys[1]).clone()
             action[..., self.turned_actions] = action[..., self.turned_actions] @ turn
-            tensordict.set(ACTION, action)
-        return tensordict.set(STATE, moved)
+            tensordict.set(self.in_keys[1], action)
+        return tensordict.set(self.out_keys[0], moved)
 
 
 class ObjectPermutation(TensorDictModuleBase):
@@ -86,6 +89,9 @@ class ObjectPermutation(TensorDictModuleBase):
 
     Args:
         groups (sequence): for each kind of object the state columns of each of its instances, all of the same number.
+
+    Keyword Args:
+        state_key (NestedKey): of the windows. Default: ``"state"``.
 
     Examples:
         >>> import torch
@@ -97,17 +103,17 @@ class ObjectPermutation(TensorDictModuleBase):
         [0.0, 2.0]
     """
 
-    def __init__(self, groups: Sequence[Sequence[Sequence[int]]]):
+    def __init__(self, groups: Sequence[Sequence[Sequence[int]]], *, state_key: NestedKey = STATE):
         super().__init__()
-        self.in_keys = self.out_keys = [STATE]
+        self.in_keys = self.out_keys = [state_key]
         self.groups = [[list(columns) for columns in group] for group in groups]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by ones with exchanged columns."""
-        state = tensordict.get(STATE)
+        state = tensordict.get(self.in_keys[0])
         index = torch.arange(state.shape[-1], device=state.device).expand(*state.shape[:-2], -1).clone()
         for group in self.groups:
             columns = torch.tensor(group, device=state.device)  # [instances, columns]
             order = torch.rand(*state.shape[:-2], len(group), device=state.device).argsort(-1)
             index[..., columns.flatten()] = columns[order].flatten(-2)
-        return tensordict.set(STATE, state.gather(-1, index.unsqueeze(-2).expand_as(state)))
+        return tensordict.set(self.out_keys[0], state.gather(-1, index.unsqueeze(-2).expand_as(state)))
