@@ -56,7 +56,7 @@ class Follower(nn.Module):
         raise NotImplementedError
 
     def attach(self, env: EnvBase) -> None:
-        """Receives the batch of environments before their episodes begin; does nothing by default."""
+        """Receives the batch of environments before their episodes begin, of which only those under way are decoded."""
 
 
 class InverseDynamicsFollower(Follower):
