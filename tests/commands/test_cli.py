@@ -44,6 +44,10 @@ def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
         ("latency x --step 4", "unknown option of koap latency: '--step'; did you mean '--steps'?"),
         ("convert x --control-h 30", "unknown option of koap convert: '--control-h'; did you mean '--control-hz'?"),
         ("validate x --foo", "unknown option of koap validate: '--foo'; known: --help, --quiet, --task, --plugin"),
+        (
+            "curve --out x --blend 0.5",
+            "unknown option of koap curve: '--blend'; did you mean '--execution.blend' or '--evaluation.blend'?",
+        ),
         ("trian --steps 5", "unknown command 'trian'; did you mean 'train'?"),
         ("train --out x --steps many", "--steps must be a whole number, got 'many'"),
         ("train --out x --seed=1.5", "--seed must be a whole number, got '1.5'"),

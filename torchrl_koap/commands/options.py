@@ -193,7 +193,11 @@ def check_call(kind: Any, arguments: Sequence[str]) -> None:
     for word in arguments[1:]:
         name, equals, value = word.partition("=")
         if name.startswith("--"):
-            option = lookup([*wanted, *more], name.replace("_", "-"), f"option of koap {command}:")
+            name, known, what = name.replace("_", "-"), [*wanted, *more], f"option of koap {command}:"
+            inside = [each for each in wanted if each.endswith(f".{name[2:]}")]  # in a section
+            if name not in known and inside:
+                raise ValueError(f"unknown {what} {name!r}; did you mean {' or '.join(map(repr, inside))}?")
+            option = lookup(known, name, what)
         if equals or not name.startswith("--"):
             _check_number(option, value if equals else word, wanted.get(option, ""))
 
