@@ -2,6 +2,7 @@
 """From frames beside recordings to actions: convert, embed, train, and what takes frames after it."""
 
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -38,6 +39,14 @@ def test_each_step_names_the_next_and_says_what_is_kept(tmp_path, capsys):
         line = next(line for line in said.splitlines() if line.startswith(f"camera {camera}"))
         assert "16 x 24, 5 components keep" in line and "reconstruction error" in line and "frames a second" in line
     assert f"koap train --dataset {tmp_path}/seen --out runs/own" in said
+
+
+def test_the_next_call_works_with_a_blank_in_the_name(tmp_path, capsys):
+    write_filmed(tmp_path / "raw", cameras=("top",))
+    assert koap("convert", tmp_path / "raw", "--out", tmp_path / "own", "--name", "my arm", "--quiet") == 0
+    assert koap("embed", tmp_path / "own", "--out", tmp_path / "seen", *EMBED[:-1]) == 0
+    call = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert call == ["next", "koap", "train", "--dataset", str(tmp_path / "seen"), "--out", "runs/my arm"]
 
 
 def test_a_robot_gives_numbers_and_frames_to_run_and_file(run, tmp_path):

@@ -3,6 +3,7 @@
 
 import json
 import re
+import shlex
 
 import numpy as np
 import pytest
@@ -25,6 +26,12 @@ def run(arm):
 def test_an_evaluation_ends_with_its_report(run, capsys):
     assert koap("eval", run) == 0
     assert capsys.readouterr().out.splitlines()[-1].split() == ["report", str(run / "index.html")]
+
+
+def test_the_next_call_works_with_a_blank_in_the_name(arrays, tmp_path, capsys):
+    assert koap("convert", arrays, "--out", tmp_path / "arm", "--name", "my arm") == 0
+    call = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert call == ["next", "koap", "train", "--dataset", str(tmp_path / "arm"), "--out", "runs/my arm"]
 
 
 def test_absolute_targets(arrays, tmp_path, capsys):

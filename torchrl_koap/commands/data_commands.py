@@ -266,7 +266,7 @@ class Validate(Command):
 def _next(folder: Path, task: Task, recordings: Recordings) -> str:
     where = shlex.quote(str(folder))
     if not recordings.cameras:
-        return f"koap train --dataset {where} --out runs/{task.name}"
+        return shlex.join(["koap", "train", "--dataset", str(folder), "--out", f"runs/{task.name}"])
     cameras = " ".join(f"--camera {shlex.quote(name)}" for name in recordings.cameras)
     return f"koap embed {where} {cameras} --out {where}_seen"
 

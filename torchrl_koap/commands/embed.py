@@ -84,5 +84,5 @@ class Embed(Command):
             "trajectories": about["trajectories"],
             "steps": about["steps"],
             "labelled steps": about["labelled_steps"],
-            "next": f"koap train --dataset {shlex.quote(str(self.out))} --out runs/{task.name}",
+            "next": shlex.join(["koap", "train", "--dataset", str(self.out), "--out", f"runs/{task.name}"]),
         }
