@@ -114,6 +114,14 @@ def test_recordings_without_actions_are_to_get_them_first(tmp_path):
     assert re.match(r"add actions to recordings (1, 2|2, 1) and convert them again, then koap train --task arm", said)
 
 
+def test_the_next_training_imports_the_plugins_of_the_first(copied_run):
+    config = json.loads((copied_run / "config.json").read_text())
+    config["run"]["plugins"] = ["json", "csv"]
+    (copied_run / "config.json").write_text(json.dumps(config))
+    said = suggest(copied_run, SuggestConfig(count=1, plugins=("csv", "math")))["next"]
+    assert " --plugin json --plugin csv --plugin math --labels.episodes " in said
+
+
 def test_suggest_from_the_shell(copied_run, capsys):
     assert koap("suggest", copied_run, "--count", "3") == 0
     lines = capsys.readouterr().out.splitlines()

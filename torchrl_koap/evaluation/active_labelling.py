@@ -213,6 +213,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
     again = ["koap", "train", "--task", task.name, "--dataset", config.dataset or trained.config.dataset]
+    for plugin in dict.fromkeys([*trained.config.run.plugins, *config.plugins]):
+        again += ["--plugin", plugin]
     every = [*labelled, *(choice.episode for choice in choices)]
     known = recorded[EPISODE][recorded[HAS_ACTION].squeeze(-1)].unique().tolist()
     without = [episode for episode in every if episode not in known]
