@@ -38,7 +38,7 @@ class EvalConfig:
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
         rollouts_per_context: rollouts in each context (place of the objects); from 2 on the report has the entropy of
             the modes per context.
-        batch_size: episodes at a time; results do not depend on it.
+        batch_size: episodes at a time; contexts and noise do not depend on it, the last digits of actions do.
         contexts_file: a context file of D3IL, instead of the 60 contexts of the library.
 
     Raises:
