@@ -143,6 +143,7 @@ def test_frames_and_actions_are_cut_together():
     np.testing.assert_array_equal(found.states, [LINE, LINE])
     np.testing.assert_array_equal(found.actions[0][:, 0], np.arange(9.0, 28))
     assert found.skipped == ("13 still frames of 1 trajectories",) and found.control_hz == 20
+    assert trim_still(make_recordings([LINE], [LINE[1:]], control_hz=20)).skipped == ()
 
 
 def test_short_trajectories_are_left_out_and_named():

@@ -111,15 +111,21 @@ def test_recordings_without_actions_are_to_get_them_first(tmp_path):
     few = {"planner": PlannerConfig(steps=2, width=8), "controller": ControllerConfig(steps=2)}
     train(TrainConfig(dataset=str(data), out=tmp_path / "run", labels=LabelConfig(episodes=(0,)), **few))
     said = suggest(tmp_path / "run", SuggestConfig(count=3))["next"]
-    assert re.match(r"add actions to recordings (1, 2|2, 1) and convert them again, then koap train --task arm", said)
+    assert re.match(r"add actions to recordings (1, 2|2, 1) and convert them again, then koap train --config", said)
 
 
-def test_the_next_training_imports_the_plugins_of_the_first(copied_run):
+def test_the_next_training_is_as_the_first_one(copied_run, tmp_path):
     config = json.loads((copied_run / "config.json").read_text())
-    config["run"]["plugins"] = ["json", "csv"]
+    config["run"]["plugins"] = ["json"]
+    config["planner"]["learning_rate"] = 2e-3
     (copied_run / "config.json").write_text(json.dumps(config))
-    said = suggest(copied_run, SuggestConfig(count=1, plugins=("csv", "math")))["next"]
-    assert " --plugin json --plugin csv --plugin math --labels.episodes " in said
+    said = suggest(copied_run, SuggestConfig(count=1, plugins=("csv",)))["next"]
+    assert " --plugin csv --labels.episodes " in said
+    assert koap(*said.removesuffix(" NEW").split()[1:], tmp_path / "new", "--quiet") == 0
+    again = json.loads((tmp_path / "new" / "config.json").read_text())
+    assert again["labels"]["episodes"] == list(map(int, said.split("--labels.episodes ")[1].split(" --out")[0].split()))
+    assert again["run"]["plugins"] == ["json", "csv"] and again["controller"] == config["controller"]
+    assert again["dataset"] == config["dataset"] and again["planner"] == config["planner"]
 
 
 def test_suggest_from_the_shell(copied_run, capsys):
@@ -141,8 +147,7 @@ def test_suggest_from_the_shell(copied_run, capsys):
         str(episode) for episode in [*written["labelled_episodes"], *(row["episode"] for row in rows)]
     ]
     assert len(written["labelled_episodes"]) == labels["trajectories_touched"]
-    dataset = json.loads((copied_run / "config.json").read_text())["dataset"]
-    assert f"koap train --task avoiding --dataset {dataset} --labels.episodes" in lines[3]
+    assert f"koap train --config {copied_run / 'config.json'} --labels.episodes" in lines[3]
     assert koap("suggest", copied_run, "--count", "7") == 1  # 2 of 8 are labelled
     assert "count must be in 1..6" in capsys.readouterr().err
 

@@ -2,6 +2,7 @@
 """A run on a robot of one's own is evaluated in an environment of Gymnasium."""
 
 import json
+import sys
 
 import pytest
 from offline_runs import record
@@ -38,6 +39,15 @@ def test_the_command(arm_run):
     assert {row["steps"] for row in result["episode"]} == {6}
     page = (arm_run / "index.html").read_text()
     assert "3 of 3 rollouts" in page and "--env toy_gym:ToyReachOwnKey-v0" in page
+
+
+def test_a_module_beside_the_data_is_found(arm_run, tmp_path, monkeypatch):
+    code = "import gymnasium, toy_gym\ngymnasium.register('Beside-v0', toy_gym.Reach, kwargs={'key': 'is_success'})\n"
+    (tmp_path / "beside_the_data.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
+    config = EvalConfig(episodes=2, env="beside_the_data:Beside-v0", threads=1, out=tmp_path / "out")
+    assert evaluate(arm_run, config)["rates"]["success"]["rate"] == 1.0
 
 
 def test_step_limit_success_and_arguments_are_said(arm_run, capsys):

@@ -176,7 +176,8 @@ def trim_still(recordings: Recordings) -> Recordings:
     spans = [
         (number, ends[number, 0], len(frames) - ends[number, 1]) for number, frames in enumerate(recordings.states)
     ]
-    return recordings.cut(spans, [f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"])
+    cut = [f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"] if ends.any() else []
+    return recordings.cut(spans, cut)
 
 
 def drop_short(recordings: Recordings) -> Recordings:

@@ -183,7 +183,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     config = SuggestConfig() if config is None else config
     set_up_torch(config.threads, "cpu")
     trained = Trained.load(run, plugins=config.plugins)
-    task, controller = trained.task, trained.controller
+    controller = trained.controller
     if not isinstance(controller, KoopmanInverseDynamics):
         raise ValueError(
             f"{trained.folder} was trained with method {trained.config.method!r}: suggestions need latent actions,"
@@ -212,8 +212,9 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
-    again = ["koap", "train", "--task", task.name, "--dataset", config.dataset or trained.config.dataset]
-    for plugin in dict.fromkeys([*trained.config.run.plugins, *config.plugins]):
+    again = ["koap", "train", "--config", str(trained.folder / "config.json")]
+    again += [] if config.dataset is None else ["--dataset", str(config.dataset)]
+    for plugin in config.plugins:
         again += ["--plugin", plugin]
     every = [*labelled, *(choice.episode for choice in choices)]
     known = recorded[EPISODE][recorded[HAS_ACTION].squeeze(-1)].unique().tolist()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.runs.weights import save_tensors
@@ -182,6 +184,9 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
         return RolloutEnvironment(make, task.max_steps, task.modes, numbers, contexts)
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 
+    module, colon, _ = config.env.partition(":")
+    with suppress(PluginError):  # making the environment says what is wrong with its module
+        load_plugins((module,) if colon else ())
     record = EpisodeRecord()
     make_env = partial(
         GymnasiumBatch,

@@ -41,8 +41,8 @@ def roll_out(
     """Runs one episode per seed, on which alone the planner's noise depends; returns each ``[steps]``, cut at its end.
 
     ``make_env`` makes an environment of a given number of parallel episodes, of which there are ``batch_size`` (by
-    default :data:`AT_ONCE`); actions depend on it by rounding errors alone,
-    which contacts amplify. ``contexts`` are those ``[objects, 3]`` of every episode.
+    default :data:`AT_ONCE`); actions depend on it by rounding errors alone, which contacts amplify. ``contexts`` are
+    those ``[objects, 3]`` of every episode.
     ``given(episodes)`` writes what the planner reads in those episodes in place of start noise. ``progress`` is called
     with the number of episodes finished.
 

@@ -73,7 +73,7 @@ class ExecutionConfig:
 
     Attributes:
         strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (inverse dynamics of
-            the simulator, which follow plans closely: remaining failures are the planner's).
+            the simulator, which follow plans closely within the arm's reach; what still fails is mostly the planner's).
         replan_interval: control steps per plan (default with feedback: those of 0.1 s, 4 to 10, or 7 where actions are
             targets).
         blend: share of the distance between robot and plan that remains after each step; 0: plans are not shifted.
