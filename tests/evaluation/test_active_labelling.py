@@ -128,6 +128,16 @@ def test_the_next_training_is_as_the_first_one(copied_run, tmp_path):
     assert again["dataset"] == config["dataset"] and again["planner"] == config["planner"]
 
 
+def test_windows_that_had_labels_are_proposed_as_whole_trajectories(demonstrations, tmp_path):
+    few = [word.replace("2", "0.2") if TINY[place - 1] == "--labels" else word for place, word in enumerate(TINY)]
+    few += ["--labels.unit", "window"]
+    assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, "--method", "koap", *few) == 0
+    found = suggest(tmp_path / "run", SuggestConfig(count=2))
+    assert set(found["labelled_episodes"]) & {row["episode"] for row in found["suggestions"]}  # in part labelled
+    words = found["next"].removesuffix(" NEW").split()
+    assert koap(*words[1:], tmp_path / "new", "--quiet") == 0
+
+
 def test_suggest_from_the_shell(copied_run, capsys):
     assert koap("suggest", copied_run, "--count", "3") == 0
     lines = capsys.readouterr().out.splitlines()

@@ -216,7 +216,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     again += [] if config.dataset is None else ["--dataset", str(config.dataset)]
     for plugin in config.plugins:
         again += ["--plugin", plugin]
-    every = [*labelled, *(choice.episode for choice in choices)]
+    again += [] if trained.config.labels.unit == "trajectory" else ["--labels.unit", "trajectory"]
+    every = list(dict.fromkeys([*labelled, *(choice.episode for choice in choices)]))
     known = recorded[EPISODE][recorded[HAS_ACTION].squeeze(-1)].unique().tolist()
     without = [episode for episode in every if episode not in known]
     first = f"add actions to recordings {some(without)} and convert them again, then " if without else ""
