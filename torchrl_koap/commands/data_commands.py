@@ -13,7 +13,7 @@ from typing import Any
 import tyro
 from tensordict import TensorDictBase
 
-from torchrl_koap.commands.options import Command
+from torchrl_koap.commands.options import Command, training_call
 from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.action_kinds import describe_likely, likely_kinds
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
@@ -264,9 +264,9 @@ class Validate(Command):
 
 
 def _next(folder: Path, task: Task, recordings: Recordings) -> str:
-    where = shlex.quote(str(folder))
     if not recordings.cameras:
-        return shlex.join(["koap", "train", "--dataset", str(folder), "--out", f"runs/{task.name}"])
+        return training_call(folder, task.name)
+    where = shlex.quote(str(folder))
     cameras = " ".join(f"--camera {shlex.quote(name)}" for name in recordings.cameras)
     return f"koap embed {where} {cameras} --out {where}_seen"
 

@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import contextlib
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from torchrl_koap.commands.options import Command
+from torchrl_koap.commands.options import Command, training_call
 from torchrl_koap.data.sources import check_new
 from torchrl_koap.data.ted import read_about
 from torchrl_koap.runs.plugins import Plugins, load_plugins
@@ -84,5 +83,5 @@ class Embed(Command):
             "trajectories": about["trajectories"],
             "steps": about["steps"],
             "labelled steps": about["labelled_steps"],
-            "next": shlex.join(["koap", "train", "--dataset", str(self.out), "--out", f"runs/{task.name}"]),
+            "next": training_call(self.out, task.name),
         }

@@ -7,6 +7,7 @@ import contextlib
 import io
 import math
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
 from functools import partial
@@ -175,6 +176,11 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
     registry = ConstructorRegistry()
     registry.struct_rule(partial(_described, short, []))
     return tyro.cli(kind, args=arguments, registry=registry, **({"prog": "koap"} | how))
+
+
+def training_call(dataset: Path, name: str) -> str:
+    """Says how a data set is trained on, as words for a shell; the run has the name of the task."""
+    return shlex.join(["koap", "train", "--dataset", str(dataset), "--out", f"runs/{name}"])
 
 
 def check_call(kind: Any, arguments: Sequence[str]) -> None:

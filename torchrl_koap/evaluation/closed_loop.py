@@ -184,9 +184,9 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
         return RolloutEnvironment(make, task.max_steps, task.modes, numbers, contexts)
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 
-    module, colon, _ = config.env.partition(":")
-    with suppress(PluginError):  # making the environment says what is wrong with its module
-        load_plugins((module,) if colon else ())
+    if ":" in config.env:
+        with suppress(PluginError):  # making the environment says what is wrong with its module
+            load_plugins([config.env.partition(":")[0]])
     record = EpisodeRecord()
     make_env = partial(
         GymnasiumBatch,
