@@ -129,6 +129,7 @@ def main(
     seeds: int = 3,
     executions: tuple[str, ...] = ("default",),
     n: int | None = None,
+    steps: int | None = None,
     folder: Path = Path("runs/proving_grounds"),
     results: Path = RESULTS,
 ) -> None:
@@ -141,6 +142,8 @@ def main(
         seeds: number of training seeds, from 0.
         executions: ways to execute plans: default, open_loop_8, temperature_1.
         n: rollouts per cell, with the seeds from 100,000 on. Default: the ground's own.
+        steps: updates of planners and Diffusion Policy at most, with a folder and a table of their own. Default: the
+            library's.
         folder: where to train.
         results: the table.
     """
@@ -178,7 +181,8 @@ def main(
                         method=method,
                         labels=LabelConfig(count=count),
                         planner=PlannerConfig(
-                            source=folder / f"{name}-{planning[0]}-{count}-{seed}" if takes else None
+                            source=folder / f"{name}-{planning[0]}-{count}-{seed}" if takes else None,
+                            steps=None if takes else steps,
                         ),
                         run=RunConfig(seed=seed, resume=True),
                     )
