@@ -133,6 +133,8 @@ def test_inspect_from_the_shell(copied_run, capsys):
     assert lines[-1].split(maxsplit=2)[2] == str(run / "inspect.json") and max(map(len, lines[:-2])) < 200
     assert written["both"]["episodes"] == 2 and (run / "plots" / "inspect.png").exists()
     assert "episodes must be >= 1, got 0" in fails(capsys, "inspect", run, "--episodes", "0")
+    assert koap("inspect", run, "--strategy", "open_loop", "--episodes", "2", "--threads", "1") == 0
+    assert all(len(line.split()) > 1 for line in capsys.readouterr().out.splitlines())  # no distances without plans
 
 
 def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_goal(copied_run, monkeypatch, tmp_path):

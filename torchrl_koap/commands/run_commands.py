@@ -122,7 +122,8 @@ class Inspect(Command):
         draw_pictures(folder, names=("inspect.png", "latent.png"))
         if (folder / "index.html").exists():
             write_report(folder, draw=False)
-        shown = {name: value for name, value in result.items() if name != "latent"}  # told by the findings
+        # the findings tell of the latent space; a policy that does not follow plans leaves no distances to them
+        shown = {name: value for name, value in result.items() if name != "latent" and value != {}}
         return shown | {"all numbers": str(folder / "inspect.json")}
 
 

@@ -11,7 +11,6 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
-from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.data.windows import WindowTable, spread_evenly
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
@@ -25,6 +24,7 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import augmentation
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, with_commands
+from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
 FITTED = 50_000  # windows that statistics without labels are fitted to

@@ -1,0 +1,44 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Relabelling: a controller's actions in place of the labels that the budget hides."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_koap.data.trajectories import extrapolate_ends
+from torchrl_koap.data.windows import WindowTable
+from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
+from torchrl_koap.modules import InverseDynamics
+
+_BATCH = 4096  # windows per forward pass
+
+
+@torch.no_grad()
+def relabel(controller: InverseDynamics, data: TensorDictBase, *, window: int) -> TensorDictBase:
+    """Gives every unlabelled step the action that an inverse dynamics in evaluation mode reads off recorded states.
+
+    An action is read at frame ``controller.num_past`` of a window. Over the ends of a trajectory the first state is
+    repeated, and the last ones go on at their velocity (:func:`~torchrl_koap.data.extrapolate_ends`)::
+
+        frame            0      1      2      ...    window - 1         (history = 1)
+        action of step 0 x_0    x_0    x_1    ...
+        action of step t x_t-1  x_t    x_t+1  ...
+
+    Flat data ``[N]`` have ``state`` as the controller sees it, and are not changed. In the shallow copy that is
+    returned every step has an action; labelled steps keep theirs bit for bit.
+
+    Raises:
+        ValueError: if the controller's actions are not finite.
+    """
+    hidden, now = ~data[HAS_ACTION].squeeze(-1), controller.num_past
+    action = data[ACTION].clone()
+    continued = extrapolate_ends(data, window - 1 - now)
+    # one window per hidden step, in the order of the data: the one that has the step at frame `now`
+    frames, _ = WindowTable.build(continued, window, counted=range(now, window - 1), pad_before=now).frames(hidden)
+    parts = [TensorDict({controller.in_key: continued[STATE][part]}, part.shape) for part in frames.split(_BATCH)]
+    if hidden.any():
+        action[hidden] = torch.cat([controller(part)[controller.out_key][:, now] for part in parts])
+    if bad := int((~action[hidden].isfinite().all(-1)).sum()):
+        raise ValueError(f"the controller's actions are not finite in {bad} of {int(hidden.sum())} steps")
+    return data.copy().update({ACTION: action, HAS_ACTION: torch.ones_like(data[HAS_ACTION])})
