@@ -53,6 +53,14 @@ def test_all_windows_at_once(pad_before):
     assert torch.equal(cut["padded"].squeeze(-1), padded) and padded.any() == bool(pad_before)
 
 
+def test_some_windows_are_spread_evenly_over_all():
+    data = demonstrations((9, 5))
+    every = cut_windows(data, 4, pad_before=1)
+    some = cut_windows(data, 4, pad_before=1, most=4)
+    assert len(every) == 10 and (some == every[[0, 3, 6, 9]]).all()
+    assert (cut_windows(data, 4, pad_before=1, most=99) == every).all()
+
+
 @pytest.mark.parametrize("padded", [False, True])
 def test_samples_are_the_stored_rows(padded):
     data = demonstrations()

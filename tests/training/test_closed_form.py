@@ -74,6 +74,15 @@ def test_no_penalty_is_below_that_of_the_errors_of_plans(fits, method):
     assert all(min(fit.errors) == pytest.approx(INPUT_NOISE * report["labels_used"]) for *_, fit in fits)
 
 
+def test_trajectories_without_a_label_are_not_cut():
+    """There may be thousands of them, and any is too short for the frames that a controller reads."""
+    data = numbered((30, 40, 3))
+    data["has_action"][-3:], data["action"][-3:] = False, torch.nan
+    torch.manual_seed(0)
+    controller = controller_of("koap", numbered())
+    assert fit_closed_form(controller, data) == fit_closed_form(controller, data[:-3])
+
+
 @pytest.mark.parametrize("method", ["koap", "linear", "pca"])
 def test_actions_that_are_not_alike_have_a_penalty_each(monkeypatch, method):
     asked = []

@@ -81,6 +81,27 @@ def test_a_planner_learns_with_these_weights(monkeypatch):
     assert not torch.equal(with_them, weights_of_a_planner())
 
 
+def test_of_much_data_some_windows_are_as_good_as_all(monkeypatch):
+    """All of them would take sixteen times the memory of the data."""
+    paths = [np.random.default_rng(seed).normal(size=(60, 3)).cumsum(0) for seed in range(20)]
+    data, task = make_demonstrations(paths, [np.diff(path, axis=0) for path in paths], control_hz=10, robot=range(3))
+    taken, fit_normalizers = [], StatePlanner.fit_normalizers
+
+    def noted(planner, windows):
+        taken.append(len(windows))
+        fit_normalizers(planner, windows)
+
+    def scale():
+        planner = fit(data, task, planner={"steps": 1}, controller={"steps": 0}, progress=False).planner
+        return planner.plan_normalizer.scale
+
+    monkeypatch.setattr(StatePlanner, "fit_normalizers", noted)
+    every = scale()
+    monkeypatch.setattr(planner_file, "FITTED", 300)
+    torch.testing.assert_close(scale(), every, rtol=0.1, atol=0)
+    assert taken == [18 * 58, 300]  # two trajectories are held out
+
+
 def test_the_robot_is_shifted_by_its_usual_step_in_any_unit_unless_the_task_says_how_far():
     windows = torch.from_numpy(np.random.default_rng(0).normal(size=(500, 16, 3))).cumsum(1)
     _, task = make_demonstrations([path.numpy() for path in windows[:3]], control_hz=10, action_dim=1, robot=(0, 2))

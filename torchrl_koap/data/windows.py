@@ -219,15 +219,21 @@ def spread_evenly(rows: Rows, most: int) -> Rows:
 
 
 def cut_windows(
-    data: TensorDictBase, window: int, *, select: Sequence[NestedKey] | None = None, pad_before: int = 0
+    data: TensorDictBase,
+    window: int,
+    *,
+    select: Sequence[NestedKey] | None = None,
+    pad_before: int = 0,
+    most: int | None = None,
 ) -> TensorDictBase:
-    """Cuts all windows of flat data at once.
+    """Cuts windows of flat data at once: all, or some that are spread evenly over the data.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` with ``episode``.
         window (int): frames per window.
         select (sequence of keys, optional): the entries to return. Default: all.
         pad_before (int): frames by which a window may begin before its trajectory; they repeat its first frame.
+        most (int, optional): number of windows at most. All of them take ``window`` times the memory of the data.
 
     Returns:
         TensorDictBase: ``[M, window]`` in the order of the data, with ``padded`` ``[M, window, 1]``.
@@ -243,7 +249,9 @@ def cut_windows(
         >>> cut_windows(data, 3, pad_before=1)["state"].squeeze(-1).tolist()
         [[0.0, 0.0, 1.0], [0.0, 1.0, 2.0], [1.0, 2.0, 3.0]]
     """
-    frames, padded = WindowTable.build(data, window, pad_before=pad_before).frames()
+    table = WindowTable.build(data, window, pad_before=pad_before)
+    rows = torch.arange(len(table.starts), device=table.starts.device)
+    frames, padded = table.frames(rows if most is None else spread_evenly(rows, most))
     windows = (data if select is None else data.select(*select))[frames]
     return windows.set("padded", padded.unsqueeze(-1))
 

@@ -58,8 +58,8 @@ def plan_errors(planner: StatePlanner, data: TensorDictBase, task: Task, *, seed
         still, the mean over units; ``trajectory``: the relative score per trajectory.
     """
     horizon, history = planner.horizon, max(planner.history, 2)  # constant velocity needs two frames
-    windows = cut_windows(data, history + horizon, select=["state", "episode"], pad_before=history - 1)
-    windows = spread_evenly(windows, SITUATIONS)
+    keys = ["state", "episode"]
+    windows = cut_windows(data, history + horizon, select=keys, pad_before=history - 1, most=SITUATIONS)
     states = windows["state"].float().cpu()
     past, future = planner.split_window(states[:, history - planner.history :])
     episode = windows["episode"][:, -1].cpu()

@@ -14,8 +14,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import cut_windows
+from torchrl_koap.data import WindowTable
 from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics
@@ -31,12 +32,11 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
 
     Entries ``[M]``: ``latent_action [M, m]``, ``state``, ``action``, ``has_action [M]``, ``episode [M]``.
     """
-    keys = [STATE, ACTION, HAS_ACTION, EPISODE]
-    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
     now = controller.num_past
-    parts = windows[STATE].split(4096)
-    latent = torch.cat([controller.infer(part, range(now, now + 1)).squeeze(-2) for part in parts])
-    here = windows[:, now]
+    table = WindowTable.build(data, controller.num_window_frames, pad_before=now)
+    states, parts = data[STATE], torch.arange(len(table.starts), device=table.starts.device).split(4096)
+    latent = torch.cat([controller.infer(states[table.frames(part)[0]], range(now, now + 1))[:, 0] for part in parts])
+    here = data[table.starts + now]
     entries = {"latent_action": latent} | {key: here[key] for key in (STATE, ACTION, EPISODE)}
     return TensorDict(entries | {HAS_ACTION: here[HAS_ACTION].squeeze(-1)}, [len(latent)])
 
@@ -80,13 +80,13 @@ def prediction_errors(
     above what a trajectory holds is an error.
     """
     now, length = controller.num_past, controller.num_window_frames + horizon - 1
-    windows = cut_windows(data, length, select=[STATE, EPISODE], pad_before=now)
-    fitted = torch.isin(windows[EPISODE][:, -1], fit_on)
-    known, new = (windows[STATE][rows] for rows in (fitted, ~fitted))
+    table = WindowTable.build(data, length, pad_before=now)
+    fitted = torch.isin(data[EPISODE][table.first], fit_on)
+    known, new = (rows.nonzero().squeeze(-1) for rows in (fitted, ~fitted))
     if not len(known) or not len(new):
         raise ValueError("fit_on must hold some of the trajectories and leave some out")
-    linear = _fit_linear(controller, known)
-    new = new[:: -(-len(new) // _MOST_WINDOWS)]
+    linear = _fit_linear(controller, data[STATE][table.frames(spread_evenly(known, 10 * _MOST_WINDOWS))[0]])
+    new = data[STATE][table.frames(new[:: -(-len(new) // _MOST_WINDOWS)])[0]]
     sums = {model: torch.zeros(horizon, new.shape[-1], dtype=torch.float64) for model in MODELS}
     frames = range(now, now + horizon)
     for states in new.split(1024):

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import cut_windows
@@ -20,7 +21,8 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     :func:`action_facts`. Returns what :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
     """
     keys = ["state", "action", "has_action", "episode"]
-    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
+    labelled = torch.isin(data["episode"], data["episode"][data["has_action"].squeeze(-1)])
+    windows = cut_windows(data[labelled], controller.num_window_frames, select=keys, pad_before=controller.num_past)
     mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
     # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again
     mask[:, : controller.num_past], mask[:, controller.num_past + 1 :] = False, False

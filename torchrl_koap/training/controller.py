@@ -22,12 +22,11 @@ from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
-from torchrl_koap.training.planner import augmentation
+from torchrl_koap.training.planner import FITTED, augmentation
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, with_commands
 from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
-FITTED = 50_000  # windows that statistics without labels are fitted to
 _KEYS = ["state", "action", "has_action"]
 
 
@@ -78,10 +77,11 @@ def _train_network(
     controller = build_controller(task, method, config.controller, data).to(config.run.device)
     history, shortest = controller.num_past, controller.num_window_frames
     window = max(WINDOW, shortest)
-    frames, _ = WindowTable.build(data, window, pad_before=history).frames()
-    if method.sees == "labelled":
-        frames = frames[data["has_action"][frames].squeeze(-1).any(-1)]
-    states = data["state"][spread_evenly(frames, FITTED)]
+    everything = method.sees == "all"
+    windows = cut_windows(data, window, select=_KEYS, pad_before=history, most=FITTED if everything else None)
+    if not everything:
+        windows = spread_evenly(windows[windows["has_action"].any(dim=(1, 2))], FITTED)
+    states = windows["state"]
     losses: dict[str, float] = {}
     with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
         controller.prepare(states, updates=budget if method.phases else 0, progress=count_up_to(bar))
@@ -122,7 +122,8 @@ def _train_sampler(
     sampler, section = method.build(task, config.planner), config.planner
     has_action = data["has_action"].squeeze(-1)
     seen = data[torch.isin(data["episode"], data["episode"][has_action])]
-    states = cut_windows(extrapolate_ends(seen, HORIZON - 1), WINDOW, select=["state"], pad_before=1)["state"]
+    extended = extrapolate_ends(seen, HORIZON - 1)
+    states = cut_windows(extended, WINDOW, select=["state"], pad_before=1, most=FITTED)["state"]
     sampler.fit_normalizers(states, data["action"][has_action])
     sampler.to(config.run.device)
     # at the end of a demonstration only the steps that were recorded count

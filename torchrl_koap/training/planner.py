@@ -35,6 +35,7 @@ from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner
 
 SITUATIONS, SAMPLES = 64, 4  # held out, and plans in each, that weights are chosen by
+FITTED = 50_000  # windows that statistics without labels are taken of
 RECORDED = 8192  # windows, of which the nearest one is looked for
 CHECKS = 30  # scores in a training at most
 COST = 0.05  # share of the training time that they may take
@@ -65,12 +66,11 @@ def learn_planner(
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
     extended = extrapolate_ends(data, planner.horizon - 1)
-    windows = cut_windows(extended, length, select=["state"], pad_before=1)["state"]
+    windows = cut_windows(extended, length, select=["state"], pad_before=1, most=FITTED)["state"]
     planner.fit_normalizers(windows[:, unseen:])
     planner.to(config.run.device)
     augment = augmentation(task, windows)
     score = None if held_out is None else plan_score(planner, held_out, spread_evenly(windows, RECORDED), task)
-    del windows  # as large as the data many times over
     buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
     weights = column_weights(task)
@@ -130,8 +130,9 @@ def plan_score(
     have the frames of the one given.
     """
     length = planner.history + planner.horizon
-    states = cut_windows(data, length, select=["state"], pad_before=planner.history - 1)["state"]
-    history, future = planner.split_window(spread_evenly(states, SITUATIONS))
+    past = planner.history - 1
+    states = cut_windows(data, length, select=["state"], pad_before=past, most=SITUATIONS)["state"]
+    history, future = planner.split_window(states)
     still, groups = history[:, -1:].expand_as(future), list(unit_groups(task.state_units).values())
     known = recorded[:, -planner.horizon :].to(future)
 
