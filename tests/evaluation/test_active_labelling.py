@@ -179,10 +179,19 @@ def test_no_hidden_label_has_a_say(copied_run, monkeypatch):
     assert suggest(copied_run, SuggestConfig(count=6)) == first
     seen, infer = [], active_labelling.infer_steps
     monkeypatch.setattr(
-        active_labelling, "infer_steps", lambda controller, data: seen.append(data) or infer(controller, data)
+        active_labelling, "infer_steps", lambda net, data, **options: seen.append(data) or infer(net, data, **options)
     )
     suggest(copied_run, SuggestConfig(count=1))
     assert seen[0]["action"].isnan().all(-1).equal(~seen[0]["has_action"].squeeze(-1))
+
+
+def test_of_many_steps_some_are_looked_at_and_the_scores_are_as_of_all(copied_run, monkeypatch):
+    every = suggest(copied_run, SuggestConfig(count=3))
+    monkeypatch.setattr(active_labelling, "_MOST_STEPS", 100)
+    some = suggest(copied_run, SuggestConfig(count=3))
+    scores = [[row["score"] for row in found["suggestions"]] for found in (every, some)]
+    assert scores[0] != scores[1] and scores[0] == pytest.approx(scores[1], rel=0.3)
+    assert some["suggestions"][0]["steps"] == every["suggestions"][0]["steps"]
 
 
 def test_the_choice_is_made_for_the_decoder_of_the_run(demonstrations, copied_run, tmp_path, monkeypatch):

@@ -116,7 +116,8 @@ def test_a_horizon_out_of_range_is_an_error():
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_every_preset_can_be_analysed(preset):
     torch.manual_seed(0)
-    data = blown((12, 31, 32, 33)).float()
+    data = blown((12, 31, 32, 33))
+    data = data.float().set("has_action", data["has_action"])
     controller = make_koopman_inverse_dynamics(2, 2, preset=preset, state_normalizer=Normalizer.fit(data["state"]))
     before, recorded = {name: value.clone() for name, value in controller.state_dict().items()}, data.clone()
     result = analyse_latent(controller.eval(), data, data["episode"] == 3, PARTS)

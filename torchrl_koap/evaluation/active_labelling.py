@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 
+_MOST_STEPS = 200_000  # that are looked at; neighbours resemble each other
 _FEW = 5  # trajectories that are chosen unasked
 _MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free
 
@@ -120,7 +121,9 @@ def rank_trajectories(
     precision = known.mT @ known + scale * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     covariance = torch.cholesky_inverse(torch.linalg.cholesky(precision))
     moment = rows.mT @ rows / len(rows)
-    left = {name: rows[(episode == name) & ~labelled] for name in names}
+    order = episode[~labelled].argsort(stable=True)
+    lengths = episode[~labelled].unique(return_counts=True)[1].tolist()
+    left = dict(zip(names, rows[~labelled][order].split(lengths), strict=True))
     chosen = []
     for _ in range(count):
         scores = {name: score(part, covariance, moment) for name, part in left.items()}
@@ -197,18 +200,24 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         )
     recorded = trained.data(config.dataset)
     data, report = trained.hide_labels(recorded)
-    steps = infer_steps(controller, trained.seen(data))
+    each = -(-len(data) // _MOST_STEPS)  # that one step stands for
+    steps = infer_steps(controller, trained.seen(data), every=each)
     choices = rank_trajectories(
         steps["latent_action"],
         steps[EPISODE],
         steps[HAS_ACTION],
-        penalty=penalty,
+        penalty=penalty / each,
         count=config.count,
         bias=bool(controller.action_decoder.linear.bias.any()),
     )
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
     rows = [
-        {"rank": rank, "steps": int((unlabelled == choice.episode).sum()), **asdict(choice)}
+        {
+            "rank": rank,
+            "steps": int((unlabelled == choice.episode).sum()),
+            "episode": choice.episode,
+            "score": choice.score / each,
+        }
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()

@@ -27,18 +27,19 @@ _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are rea
 
 
 @torch.no_grad()
-def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> TensorDict:
+def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase, *, every: int = 1) -> TensorDict:
     """Infers the latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
 
-    Entries ``[M]``: ``latent_action [M, m]``, ``state``, ``action``, ``has_action [M]``, ``episode [M]``.
+    Where ``every`` is above 1, one step of so many is looked at. Entries ``[M]``: ``latent_action [M, m]``, ``state``,
+    ``action``, ``has_action [M]``, ``episode [M]``.
     """
     now = controller.num_past
     table = WindowTable.build(data, controller.num_window_frames, pad_before=now)
-    states, parts = data[STATE], torch.arange(len(table.starts), device=table.starts.device).split(4096)
-    latent = torch.cat([controller.infer(states[table.frames(part)[0]], range(now, now + 1))[:, 0] for part in parts])
-    here = data[table.starts + now]
-    entries = {"latent_action": latent} | {key: here[key] for key in (STATE, ACTION, EPISODE)}
-    return TensorDict(entries | {HAS_ACTION: here[HAS_ACTION].squeeze(-1)}, [len(latent)])
+    states, rows = data[STATE], torch.arange(0, len(table.starts), every, device=table.starts.device)
+    latent = [controller.infer(states[table.frames(part)[0]], range(now, now + 1))[:, 0] for part in rows.split(4096)]
+    here = data[table.starts[rows] + now]
+    entries = {"latent_action": torch.cat(latent)} | {key: here[key] for key in (STATE, ACTION, EPISODE)}
+    return TensorDict(entries | {HAS_ACTION: here[HAS_ACTION].squeeze(-1)}, [len(rows)])
 
 
 def split_trajectories(episode: Tensor, labelled: Tensor) -> Tensor:
@@ -175,13 +176,13 @@ def analyse_latent(
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
     errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)
     result["multi_step"] = {"steps": horizon, "held_out_trajectories": held_out} | errors
-    steps = infer_steps(controller, data)
-    known = steps[HAS_ACTION]
-    if not known.all():  # the data lack labels themselves
-        steps = steps[known]
-        if len(steps[EPISODE].unique()) < 2:
-            note = "fewer than two trajectories have labels to probe latent actions with"
-            return result | {OUTSIDE_THE_BUDGET: {"note": note}}
+    known = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique()
+    if len(known) < 2:
+        note = "fewer than two trajectories have labels to probe latent actions with"
+        return result | {OUTSIDE_THE_BUDGET: {"note": note}}
+    steps = infer_steps(controller, data[torch.isin(data[EPISODE], known)])
+    steps = steps[steps[HAS_ACTION]]
+    if not data[HAS_ACTION].all():  # the data lack labels themselves
         fit_on = split_trajectories(steps[EPISODE], torch.zeros(len(steps), dtype=torch.bool))
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()
