@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from camera_sets import write_filmed
 from command_calls import fails
 from tiny_runs import koap, write_demonstrations
 
@@ -26,6 +27,12 @@ def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):
     assert koap("convert", tmp_path / "plain", "--out", tmp_path / "again", "--robot", "q1", "q2") == 0
     one, other = (load_ted(folder / "ted")[0] for folder in (arm, tmp_path / "again"))
     assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
+
+
+def test_frames_that_another_format_does_not_hold_are_named(tmp_path, capsys):
+    raw = write_filmed(tmp_path / "raw", trajectories=1)
+    assert koap("convert", raw, "--to", "npz", "--out", tmp_path / "plain") == 0
+    assert re.search("cameras +top, wrist: frames are not written", capsys.readouterr().out)
 
 
 def test_a_data_set_is_not_written_among_recordings(tmp_path, capsys):

@@ -206,7 +206,9 @@ class Convert(Command):
         for name in self._given([name for name in _DESCRIBING if name not in reading]):
             raise ValueError(f"--{name.replace('_', '-')} was given, but format {kind!r} does not hold it")
         recordings = self._read()
-        return {"written": str(write_recordings(recordings, self.out, kind)), "format": kind, **_contents(recordings)}
+        written = {"written": str(write_recordings(recordings, self.out, kind)), "format": kind}
+        left = ", ".join(recordings.cameras)
+        return written | _contents(recordings) | ({"cameras": f"{left}: frames are not written"} if left else {})
 
     def _read(self) -> Recordings:
         recordings = read_recordings(self.source, **self._given(self._reading()))
