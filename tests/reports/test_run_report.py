@@ -102,6 +102,15 @@ def test_empty_run_says_which_commands_make_the_sections(tmp_path):
     assert "img" not in page.tags and not (folder / "plots").exists()
 
 
+def test_commands_to_try_next_roll_out_in_the_environment_of_the_last_rollouts(tmp_path):
+    rates = {"success": {"rate": 0.4, "low": 0.1, "high": 0.7, "episodes": 10}}
+    evaluation = {"rates": rates, "env": "mine:Base-v0", "env_kwargs": ["name=my base"], "success_key": "is_success"}
+    (tmp_path / "eval.json").write_text(json.dumps(evaluation))
+    text, where = Page(write_report(tmp_path)).text, "--env mine:Base-v0 --env-kwargs 'name=my base' --success-key"
+    assert f"koap inspect {tmp_path} {where} is_success" in text
+    assert f"koap eval {tmp_path} --episodes 60 --seed 100 {where} is_success" in text
+
+
 def test_a_picture_that_no_evaluation_could_leave_says_why(tmp_path):
     errors = {"outside_budget": {"note": "no labels outside the budget"}}
     (tmp_path / "eval.json").write_text(json.dumps({"action_errors": errors}))

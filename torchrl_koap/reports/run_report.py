@@ -103,15 +103,25 @@ def _eval_command(run: RunFacts) -> str:
     first = mapping(episode[0]) if isinstance(episode, list) and episode else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
     options |= dict(mapping(run.evaluation.get("execution"))) | {key: evaluation.get(key) for key in _ABOUT_ENV}
+    return shlex.join([*words, *_words(options)])
+
+
+def _words(options: Mapping[str, Any]) -> list[str]:
+    """Options as words of a command, those that were given."""
+    words = []
     for key, value in options.items():
         if value not in (None, []):
             words += [f"--{key.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
-    return shlex.join(words)
+    return words
 
 
 def _filled(command: str, run: RunFacts) -> str:
+    """A command of this run; one that rolls out does so in the environment of the last rollouts."""
     places = {"run": run.folder, "data": run.config.get("dataset")}
-    return command.format(**{name: shlex.quote(str(place)) for name, place in places.items()})
+    line = command.format(**{name: shlex.quote(str(place)) for name, place in places.items()})
+    rolls_out = command.startswith(("koap eval", "koap inspect"))
+    words = _words({key: run.evaluation.get(key) for key in _ABOUT_ENV}) if rolls_out else []
+    return " ".join([line, *map(shlex.quote, words)])
 
 
 def _given(source: Mapping[str, Any], key: str) -> bool:
