@@ -78,6 +78,8 @@ def test_reset_forgets_the_episode_before():
 
 
 def test_refusals():
+    with pytest.raises(TypeError, match=r"must come from load_policy\(\) or Trained.policy\(\), got str"):
+        Agent("runs/arm")
     agent = Agent(policy_of())
     with pytest.raises(RuntimeError, match="reset.. the agent before the first act"):
         agent.act(np.zeros(2))

@@ -41,6 +41,7 @@ class Agent:
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
+        TypeError: for anything else than a policy, such as the name of its file.
         ValueError: for a seed that is no whole number >= 0; for observations of another width, batch or number of axes
             than before, that are not finite, or from which no finite action follows.
 
@@ -61,6 +62,8 @@ class Agent:
     def __init__(self, policy: PlanningPolicy, *, seed: int = 0):
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise ValueError(f"seed must be a whole number >= 0, got {seed!r}")
+        if not isinstance(policy, torch.nn.Module):  # a compiled policy is one too
+            raise TypeError(f"policy must come from load_policy() or Trained.policy(), got {type(policy).__name__}")
         self.policy, self.seed = policy, int(seed)
         example = next(policy.parameters(), torch.empty(0))
         self.device, self.dtype = example.device, example.dtype
