@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One way in for every folder of demonstrations: right numbers, right task, noise of its own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.data.ted import load_ted
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import TASKS, get_task
 
 
 def test_values_are_those_of_the_raw_episodes(tmp_path):
@@ -98,6 +100,16 @@ def test_what_cannot_be_opened(tmp_path):
     (tmp_path / "narrow" / "about.json").write_text(about)
     with pytest.raises(DataError, match="3 observation and 2 action columns, task 'avoiding' has 4 and 2"):
         open_dataset(tmp_path / "narrow", task=get_task("avoiding"))
+
+
+def test_a_registered_task_that_the_data_set_overrules_is_said(tmp_path, monkeypatch, recwarn):
+    folder = save_demonstrations(tmp_path / "arm", [np.zeros((9, 3))], control_hz=30, action_dim=2)
+    own = find_task_of(folder)
+    monkeypatch.setitem(TASKS, "arm", own)
+    assert find_task_of(folder, "arm") == own and not [item for item in recwarn if "registered" in str(item.message)]
+    monkeypatch.setitem(TASKS, "arm", replace(own, env="lab.env:Env"))
+    with pytest.warns(UserWarning, match="holds its own task 'arm', which differs from the registered one"):
+        assert find_task_of(folder, "arm") == own
 
 
 def test_a_call_without_data_names_both_commands():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shlex
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from torchrl_koap.data.ted import read_about, read_steps, stored_folder, stored_
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state, trajectory_lengths
 from torchrl_koap.files import DataError
 from torchrl_koap.lookup import nearest
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import TASKS, Task, get_task
 
 DEFAULT_TASK = "avoiding"  # what D3IL's pickles are of if nobody says so
 
@@ -96,6 +97,9 @@ def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
     own = stored_task(folder)
     if name not in (None, own.name):
         raise ValueError(f"dataset {str(dataset)!r} holds its own task {own.name!r}; --task {name} does not fit it")
+    if name is not None and TASKS.get(name, own) != own:
+        said = f"dataset {str(dataset)!r} holds its own task {name!r}, which differs from the registered one"
+        warnings.warn(f"{said}: the data set's is used; save the data again to use the other", stacklevel=2)
     return own
 
 
