@@ -29,6 +29,13 @@ def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):
     assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
 
 
+def test_without_labels_no_training_is_proposed(tmp_path, capsys):
+    (tmp_path / "raw").mkdir()
+    np.savez(tmp_path / "raw" / "a.npz", states=np.random.default_rng(0).normal(size=(30, 2)), control_hz=9.0)
+    assert koap("convert", tmp_path / "raw", "--action-dim", "1", "--out", tmp_path / "arm") == 0
+    assert re.search("next +add actions to a few recordings", capsys.readouterr().out)
+
+
 def test_frames_that_another_format_does_not_hold_are_named(tmp_path, capsys):
     raw = write_filmed(tmp_path / "raw", trajectories=1)
     assert koap("convert", raw, "--to", "npz", "--out", tmp_path / "plain") == 0

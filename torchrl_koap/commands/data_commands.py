@@ -266,6 +266,8 @@ class Validate(Command):
 
 
 def _next(folder: Path, task: Task, recordings: Recordings) -> str:
+    if not recordings.num_labels:
+        return "add actions to a few recordings and convert them again: `koap train` needs them"
     if not recordings.cameras:
         return training_call(folder, task.name)
     where = shlex.quote(str(folder))
