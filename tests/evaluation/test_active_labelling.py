@@ -111,7 +111,12 @@ def test_recordings_without_actions_are_to_get_them_first(tmp_path):
     few = {"planner": PlannerConfig(steps=2, width=8), "controller": ControllerConfig(steps=2)}
     train(TrainConfig(dataset=str(data), out=tmp_path / "run", labels=LabelConfig(episodes=(0,)), **few))
     said = suggest(tmp_path / "run", SuggestConfig(count=3))["next"]
-    assert re.match(r"add actions to recordings (1, 2|2, 1) and convert them again, then koap train --config", said)
+    first, _, then = said.partition(", then ")
+    assert re.match(r"add actions to recordings (1, 2|2, 1) and convert them again \(--name arm --out DATA\)", first)
+    more = [np.diff(frames, axis=0) for frames in states]
+    again = save_demonstrations(tmp_path / "more", states, more, control_hz=30, name="arm")
+    words = [str(again) if word == "DATA" else word for word in then.removesuffix(" NEW").split()]
+    assert koap(*words[1:], tmp_path / "new", "--quiet") == 0
 
 
 def test_the_next_training_is_as_the_first_one(copied_run, tmp_path):

@@ -221,15 +221,17 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
-    again = ["koap", "train", "--config", str(trained.folder / "config.json")]
-    again += [] if config.dataset is None else ["--dataset", str(config.dataset)]
-    for plugin in config.plugins:
-        again += ["--plugin", plugin]
-    again += [] if trained.config.labels.unit == "trajectory" else ["--labels.unit", "trajectory"]
     every = list(dict.fromkeys([*labelled, *(choice.episode for choice in choices)]))
     known = recorded[EPISODE][recorded[HAS_ACTION].squeeze(-1)].unique().tolist()
     without = [episode for episode in every if episode not in known]
-    first = f"add actions to recordings {some(without)} and convert them again, then " if without else ""
+    converted = f"convert them again (--name {shlex.quote(trained.task.name)} --out DATA)"
+    first = f"add actions to recordings {some(without)} and {converted}, then " if without else ""
+    again = ["koap", "train", "--config", str(trained.folder / "config.json")]
+    dataset = "DATA" if without else config.dataset
+    again += [] if dataset is None else ["--dataset", str(dataset)]
+    for plugin in config.plugins:
+        again += ["--plugin", plugin]
+    again += [] if trained.config.labels.unit == "trajectory" else ["--labels.unit", "trajectory"]
     return {
         "penalty": penalty,
         "labelled_steps": report.labelled_transitions,
