@@ -37,6 +37,7 @@ def test_experiments():
     left, right = draw_experiments(result, RUN).axes
     assert [bar.get_height() for bar in left.patches] == [50.0] * 3
     assert right.patches[0].get_width() == 0.002
+    assert [text.get_text() for text in right.get_legend().get_texts()] == ["from the plan"]  # what was not measured
     with pytest.raises(NothingToDraw, match="left out"):
         draw_experiments({"latent": {}}, RUN)
     with pytest.raises(NothingToDraw, match="no latent space"):

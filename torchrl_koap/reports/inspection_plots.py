@@ -94,7 +94,7 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
         ("recording_to_execution", MUTED, -0.18, "from the recording, when that is the plan"),
     ):
         values = [errors[-1] for errors in result.get(key, {}).values()]
-        right.barh(np.arange(len(values)) + offset, values, height=0.34, color=color, label=label)
+        right.barh(np.arange(len(values)) + offset, values, height=0.34, color=color, label=label if values else None)
     names = list(result["plan_to_execution"])
     right.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     right.invert_yaxis()
