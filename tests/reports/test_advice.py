@@ -48,6 +48,7 @@ FEW = rates(0.95) | {"mode_entropy": 0.3}
         ({}, []),
         (SUCCEEDS | {"summary": {"labels": {"labelled_transitions": 80}}}, []),
         ({"evaluation": rates(0.5)}, ["koap inspect {run}"]),
+        ({"evaluation": rates(0.5) | {"env": "mine:Base-v0"}}, ["koap eval {run} --out {run}_recorded"]),
         ({"evaluation": rates(0.5), "summary": {"planner_parameters": 0}}, []),  # a policy of its own
         ({"evaluation": FEW, "task": AVOIDING}, ["koap inspect {run}"]),
         ({"evaluation": FEW | {"mode_entropy": 0.8}, "task": AVOIDING}, []),

@@ -107,7 +107,7 @@ def test_commands_to_try_next_roll_out_in_the_environment_of_the_last_rollouts(t
     evaluation = {"rates": rates, "env": "mine:Base-v0", "env_kwargs": ["name=my base"], "success_key": "is_success"}
     (tmp_path / "eval.json").write_text(json.dumps(evaluation))
     text, where = Page(write_report(tmp_path)).text, "--env mine:Base-v0 --env-kwargs 'name=my base' --success-key"
-    assert f"koap inspect {tmp_path} {where} is_success" in text
+    assert f"koap eval {tmp_path} --out {tmp_path}_recorded" in text
     assert f"koap eval {tmp_path} --episodes 60 --seed 100 {where} is_success" in text
 
 

@@ -56,11 +56,10 @@ def advice(run: RunFacts) -> Iterator[Advice]:
                 "train the planner with larger disturbances (`recovery` of the task, twice the present one)",
             )
     if fails and both is None and not policy:  # nobody has looked where
-        yield Advice(
-            f"success is {_percent(success)}; whether planner or controller fails is not known",
-            "let each of them work alone",
-            "koap inspect {run}",
-        )
+        apart = ("let each of them work alone", "koap inspect {run}")
+        if run.evaluation.get("env"):  # which cannot start where a recording did
+            apart = ("compare their errors on recordings", "koap eval {run} --out {run}_recorded")
+        yield Advice(f"success is {_percent(success)}; whether planner or controller fails is not known", *apart)
     labels = number(mapping(run.summary.get("labels")).get("labelled_transitions"))
     if fails and not planner_fails and labels is not None and labels < FEW_LABELS and str(method).startswith("koap"):
         yield Advice(

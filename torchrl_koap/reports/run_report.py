@@ -119,7 +119,7 @@ def _filled(command: str, run: RunFacts) -> str:
     """A command of this run; one that rolls out does so in the environment of the last rollouts."""
     places = {"run": run.folder, "data": run.config.get("dataset")}
     line = command.format(**{name: shlex.quote(str(place)) for name, place in places.items()})
-    rolls_out = command.startswith(("koap eval", "koap inspect"))
+    rolls_out = "--episodes" in command or command.startswith("koap inspect")
     words = _words({key: run.evaluation.get(key) for key in _ABOUT_ENV}) if rolls_out else []
     return " ".join([line, *map(shlex.quote, words)])
 
