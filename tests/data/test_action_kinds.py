@@ -116,6 +116,16 @@ def test_targets_in_other_units_than_their_columns_are_raw():
     assert not warnings(PATHS, offset, action_kind="absolute", targets=JOINTS[:2])
 
 
+def test_a_switch_beside_targets_is_to_be_brought_to_its_column():
+    """Of another kind, it would leave the others without targets."""
+    paths = [40 * path + 90 for path in PATHS]
+    steps = [np.stack([path[1:, 0], path[1:, 1] > 90], -1) for path in paths]
+    (said,) = warnings(paths, steps, action_kind="absolute", targets=JOINTS[:2])
+    assert said.endswith("bring them to the unit of their columns, as 0 and 1 of a gripper to its widths")
+    scaled = [steps * (1, 80) + (0, 50) for steps in steps]
+    assert not warnings(paths, scaled, action_kind="absolute", targets=JOINTS[:2])
+
+
 def test_normalised_targets_of_columns_in_degrees_are_raw_however_they_are_declared():
     """They are small, so they lie nearer to the changes than to the columns."""
     paths = [40 * path + 90 for path in PATHS]

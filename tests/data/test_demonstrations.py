@@ -116,7 +116,7 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
             {"action_kind": "absolute"},
             r"have 2 columns, the robot's columns are 4: name in targets \(--targets\) the col",
         ),
-        ({"action_kind": "raw", "targets": [0, 1]}, "targets .* are for action_kind .* 'absolute'"),
+        ({"action_kind": "raw", "targets": [0, 1]}, "targets .* are for action_kind .* 'absolute' of all actions"),
         ({"action_kind": "absolute", "targets": [0, 3], "command": [3]}, "column 'cup_y' is a target and a command"),
         ({"action_units": ["m"]}, "action_units .* names 1 columns, there are 2"),
         ({"state_units": ["m"]}, "state_units .* names 1 columns, there are 4"),

@@ -162,10 +162,11 @@ def _targets_far_away(labels: _Labels, task: Task, likely: Mapping[str, LikelyKi
     if far:
         kinds = {name: likely[name].kind for name in far}
         targets = " and other --targets" if "absolute" in kinds.values() else ""
-        yield (
-            f"absolute actions lie away from their targets on average, {some([*far.values()])}: convert again with"
-            f" --action-kind {_asked(task, kinds)}{targets}"
-        )
+        cure = f"convert again with --action-kind {_asked(task, kinds)}{targets}"
+        # beside raw ones, the other actions would have no targets
+        if len(far) < task.action_dim and set(kinds.values()) == {"raw"}:
+            cure = "bring them to the unit of their columns, as 0 and 1 of a gripper to its widths"
+        yield f"absolute actions lie away from their targets on average, {some([*far.values()])}: {cure}"
 
 
 def _readings(labels: _Labels, task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -303,7 +303,7 @@ def _targets(
     """State columns that absolute actions are the targets of."""
     if set(kinds) != {"absolute"}:
         if given is not None:
-            problems.append(f"{option('targets')} are for {option('action_kind')} 'absolute'")
+            problems.append(f"{option('targets')} are for {option('action_kind')} 'absolute' of all actions")
         return []
     columns = list(own) if given is None else _columns(given, names, "targets", problems)
     if len(columns) != len(kinds):
