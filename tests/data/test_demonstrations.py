@@ -55,6 +55,8 @@ def test_commands_are_never_seen_by_what_learns():
     data, task = make_demonstrations(STATES, ACTIONS, control_hz=20, state_names=NAMES, command=["cup_x", "cup_y"])
     assert task.command == "command" and task.state_names == ("q1", "q2") and task.robot == (0, 1)
     assert task.state_of(data["observation"]).shape[-1] == 2
+    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, command=[0, 1], robot=[3])
+    assert task.robot == (1,)  # of the state, which lacks the commands
 
 
 def test_columns_of_one_role_may_lie_apart():
@@ -82,8 +84,9 @@ def test_raw_actions_are_about_no_column():
     assert not task.targets and not task.delta_actions and task.action_rule is None
     assert action_facts(task, (0, 1)) == {"axes": [], "guessed": True, "alike": False}
     assert commanded_columns(task) is None
-    _, mixed = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=["delta", "raw"], robot=[0, 1])
-    assert action_facts(mixed, (0, 1))["alike"]
+    for kinds in (["delta", "raw"], "absolute"):
+        _, other = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds, robot=[0, 1])
+        assert action_facts(other, (0, 1))["alike"]
     assert resolve(TrainConfig(out="run"), task).controller.preset == "absolute"  # centred, read off the present frame
     labels = data["action"][data["has_action"].squeeze(-1)]
     assert command_ranges(task, data) == [[float(x.min()), float(x.max())] for x in labels.T]
@@ -172,6 +175,10 @@ def test_an_offset_is_subtracted_in_float64_and_stored(offset, tmp_path):
     again = read_recordings(save_demonstrations(tmp_path / "far", far, targets, **absolute))
     np.testing.assert_allclose(again.states[0], far[0], rtol=0, atol=1e-5)
     np.testing.assert_allclose(again.actions[0], targets[0], rtol=0, atol=1e-5)
+
+
+def test_episodes_may_last_longer_than_the_longest_demonstration():
+    assert make_demonstrations([STATES[0][:12], *STATES[1:]], action_dim=2, control_hz=20)[1].max_steps == 45
 
 
 def test_small_offsets_stay():

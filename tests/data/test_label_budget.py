@@ -175,10 +175,12 @@ def test_commands_hide_with_the_actions():
 def test_a_smaller_budget_takes_the_commands_of_labels_away_too(told):
     whole, _ = LabelBudget(fraction=1.0).apply(demonstrations(), command=COMMAND, tell_commands=True)
     assert not whole["label_command"].isnan().any()
-    less, _ = LabelBudget(count=1).apply(whole, command=COMMAND, tell_commands=told)
+    less, _ = LabelBudget(count=3, unit="transition").apply(whole, command=COMMAND, tell_commands=told)
     assert ("label_command" in less.keys()) == told
     if told:
         assert torch.equal(~less["label_command"].isnan().any(-1), less["has_action"].squeeze(-1))
+        again, _ = LabelBudget(fraction=1.0).apply(less, command=COMMAND, tell_commands=True)
+        same_bits(again, less)  # what is blank in the observation by now is still told
 
 
 @pytest.mark.parametrize("unit", UNITS)

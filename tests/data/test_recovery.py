@@ -131,7 +131,7 @@ def test_observed_frames_move_along_the_way_to_the_nearest_other_window_and_the_
         nearest = min(others, key=lambda other: float((windows[other, 1] - present).norm()))
         way = windows[nearest, 1] - present
         share = float(shift[index, 1] @ way / (way @ way))
-        assert 0 <= share <= 0.6
+        assert 0 < share <= 0.6
         torch.testing.assert_close(shift[index, 1], share * way, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(shift[:, 0], shift[:, 1])  # both observed frames alike: its velocity stays
     for step in range(1, 15):

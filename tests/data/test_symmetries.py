@@ -63,7 +63,11 @@ RECOVERY = functools.partial(RecoveryAugmentation, 0.1, columns=[0, 1])
 
 @pytest.mark.parametrize(
     ("augment", "option"),
-    [(PLANAR, "turned_actions"), (RECOVERY, "moved_by"), (functools.partial(RECOVERY, under_way=True), "moved_by")],
+    [
+        (PLANAR, "turned_actions"),
+        (RECOVERY, "moved_by"),
+        (functools.partial(RECOVERY, under_way=True, history=3), "moved_by"),
+    ],
     ids=["turned", "recovery", "recovery under way"],
 )
 def test_actions_that_move_the_state_stay_its_differences(augment, option):

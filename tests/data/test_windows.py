@@ -61,17 +61,16 @@ def test_some_windows_are_spread_evenly_over_all():
     assert (cut_windows(data, 4, pad_before=1, most=99) == every).all()
 
 
-@pytest.mark.parametrize("padded", [False, True])
-def test_samples_are_the_stored_rows(padded):
+@pytest.mark.parametrize("options", [{}, {"pad_before": 1}, {"pad_after": 4}, {"pad_before": 1, "pad_after": 4}])
+def test_samples_are_the_stored_rows(options):
     data = demonstrations()
-    options = {"pad_before": 1, "pad_after": 4} if padded else {}
     buffer = make_window_buffer(data, 16, 64, **options)
     for key, value in buffer.sample().items(True, True):
         assert value.shape[:2] == (64, 16), key
     batch, info = buffer.sample(return_info=True)
     for key in data.keys(True, True):
         assert torch.equal(batch[key], data[key][info["index"]])
-    assert isinstance(buffer, TensorDictReplayBuffer) == padded
+    assert isinstance(buffer, TensorDictReplayBuffer) == ("padded" in batch.keys()) == bool(options)
 
 
 @settings(max_examples=40, deadline=None)
@@ -88,6 +87,14 @@ def test_labelled_windows_by_the_definition(seed, number, before, after, counted
         inner = [begin + frame for frame in range(counted, 5 - counted // 2)]
         expected.append(any(first <= row and row + 1 <= last and bool(has_action[row]) for row in inner))
     assert table.labelled.tolist() == expected
+
+
+def test_labels_on_inner_frames_count_unasked():
+    data = demonstrations((16, 16))
+    data["has_action"] = torch.isin(data["step_count"], torch.tensor([0, 15])).unsqueeze(-1)
+    assert not WindowTable.build(data, 16).labelled.any()
+    data["has_action"][[1, 30]] = True
+    assert WindowTable.build(data, 16).labelled.all()
 
 
 def test_wrong_options():

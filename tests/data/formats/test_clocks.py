@@ -27,6 +27,7 @@ def test_the_usual_step_is_the_rate():
         (TIME * 1e3, None, "says 0.03 frames per second if it is in seconds: name it time_ms"),
         (-TIME, None, r"do not increase, or are missing, in column 'time' of 1 of 2 .*: 1.csv \(frame 1\)"),
         (np.r_[TIME, 9.0], None, r"1.csv: frames are 0.03333 to 7.033 s apart \(frame 59\); .* pass resample .* 30"),
+        (np.insert(TIME, 9, 0.29), None, r"1.csv: frames are 0.01 to 0.03333 s apart"),
         (TIME, 20, "says 30 frames per second, the source declares 20: pass control_hz"),
     ],
 )

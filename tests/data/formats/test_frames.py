@@ -57,6 +57,9 @@ def test_frames_on_a_clock_of_their_own_are_matched(tmp_path):
     np.save(tmp_path / "run_0" / "wrist.npy", frames)
     np.save(tmp_path / "run_0" / "wrist_times.npy", times)
     np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
+    table = dict(np.load(tmp_path / "run_0.npz"))
+    np.savez(tmp_path / "run_0.npz", time_ms=1e3 * table.pop("timestamp"), **table)
+    np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
     np.save(tmp_path / "run_0" / "wrist_times.npy", times[:9])
     with pytest.raises(DataError, match=r"wrist_times.npy is for 18 frames and a clock, it has \[9\] times"):
         read_recordings(tmp_path)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from torchrl_koap.data import make_demonstrations, make_recordings
+from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.files import DataError
 
@@ -62,6 +63,30 @@ def test_leaps_are_not_filled():
     apart = np.abs(np.exp(1j * found[:, 0]) - np.exp(1j * (3 * new + 1)))
     assert apart.max() < 3 / 40 + 1e-9 and np.abs(found[:, 0]).max() <= np.pi  # half a recorded step
     np.testing.assert_allclose(np.abs(found[:, 1]), np.abs(np.cos(new)), atol=0.03)
+
+
+def test_a_switch_is_that_of_the_nearest_frame():
+    found = resampled(recorded(TIME > 0.01), 30).states[0][:, 0]
+    np.testing.assert_array_equal(found, np.arange(61) > 0)  # 0.033 s is nearer to 0.05 s than to 0 s
+
+
+def test_an_action_a_little_late_is_that_of_its_step():
+    times = TIME + 0.004 * (np.arange(41) % 2)
+    found = resampled(recorded(TIME, times=times, actions=np.arange(40.0)[:, None]), 20, "absolute", times=[times])
+    np.testing.assert_array_equal(found.actions[0][:, 0], np.arange(40))
+
+
+def test_a_gap_shorter_than_two_new_steps_is_none():
+    times = TIME + 0.3 * (TIME > 0.98)
+    assert len(resampled(recorded(TIME, times=times), 4, times=[times]).states) == 1
+    assert len(resampled(recorded(TIME, times=times), 10, times=[times]).states) == 2
+
+
+def test_cameras_show_the_nearest_frame_behind_a_gap_too():
+    times = TIME + 3 * (TIME > 0.98)
+    recordings = recorded(TIME, times=times, cameras={"top": [Clip("top.npy", tuple(range(100, 141)))]})
+    before, behind = resampled(recordings, 10, times=[times]).cameras["top"]
+    assert before.numbers == tuple(range(100, 120, 2)) and behind.numbers == tuple(range(120, 141, 2))
 
 
 def test_gaps_end_trajectories_and_are_told():
