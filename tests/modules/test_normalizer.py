@@ -37,13 +37,14 @@ def test_standard_and_rms(dtype):
 
 
 def test_a_column_that_rarely_moves_is_scaled_by_how_far_it_moves_then():
-    values = torch.full((20_000, 2), 5.0)
+    values = torch.tensor([5.0, 5.0, 0.0]).repeat(20_000, 1)
     values[::20, 0] = 5.0 + 3.0 * torch.tensor([1.0, -1.0]).repeat(500)
     values[::40, 1] += 2.0
     values[1::40, 1] += 0.001  # at rest, up to noise
+    values[::20, 2] = 0.003  # in another unit
     normalizer = Normalizer.fit(values, mode="moving")
-    torch.testing.assert_close(normalizer.offset, torch.tensor([5.0, 5.0]))
-    torch.testing.assert_close(normalizer.scale, torch.tensor([3.0, 2.0]))
+    torch.testing.assert_close(normalizer.offset, torch.tensor([5.0, 5.0, 0.0]))
+    torch.testing.assert_close(normalizer.scale, torch.tensor([3.0, 2.0, 0.003]))
 
 
 @settings(max_examples=50, deadline=None)

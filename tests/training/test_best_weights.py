@@ -66,9 +66,12 @@ def test_a_score_that_still_falls_ends_nothing(tmp_path):
 def test_without_a_score_the_last_weights_are_kept(tmp_path):
     """Where nothing moves on the held-out trajectories there is none: weights of before the training must not stay."""
     curve = Curve(*[float("nan")] * 10)
-    _, best, _ = training(tmp_path, curve)
+    loss, best, _ = training(tmp_path, curve)
     assert len(curve.seen) == 10 and best.step.item() == 100
-    assert all(torch.equal(value, best.network.state_dict()[name]) for name, value in curve.seen[-1].items())
+    average, kept = loss.target_network_params.flatten_keys("."), best.network.state_dict()
+    assert average.keys() == kept.keys() == curve.seen[-1].keys()
+    for name, value in curve.seen[-1].items():
+        assert torch.equal(value, kept[name]) and torch.equal(value, average[name]), name
 
 
 def test_a_missing_score_replaces_no_score(tmp_path):

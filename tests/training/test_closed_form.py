@@ -1,13 +1,16 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The closed-form fit of a finished controller: which labels it sees, and how often."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small_networks import controller_of
 
 from torchrl_koap.data import LabelBudget, cut_windows, flatten_trajectories, select_state
 from torchrl_koap.modules.ridge import INPUT_NOISE, ridge
-from torchrl_koap.training.closed_form import fit_closed_form
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 
 LENGTHS = (25, 18, 31, 40, 22)
 CONTROLLERS = [("koap", "default"), ("koap", "paper"), ("koap", "absolute"), ("linear", "default")]
@@ -109,3 +112,12 @@ def test_no_motion_decodes_to_no_action_only_where_zero_is_zero(preset, through_
     fit_closed_form(controller, labelled)
     bias = controller.action_decoder.linear.bias
     assert (bias == 0).all() == through_zero
+
+
+def test_columns_are_guessed_for_robots_without_a_simulator_alone():
+    assert action_facts(get_task("avoiding"), range(4)) == {"axes": [0, 1], "guessed": False, "alike": True}
+    stacking = get_task("stacking")
+    assert action_facts(stacking, range(stacking.state_dim))["axes"] == []
+    robot = replace(stacking, env=None, expert=None)
+    assert action_facts(robot, range(8)) == {"axes": [*range(8)], "guessed": True, "alike": True}
+    assert action_facts(robot, range(7))["axes"] == []

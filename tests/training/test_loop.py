@@ -314,6 +314,16 @@ def test_a_gradient_far_longer_than_those_before_is_shortened():
     assert x.grad.isnan().all()  # the loop tells of it
 
 
+def test_a_hundred_gradients_tell_the_usual_length():
+    x = nn.Parameter(torch.zeros(1))
+    for usual, wanted in ((3.0, 0.25), (0.0, 1.0)):
+        limit = OutlierLimit([x], decay=0.999)
+        for length in [usual] * SETTLED + [20 * usual]:
+            x.grad = torch.full_like(x, length)
+            factor = limit().item()
+        assert factor == pytest.approx(wanted)
+
+
 @pytest.mark.parametrize("updates, averaged", [(8, [4, 8]), (6, [4, 6]), (1, [1])])
 def test_the_average_is_stepped_every_fourth_update_and_at_the_end(updates, averaged):
     class Average:
@@ -324,14 +334,8 @@ def test_the_average_is_stepped_every_fourth_update_and_at_the_end(updates, aver
             self.seen.append(len(drawn))
 
     drawn, average = [], Average()
-    train_phase(
-        "x",
-        Quadratic(),
-        lambda: drawn.append(1) or constant()(),
-        num_steps=updates,
-        learning_rate=0.1,
-        target_update=average,
-    )
+    options = {"num_steps": updates, "learning_rate": 0.1, "target_update": average}
+    train_phase("x", Quadratic(), lambda: drawn.append(1) or constant()(), **options)
     assert average.seen == averaged
 
 

@@ -189,6 +189,14 @@ def steps_of(run, phase):
     return load_tensors(run / "checkpoints" / f"{phase}.safetensors")[1]["step"]
 
 
+def test_a_policy_without_plans_has_averaged_weights(whole_run):
+    made = load_tensors(whole_run("dp") / "controller.safetensors")[0]
+    saved = load_tensors(whole_run("dp") / "checkpoints" / "policy.safetensors")[0]
+    name = "denoiser.first.weight" if "denoiser.first.weight" in made else "denoiser.head.3.weight"
+    assert torch.equal(made[name], saved[f"loss.target_network_params.{name}"])
+    assert not torch.equal(made[name], saved[f"loss.network_params.{name}"])
+
+
 def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):
     states = [np.random.default_rng(index).normal(size=(40, 3)).cumsum(0) for index in range(4)]
     actions = [np.diff(states[0][:, :2], axis=0), None, None, None]

@@ -8,9 +8,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap import PlannerConfig, fit, make_demonstrations
-from torchrl_koap.data import cut_windows, flatten_trajectories, select_state
+from torchrl_koap import PlannerConfig, TrainConfig, fit, make_demonstrations, train
+from torchrl_koap.data import cut_windows, flatten_trajectories, save_demonstrations, select_state
 from torchrl_koap.modules import MLPDenoiser, StatePlanner
+from torchrl_koap.objectives import PlannerLoss
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import planner as planner_file
 from torchrl_koap.training.planner import augmentation, check_interval, column_weights, plan_score
@@ -100,6 +102,42 @@ def test_of_much_data_some_windows_are_as_good_as_all(monkeypatch):
     monkeypatch.setattr(planner_file, "FITTED", 300)
     torch.testing.assert_close(scale(), every, rtol=0.1, atol=0)
     assert taken == [18 * 58, 300]  # two trajectories are held out
+
+
+@pytest.mark.parametrize(
+    ("held_out", "kept"), [(0.3, "best.network"), (0.0, "loss.target_network_params")], ids=["best", "last"]
+)
+def test_averaged_weights_are_kept_and_of_these_the_best(held_out, kept, tmp_path, monkeypatch):
+    monkeypatch.setattr(planner_file, "check_interval", lambda *_: 2)
+    paths = [np.random.default_rng(seed).normal(size=(30, 2)).cumsum(0) for seed in range(4)]
+    folder = save_demonstrations(tmp_path / "arm", paths, [path[1:] - path[:-1] for path in paths], control_hz=10)
+    options = {"steps": 10, "batch_size": 8, "width": 8, "held_out": held_out, "learning_rate": 10.0}  # soon spoiled
+    train(TrainConfig(out=tmp_path / "run", dataset=str(folder), method="linear", planner=PlannerConfig(**options)))
+    weights = load_tensors(tmp_path / "run" / "planner.safetensors")[0]
+    saved, name = load_tensors(tmp_path / "run" / "checkpoints" / "planner.safetensors")[0], "denoiser.last.weight"
+    entries = [entry for entry in saved if entry.endswith(name) and torch.equal(saved[entry], weights[name])]
+    assert entries == [f"{kept}.{name}"]
+
+
+def test_a_planner_of_one_frame_plans_from_all_states_that_have_a_next_one(monkeypatch):
+    batches, forward = [], PlannerLoss.forward
+    monkeypatch.setattr(PlannerLoss, "forward", lambda self, batch: batches.append(batch) or forward(self, batch))
+    lines = [np.arange(41.0)[:, None]] * 2
+    data, _ = make_demonstrations(lines, [np.ones((40, 1))] * 2, control_hz=10)
+    options = {"steps": 2, "frames": 1, "width": 8, "batch_size": 512, "held_out": 0.0}
+    planner = fit(data, method="linear", planner=options, progress=False).planner
+    assert planner.condition_normalizer.offset == planner.condition_normalizer.scale == 19  # from states 0 to 38
+    torch.testing.assert_close(planner.plan_normalizer.offset.flatten(), torch.arange(1.0, 15))
+    states = torch.cat([batch["state"] for batch in batches])
+    assert (states.diff(dim=1) == 1).all() and states[:, 0].unique().tolist() == [*range(39)]
+
+
+def test_actions_turn_with_the_scene_and_lead_back_with_the_robot():
+    task, states = get_task("aligning"), torch.rand(20, 16, get_task("aligning").state_dim)
+    windows = TensorDict({"state": states, "action": states[..., :3].diff(dim=1, append=states[:, -1:, :3])}, [20])
+    moved = augmentation(task, states, actions=True)(windows.clone())
+    torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :3].diff(dim=1))
+    assert not torch.allclose(moved["action"], windows["action"])
 
 
 def test_the_robot_is_shifted_by_its_usual_step_in_any_unit_unless_the_task_says_how_far():

@@ -15,6 +15,7 @@ from torchrl_koap.training import response as response_fit
 from torchrl_koap.training.response import (
     fit_response,
     labelled_steps,
+    prediction_errors,
     tracked_columns,
 )
 
@@ -59,6 +60,14 @@ def test_stretches_with_hidden_commands_have_offsets_of_their_own():
     assert found["held_out_error"] < 1e-4
     # the coordinates are nearly dependent: what counts is the answer to a command
     torch.testing.assert_close(response.double().impulse_matrix(8), a_system().impulse_matrix(8), atol=5e-3, rtol=0)
+
+
+def test_the_error_is_that_of_stretches_left_out():
+    data, response = recordings(episodes=5, length=7, noise=0.01), columns()
+    found = fit_response(response, data)
+    steps, changes = labelled_steps(response, data)
+    stretches = response_fit._stretches(response, data, steps, changes)
+    assert found["held_out_error"] > 2 * prediction_errors(response, stretches).square().mean().sqrt()
 
 
 def test_absolute_commands_give_the_same_model():

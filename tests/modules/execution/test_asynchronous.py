@@ -80,6 +80,18 @@ def test_what_is_executed_meanwhile_binds_the_new_plan():
     agent.close()
 
 
+def test_a_plan_that_takes_long_is_bound_by_whole_steps_and_never_throughout():
+    agent = make_agent()
+    assert [agent._steps(seconds) for seconds in (0.0, 0.02, 0.05)] == [1, 1, 2]  # of 33 ms
+    agent.reset(np.zeros(2))
+    agent._delay = 50
+    for step in range(3):
+        agent.act(np.array([step, 0.0]))
+    agent._pending.result(10)
+    assert agent.policy.planner.known[1].shape == (1, 5, 2)  # of six states
+    agent.close()
+
+
 def test_the_first_plan_is_made_before_the_clock_runs():
     agent = make_agent()
     agent.reset(np.array([7.0, 0.0]))

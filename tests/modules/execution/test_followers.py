@@ -12,7 +12,7 @@ from torchrl_koap.modules import (
     blend_plan,
     make_policy,
 )
-from torchrl_koap.modules.execution.followers import InverseDynamicsFollower, command_rest
+from torchrl_koap.modules.execution.followers import InverseDynamicsFollower, command_rest, remaining_plan
 from torchrl_koap.modules.windows import StateReader
 from torchrl_koap.tasks.action_rules import ActionRule
 
@@ -47,13 +47,17 @@ def test_the_last_word_on_actions_sees_the_whole_window():
         seen.append(states)
         return actions + 0.5
 
-    follower = InverseDynamicsFollower(EchoController(), reads=StateReader((0, 1)), action_rule=rule)
-    states, plan = (
-        torch.tensor([[[3.0, 7.0], [4.0, 7.0]]]),
-        CountingPlanner().sample(torch.tensor([[[3.0, 7], [4, 7]]])),
-    )
-    assert follower(states, states, plan)[0, 0, :2].tolist() == [3.5, 4.5]
-    assert seen[0][0, :, 0].tolist() == [3, 4] + [4 + 1000.0 * k for k in range(1, 7)]  # plans as they were made
+    follower = InverseDynamicsFollower(EchoController(), reads=StateReader((1, 0)), action_rule=rule)
+    states = torch.tensor([[[3.0, 7.0], [4.0, 8.0]]])
+    plan = CountingPlanner().sample(states + 5.0)  # of a robot that is elsewhere by now
+    assert follower(states, states, plan)[0, 0, :2].tolist() == [7.5, 8.5]
+    assert seen[0][0, :, 0].tolist() == [3, 4] + [9 + 1000.0 * k for k in range(1, 7)]  # plans as they were made
+
+
+def test_the_last_state_stays_when_a_plan_is_over():
+    plan = torch.arange(8.0).reshape(2, 4, 1)
+    assert remaining_plan(plan, 2)[:, :, 0].tolist() == [[2, 3, 3, 3], [6, 7, 7, 7]]
+    assert remaining_plan(plan, torch.tensor([0, 9]))[:, :, 0].tolist() == [[0, 1, 2, 3], [7, 7, 7, 7]]
 
 
 @torch.no_grad()

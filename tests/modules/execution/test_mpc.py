@@ -55,6 +55,7 @@ def test_bad_columns_and_intervals_are_refused():
         ResponseModel([0, 1], [0], [0, 1])
     with pytest.raises(ValueError, match="look_ahead must be at least 2, got .*: lower replan_interval"):
         policy_of(replan_interval=14)
+    assert [policy_of(replan_interval=steps).follower.look_ahead for steps in (1, 13)] == [14, 2]
 
 
 def mpc_of(response=None, look_ahead=11, **options):

@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Components in units of the noise, coordinates along curved surfaces, and a lifting that finds their number."""
 
+import copy
+
 import pytest
 import torch
 
@@ -107,6 +109,16 @@ class TestCompactLifting:
         error = lifting.reconstruction_error(lifting.encode(windows), windows).mean()
         assert error < 0.3 * lifting.components(windows).square().mul(lifting.components.weights).mean()
 
+    def test_what_is_learned_before_the_losses_depends_on_the_data_alone(self):
+        windows = embedded(turning(100).sin())
+        lifting = CompactLifting(24, 2)
+        lifting.prepare(windows)
+        same = copy.deepcopy(lifting)
+        for seed, each in enumerate((lifting, same)):
+            torch.manual_seed(seed)
+            each.pretrain(windows, 3)
+        assert all(torch.equal(value, same.state_dict()[name]) for name, value in lifting.state_dict().items())
+
     def test_the_error_counts_components_by_how_far_they_stand_out(self):
         windows = embedded(turning(bodies=2).sin())
         lifting = CompactLifting(24, 2)
@@ -138,8 +150,9 @@ class TestCompactLifting:
             CompactLifting(24, 2).encode(torch.randn(3, 25))
 
     def test_narrow_states_are_kept_as_they_are(self):
-        model = make_koopman_inverse_dynamics(4, 2, preset="semi_supervised")
-        assert model.lifting.keeps_state
+        for columns, kept in ((8, True), (9, False)):
+            model = make_koopman_inverse_dynamics(columns, 2, preset="semi_supervised")
+            assert model.lifting.keeps_state == kept
 
 
 def uniform(*shape, seed=0):

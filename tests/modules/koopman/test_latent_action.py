@@ -3,14 +3,24 @@
 
 import math
 
+import pytest
 import torch
 
-from torchrl_koap.modules import LatentActionFourier
+from torchrl_koap.modules import LatentActionFourier, LatentActionLSTM, LatentActionMLP
 
 
 def windows(*batch, dtype=torch.float32, num_frames=16, d=2):
     generator = torch.Generator().manual_seed(2)
     return torch.randn(*batch, num_frames, d, generator=generator, dtype=torch.float64).cumsum(-2).to(dtype)
+
+
+@pytest.mark.parametrize("kind", [LatentActionLSTM, LatentActionMLP])
+def test_every_frame_that_is_read_counts(kind):
+    torch.manual_seed(0)
+    network = kind(2, 4, num_past=1, look_ahead=(4, 8))
+    read = network.gather(windows(3)).requires_grad_()
+    network.infer(read).square().sum().backward()
+    assert read.shape == (3, 16, 4, 2) and (read.grad.abs().sum(-1) > 0).all()
 
 
 # Fourier observables
