@@ -6,10 +6,14 @@ import re
 
 import pytest
 from tiny_runs import koap
+from torchrl.envs import TransformedEnv
 
+from torchrl_koap.evaluation import EvalConfig, latency
+from torchrl_koap.evaluation.closed_loop import choose_contexts, find_environment
 from torchrl_koap.evaluation.data_errors import AFTER
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.runs.weights import load_tensors
+from torchrl_koap.tasks import get_task
 
 
 def test_what_an_evaluation_writes(copied_run, capsys):
@@ -63,3 +67,39 @@ def test_a_film_that_cannot_be_made_is_left_out(copied_run, monkeypatch):
     assert "film.gif was not made" in (copied_run / "index.html").read_text()
     made = {file.name for file in (copied_run / "plots").iterdir()}
     assert {"rollouts.gif", "rollouts.png"} <= made and "film.gif" not in made
+
+
+def test_rollouts_of_a_context_follow_each_other():
+    numbers, places = choose_contexts(get_task("aligning"), EvalConfig(episodes=5, rollouts_per_context=2))
+    assert numbers == [0, 0, 1, 1, 2] and (places[0] == places[1]).all() and (places[1] != places[2]).any()
+
+
+@pytest.mark.parametrize(("name", "noisy"), [("avoiding", False), ("po_sorting", True)])
+def test_policies_are_judged_with_the_noise_of_the_task(name, noisy):
+    env = find_environment(get_task(name), EvalConfig()).make_env(1)
+    assert isinstance(env, TransformedEnv) == noisy
+
+
+def test_a_step_after_a_late_one_is_not_late(monkeypatch):
+    class Clock:
+        now = 0.0
+
+        def perf_counter(self):
+            return self.now
+
+        def sleep(self, seconds):
+            self.now += seconds
+
+    class Slow:
+        took = iter((0.01, 0.26, 0.01, 0.01))
+
+        def reset(self):
+            pass
+
+        def act(self, observation):
+            clock.sleep(next(self.took))
+
+    clock = Clock()
+    monkeypatch.setattr(latency, "time", clock)
+    found = latency.run_control_loop(Slow(), range(4), control_hz=10.0)
+    assert found["late_steps"] == 1 and found["max"] == pytest.approx(260) and found["step_ms"] == 100

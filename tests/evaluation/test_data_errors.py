@@ -12,10 +12,14 @@ from torchrl_koap.evaluation.data_errors import (
     AFTER,
     BEFORE,
     episodes_outside,
+    errors_left_out,
+    errors_of_chunks,
     errors_outside_budget,
     first_actions,
     plan_errors,
+    summarise_errors,
 )
+from torchrl_koap.modules import DiffusionPolicy, MLPDenoiser
 from torchrl_koap.tasks import Action, Task, get_task
 
 ARM = Task(
@@ -25,7 +29,7 @@ ARM = Task(
     actions={"dq": Action("rad")},
     position="joint",
 )
-LENGTHS = (25, 18, 31, 13, 22, 9)  # the last one is too short
+LENGTHS = (25, 18, 31, 13, 22, 9, AFTER)  # the last two are too short
 
 
 def hidden_action_errors(controller, data, labelled):
@@ -124,6 +128,18 @@ def test_a_linear_world_is_predicted_by_the_ridge():
     assert rmse(tensors["predicted"], tensors["true"]) == pytest.approx(row["controller"], rel=1e-5)
 
 
+def test_a_trajectory_left_out_is_judged_by_the_others_alone():
+    data = counting((30, 40))
+    data["action"] = torch.where(data["episode"].unsqueeze(-1) == 0, 1.0, -1.0).expand(-1, 2).clone()
+    controller = controller_of("linear", data)
+    before = {name: value.clone() for name, value in controller.state_dict().items()}
+    found = errors_left_out(controller, data, get_task("avoiding"), (0, 1))
+    assert found["labels"] == 70 - 2 * AFTER and found["trajectories"] == 2
+    assert [found["unit"][0][name] for name in ("controller", "ridge", "mean_action")] == pytest.approx([2.0] * 3)
+    after = controller.state_dict()
+    assert all(torch.allclose(value, after[name], equal_nan=True) for name, value in before.items())
+
+
 def test_an_action_that_never_changes_is_commanded_right_whatever_is_decoded():
     data = counting()
     data["action"][:, 1] = 7.0
@@ -182,3 +198,36 @@ def test_both_ways_of_a_fork_are_no_mistake_and_units_stay_apart():
 
 def test_a_planner_that_sees_one_frame_is_compared_with_constant_velocity_too():
     assert plan_errors(Planner(1.0, history=1), forked(), ARM) == plan_errors(Planner(1.0), forked(), ARM)
+
+
+class Jumping(Planner):
+    """Draws a sign for every step of a plan."""
+
+    def sample(self, history, noise):
+        sign = torch.where(noise[:, :, :1] > 0, 1.0, -1.0) * torch.tensor([1.0, 0.0])
+        return history[:, -1:] + sign * self.size * torch.arange(1.0, 5.0)[:, None]
+
+
+def test_the_best_plan_is_one_plan_and_the_seed_draws_them():
+    found, again, other = (plan_errors(Jumping(1.0), forked(), ARM, seed=seed) for seed in (0, 0, 1))
+    best = found["unit"][0]["planner"]["best_of"]
+    assert max(best["per_step"]) < 0.01 and best["overall"] > 0.2
+    assert found == again != other
+
+
+def test_trajectories_are_compared_in_one_unit():
+    models = {"mean_action": torch.tensor([[1.0], [3.0]]), "controller": torch.ones(2, 1), "ridge": torch.zeros(2, 1)}
+    found = summarise_errors(models, torch.zeros(2, 1), torch.tensor([4, 7]), ARM)
+    assert found["relative"] == pytest.approx((1 / 5) ** 0.5) and found["ridge_relative"] == 0
+    assert [row["episode"] for row in found["trajectory"]] == [4, 7]
+    assert [row["relative_action_error"] for row in found["trajectory"]] == pytest.approx([found["relative"]] * 2)
+
+
+def test_sampled_targets_are_judged_by_how_far_they_are_from_the_robot():
+    paths = [torch.randn(30, 2).cumsum(0) for _ in range(4)]
+    data = select_state(flatten_trajectories(paths, [path[:-1] + 0.5 for path in paths]), (0, 1))
+    actions = {name: Action("m", "absolute", column) for column, name in enumerate("xy")}
+    task = Task(name="reach", observation_parts={"robot": 2}, actions=actions, position="robot")
+    policy = DiffusionPolicy(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2, action_dim=2, num_steps=2)
+    found = errors_of_chunks(policy, data, LabelBudget(count=2).apply(data)[0], task)
+    assert found["trajectories"] == 2 and found["unit"][0]["mean_action"] == pytest.approx(0, abs=1e-5)

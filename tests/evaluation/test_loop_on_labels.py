@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from torchrl_koap import ExecutionConfig, fit
-from torchrl_koap.data import make_demonstrations
+from torchrl_koap.data import LabelBudget, make_demonstrations, select_state
+from torchrl_koap.evaluation import loop_on_labels
 from torchrl_koap.evaluation.loop_on_labels import check_loop
 
 SMALL = {"planner": {"network": "mlp", "steps": 600, "batch_size": 64, "width": 64}, "controller": {"steps": 0}}
@@ -33,10 +34,50 @@ def trained():
 
 def test_a_policy_that_goes_to_the_goal(trained):
     found = check_loop(*trained, trained[1])
-    assert found["steps"] == 120 and found["robots"] == 8 and found["explained"] > 0.999
-    assert found["largest_command"] < 3 and found["faults"] == []
+    assert found["steps"] == 120 and found["robots"] == 8 and found["explained"] > 1 - 1e-9
+    assert 0.6 < found["largest_command"] < 1.2 and found["faults"] == []
+    assert found["largest_command_late"] < 0.3 * found["largest_command"]
     assert found["limited_commands"] == 0 and found["commands"] == 8 * 120
     assert found["distance_to_demonstrations"] < 0.5 and json.dumps(found)
+
+
+def test_commands_are_counted_in_those_of_the_budget_and_noise_is_that_of_the_seed(trained, monkeypatch):
+    monkeypatch.setattr(loop_on_labels, "STEPS", 30)
+    model, data = trained
+    few, _ = LabelBudget(episodes=[2]).apply(data)
+    largest = [each["action"][each["has_action"].squeeze(-1)].abs().max().item() for each in (few, data)]
+    found, again, other = (check_loop(model, data, each, seed=s) for each, s in ((data, 0), (few, 0), (data, 1)))
+    assert again["largest_command"] == pytest.approx(found["largest_command"] * largest[1] / largest[0])
+    assert again["distance_to_demonstrations"] == found["distance_to_demonstrations"]
+    assert other["distance_to_demonstrations"] != found["distance_to_demonstrations"]
+
+
+def test_motion_goes_on_from_the_step_before_and_not_from_another_recording(trained, monkeypatch):
+    monkeypatch.setattr(loop_on_labels, "STEPS", 30)
+    random, states, actions = np.random.default_rng(0), [], []
+    for _ in range(20):
+        commands, speeds = random.normal(size=(18, 2)), [random.normal(size=2)]
+        for command in commands:
+            speeds.append(0.6 * speeds[-1] + 0.4 * command)
+        states.append(np.cumsum([random.normal(size=2), *speeds[1:]], axis=0)), actions.append(commands)
+    data, _ = make_demonstrations(states, actions, control_hz=100)
+    assert check_loop(trained[0], data, data)["explained"] > 1 - 1e-6
+
+
+def test_origins_are_added_before_a_policy_reads_and_subtracted_from_what_it_commands():
+    data, _ = recordings()
+    states = [1e7 + data["observation"][data["episode"] == number].double().numpy() for number in range(8)]
+    targets = [rows[:-1] + 2 * np.diff(rows, axis=0) for rows in states]
+    options, found = {"control_hz": 100, "action_kind": "absolute", "targets": [0, 1], "max_steps": 20}, []
+    origin = make_demonstrations(states, targets, **options)[1].observation_origin
+    few = SMALL | {"planner": SMALL["planner"] | {"steps": 3}}
+    for moved in (0.0, np.array(origin)):
+        data, task = make_demonstrations([x - moved for x in states], [x - moved for x in targets], **options)
+        data = select_state(data, task.state_of)
+        found.append(check_loop(fit(data, task, **few, progress=False), data, data))
+        assert (task.origins is None) == bool(np.any(moved))
+    far, near = ({name: value for name, value in each.items() if name != "faults"} for each in found)
+    assert far == pytest.approx(near, rel=1e-5) and far["commands"] > 0
 
 
 def test_a_policy_that_overshoots_ever_more_is_unstable(trained):

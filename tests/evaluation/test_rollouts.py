@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from toy_policies import (
     CountingPlanner,
@@ -102,6 +103,31 @@ def test_episodes_that_are_over_are_neither_planned_nor_counted():
     roll_out(policy, lambda n: EpisodesOfRandomLength(n, ((9,), (1,), (3,))), [0, 1, 2], max_steps=12)
     assert policy.limited.tolist() == [13, 13]  # every action of an episode was held in its range
     assert [len(states) for states in policy.planner.calls] == [3, 1, 1]
+
+
+class Placed(EpisodesOfRandomLength):
+    """Shows in its last column where an episode began."""
+
+    def _reset(self, tensordict=None, contexts=None):
+        first = super()._reset(tensordict)
+        first["observation"][:, 2] = torch.as_tensor(contexts)
+        return first
+
+
+@pytest.mark.parametrize(("batch_size", "parts"), [(None, [(0, 3)]), (2, [(0, 2), (2, 3)])])
+def test_every_episode_begins_in_its_own_context_and_is_handed_what_is_its_own(batch_size, parts):
+    asked = []
+
+    def given(part):
+        asked.append((part.start, part.stop))
+        return TensorDictModule(lambda: torch.zeros(part.stop - part.start, 6, 2), in_keys=[], out_keys=["noise"])
+
+    policy = make_policy(CountingPlanner(), EchoController(), state_of=(0, 1))
+    options = {"max_steps": 3, "batch_size": batch_size, "contexts": [5.0, 6.0, 7.0]}
+    episodes = roll_out(policy, lambda n: Placed(n, ((9,),) * n), [0, 1, 2], given=given, **options)
+    assert asked == parts and [episode["observation"][0, 2].item() for episode in episodes] == options["contexts"]
+    with pytest.raises(ValueError, match="one context per seed is needed, got 3 and 2"):
+        roll_out(policy, lambda n: Placed(n, ((9,),) * n), [0, 1], **options)
 
 
 @pytest.mark.parametrize(("seeds", "size"), [([], None), ([1], 0), ([1], -2)])

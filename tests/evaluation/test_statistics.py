@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy, rate, wilson_interval
+from torchrl_koap.evaluation.statistics import (
+    bootstrap_interval,
+    expected_entropy,
+    mode_entropy,
+    rate,
+    wilson_interval,
+)
 
 Z = 1.959963984540054
 
@@ -57,3 +63,15 @@ def test_expected_entropy_is_the_mean_over_all_draws(episodes, number):
     draws = np.stack(np.meshgrid(*[range(number)] * episodes), -1).reshape(-1, episodes)
     entropies = [mode_entropy(draw.tolist(), number) for draw in draws]
     assert expected_entropy(episodes, number) == pytest.approx(np.mean(entropies), abs=1e-12)
+
+
+def test_a_bootstrap_interval_lies_around_the_statistic_and_is_always_the_same():
+    numbers = np.random.default_rng(0).normal(size=400).tolist()
+    reach = Z * np.std(numbers) / 20
+    assert bootstrap_interval(numbers, np.mean) == pytest.approx(
+        (np.mean(numbers) - reach, np.mean(numbers) + reach), abs=0.02
+    )
+    modes = np.random.default_rng(0).integers(24, size=60).tolist()  # resamples lack some of them
+    low, high = bootstrap_interval(modes, lambda seen: mode_entropy(seen, 24))
+    assert (low + high) / 2 == pytest.approx(mode_entropy(modes, 24), abs=0.01) and 0.03 < high - low < 0.2
+    assert bootstrap_interval(modes, lambda seen: mode_entropy(seen, 24)) == (low, high)
