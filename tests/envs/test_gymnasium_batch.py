@@ -54,6 +54,15 @@ def test_numbers_are_those_of_the_environment_itself():
     assert not torch.equal(rollout["observation"][0], rollout["observation"][1])
 
 
+def test_a_seed_is_that_of_one_episode():
+    env = GymnasiumBatch("ToyReach-v0", TASK, 2)
+    env.seed_episodes([4, 9])
+    first, second = (env.reset()["observation"] for _ in range(2))
+    assert (first != second).any(-1).all()  # the environment's own generator goes on
+    env.seed_episodes([4, 9])
+    assert torch.equal(env.reset()["observation"], first)
+
+
 def test_origins_of_the_data_are_subtracted_from_observations_and_added_to_actions():
     origin = np.array([1e6, -1e6, 0.0, 3.0])
 

@@ -11,6 +11,7 @@ from offline_runs import save_arm
 
 from torchrl_koap import ControllerConfig, EvalConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.studies import cells as cells_file
 from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
 from torchrl_koap.studies.paired_comparison import compare, compare_cells
 from torchrl_koap.studies.report import write_study_report
@@ -118,6 +119,20 @@ def test_a_damaged_cell_is_made_again_without_being_trained_again(finished):
     assert outcomes == before[1]
     assert {k: v for k, v in after.items() if k not in clock} == {k: v for k, v in before[0].items() if k not in clock}
     assert (folder / "controller.safetensors").stat().st_mtime_ns == weights
+
+
+def test_a_cell_that_was_killed_while_it_was_trained_goes_on(finished):
+    folder = finished / CELL.folder
+    before = read_result(folder)[1]
+    for name in ("controller.safetensors", "summary.json", "eval.json", "result.json"):
+        (folder / name).unlink()
+    run_cell(folder)
+    assert read_result(folder)[1] == before
+
+
+def test_outcomes_are_compared_by_context_and_else_by_seed():
+    rows = [{"seed": 100, "outcome": "success", "context": 7}, {"seed": 101, "outcome": "timeout"}]
+    assert cells_file._outcomes_of({"episode": rows}) == [[7, 100, True], [101, 101, False]]
 
 
 def test_a_cell_of_which_something_else_was_asked_is_refused(root, planner, demonstrations):

@@ -63,6 +63,9 @@ def test_seeds_that_disagree_widen_the_interval():
     result = compare({0: always, 1: never}, {0: never, 1: never})
     assert result.difference == 0.5
     assert (result.low, result.high) == (0.0, 1.0)
+    # of four seeds three are drawn: two wins among them are rarer than 1 in 6, three rarer than 1 in 60
+    result = compare({0: always, 1: never, 2: never, 3: never}, dict.fromkeys(range(4), never))
+    assert (result.difference, result.low, result.high) == (0.25, 0.0, pytest.approx(2 / 3))
 
 
 def test_rollouts_of_one_context_are_one_unit():

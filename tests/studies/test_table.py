@@ -51,6 +51,8 @@ def test_seeds_are_pooled():
     assert item.mean("mode_entropy") == pytest.approx(0.55)
     assert item.measures["action_error"] == Measure(1.5, 1.0, 2.0)
     assert item.mean("labelled_transitions") == 320.5 and item.mean("relative_plan_error") is None
+    item = summarise([cell(successes=9, episodes=10, action_error=math.inf), cell(seed=1, successes=0)])[0]
+    assert item.measures["success"].mean == 9 / 40 and item.measures["action_error"] == Measure(2.0, 2.0, 2.0)
 
 
 def test_a_terminal_shows_success_or_the_action_error():

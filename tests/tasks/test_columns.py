@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from torchrl_koap.tasks import TASKS, Columns, get_task
 from torchrl_koap.tasks.columns import double_yaw, yaw_of
@@ -83,3 +84,9 @@ def test_yaw_of_quaternions_ignores_sign_and_a_small_tilt():
     w, _, _, z = upright.unbind(-1)
     tilted = torch.stack([w * tilt[0], w * tilt[1], z * tilt[1], z * tilt[0]], -1)
     assert (yaw_of(tilted) - expected).abs().max() < 2e-3
+
+
+def test_yaw_is_where_the_first_axis_points_from_above():
+    quaternion = torch.nn.functional.normalize(torch.randn(50, 4, dtype=torch.float64), dim=-1)
+    axis = Rotation.from_quat(quaternion.roll(-1, -1).numpy()).as_matrix()[:, :2, 0]
+    torch.testing.assert_close(yaw_of(quaternion), torch.nn.functional.normalize(torch.from_numpy(axis), dim=-1))
