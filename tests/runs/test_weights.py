@@ -39,6 +39,13 @@ def test_weights_bring_their_statistics(saved):
     assert torch.equal(model(x), other(x))
 
 
+def test_weights_keep_their_type(tmp_path):
+    model, other = Model().double(), Model(seed=1)
+    save_tensors(tmp_path / "model", model.state_dict())
+    load_weights(tmp_path / "model", other, {})
+    assert other.layer.weight.dtype == torch.float64 and torch.equal(other.layer.weight, model.layer.weight)
+
+
 def test_files_of_tensors_may_be_read_by_whom_other_files_may(tmp_path):
     (tmp_path / "plain").touch()
     save_tensors(tmp_path / "tensors", {"x": torch.zeros(2)})

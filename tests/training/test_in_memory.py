@@ -116,6 +116,15 @@ def test_a_policy_without_plans_sees_trajectories_with_labels_alone():
     assert not trained.controller.training and trained.planner is None
 
 
+def test_a_teacher_tells_targets_where_actions_are_targets():
+    states = [50 + rows for rows in record()[0]]
+    targets = [states[0][1:, :2], *[None] * 5]
+    data, task = make_demonstrations(**few_labels(states=states, actions=targets), action_kind="absolute")
+    options = {"planner": {"steps": 1, **SMALL}, "controller": {"steps": 1}, "progress": False}
+    learned = fit(data, task, method="vpt", **options).controller.action_normalizer  # of all actions, most a teacher's
+    assert (learned.offset - 50).abs().max() < 5 and learned.scale.max() < 5
+
+
 def test_labels_marked_missing_or_found():
     data, task = make_demonstrations(**few_labels())
     expected = fit_controller(data, task, method="linear").controller
@@ -152,12 +161,13 @@ def test_the_decoder_beats_a_ridge_on_a_lagging_robot():
     assert koap < 0.08 and koap < 0.75 * ridge, (koap, ridge)
 
 
-def test_a_short_recording_is_refused_before_the_planner_is_trained(monkeypatch):
+@pytest.mark.parametrize("preset", [None, "semi_supervised"])
+def test_a_short_recording_is_refused_before_the_planner_is_trained(preset, monkeypatch):
     monkeypatch.setattr("torchrl_koap.training.in_memory.learn_planner", pytest.fail)
     states, actions = record()
     data, task = make_demonstrations(**few_labels(states=[states[0][:9], *states[1:]], actions=[None, *actions[1:]]))
     with pytest.raises(ValueError, match=r"1 of 6 trajectories are shorter than a window .*: 0 \(8 steps\)"):
-        fit(data, task)
+        fit(data, task, controller={"preset": preset})
 
 
 def test_refusals():

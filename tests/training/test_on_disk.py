@@ -185,6 +185,12 @@ def test_a_method_killed_in_a_phase_or_behind_it_ends_bit_for_bit_like_one_that_
     assert [{**row, speed: 0} for row in rows[0]] == [{**row, speed: 0} for row in rows[1]]
 
 
+@pytest.mark.parametrize("method", [method for method in KILLED if METHODS[method].plans])
+def test_phases_share_the_updates(method, whole_run):
+    taken = [steps_of(whole_run(method), phase.name) for phase in METHODS[method].phases]
+    assert sum(taken) == LONGER["controller"].steps and len(taken) == len(METHODS[method].phases)
+
+
 def steps_of(run, phase):
     return load_tensors(run / "checkpoints" / f"{phase}.safetensors")[1]["step"]
 
