@@ -143,6 +143,8 @@ def test_an_action_that_never_changes_is_commanded_as_it_is():
     decoded = torch.ones(1, 3, 3)
     assert task.action_rule(torch.zeros(1, 3, 4), decoded)[0].tolist() == [[1, 1, 0.5]] * 3 and decoded.min() == 1
     assert Task.from_json(task.to_json()) == task
+    data, raw = make_demonstrations(STATES, still, control_hz=20, action_kind="raw")
+    assert [ends is None for ends in command_ranges(raw, data)] == [False, False, True]
     absolute = make_demonstrations(STATES, still, control_hz=20, action_kind="absolute", targets=[0, 1, 2])[1]
     assert absolute.action_rule(torch.full((1, 3, 4), 2.0), decoded)[0].tolist() == [[3, 3, 0.5]] * 3
 

@@ -224,8 +224,9 @@ def test_trajectories_are_compared_in_one_unit():
 
 
 def test_sampled_targets_are_judged_by_how_far_they_are_from_the_robot():
-    paths = [torch.randn(30, 2).cumsum(0) for _ in range(4)]
-    data = select_state(flatten_trajectories(paths, [path[:-1] + 0.5 for path in paths]), (0, 1))
+    paths = [torch.randn(30, 2).cumsum(0) for _ in range(5)]
+    targets = [*(path[:-1] + 0.5 for path in paths[1:]), None]  # of the last one nobody knows any
+    data = select_state(flatten_trajectories([*paths[1:], paths[0]], targets), (0, 1))
     actions = {name: Action("m", "absolute", column) for column, name in enumerate("xy")}
     task = Task(name="reach", observation_parts={"robot": 2}, actions=actions, position="robot")
     policy = DiffusionPolicy(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2, action_dim=2, num_steps=2)

@@ -13,7 +13,7 @@ from torchrl_koap.data.ted import load_ted
 from torchrl_koap.files import DataError
 from torchrl_koap.modules import StatePlanner, TemporalUnet
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
-from torchrl_koap.objectives import KOAPLoss
+from torchrl_koap.objectives import DiffusionPolicyLoss, KOAPLoss
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training import planner as planner_training
@@ -114,6 +114,15 @@ def test_a_policy_without_plans_sees_trajectories_with_labels_alone():
     other["observation"][data["episode"] > 1] += 9.0
     assert same_weights(fit(other, task, **options).controller, trained.controller)
     assert not trained.controller.training and trained.planner is None
+
+
+def test_a_policy_without_plans_learns_from_the_last_steps_too(monkeypatch):
+    batches, line = [], np.arange(41.0)[:, None]
+    monkeypatch.setattr(DiffusionPolicyLoss, "forward", observed(DiffusionPolicyLoss.forward, batches))
+    data, task = make_demonstrations([line] * 2, [line[:-1]] * 2, control_hz=10, action_kind="raw")
+    fit(data, task, method="dp", planner={"steps": 2, "width": 8, "batch_size": 512}, progress=False)
+    first = torch.cat([batch["action"][:, 1] for batch in batches])
+    assert first.unique().tolist() == [*range(39)]  # steps that another one follows
 
 
 def test_a_teacher_tells_targets_where_actions_are_targets():

@@ -132,6 +132,24 @@ def test_a_planner_of_one_frame_plans_from_all_states_that_have_a_next_one(monke
     assert (states.diff(dim=1) == 1).all() and states[:, 0].unique().tolist() == [*range(39)]
 
 
+def test_observed_frames_are_on_their_way_back_where_there_is_no_simulator():
+    paths = [np.random.default_rng(seed).normal(size=(20, 2)).cumsum(0) for seed in range(3)]
+    own = make_demonstrations(paths, control_hz=10, action_dim=2)[1]
+    for task, share in ((own, 0.7), (get_task("avoiding"), 1.0)):
+        states = torch.rand(20, 16, task.state_dim)
+        shift = augmentation(task, states)(TensorDict({"state": states.clone()}, [20]))["state"] - states
+        torch.testing.assert_close(shift[:, 1], share * shift[:, 0], rtol=0, atol=1e-5)
+        assert shift[:, 0].any()
+
+
+def test_fingers_are_not_shifted_with_the_arm():
+    task = get_task("stacking_unobserved_joints")
+    states, (_, fingers) = torch.rand(20, 16, task.state_dim), task.gripper
+    states[..., fingers] = 0.06  # holding something
+    moved = augmentation(task, states)(TensorDict({"state": states.clone()}, [20]))["state"]
+    assert (moved[..., fingers] == 0.06).all() and (moved[:, 1, :3] != states[:, 1, :3]).all()
+
+
 def test_actions_turn_with_the_scene_and_lead_back_with_the_robot():
     task, states = get_task("aligning"), torch.rand(20, 16, get_task("aligning").state_dim)
     windows = TensorDict({"state": states, "action": states[..., :3].diff(dim=1, append=states[:, -1:, :3])}, [20])

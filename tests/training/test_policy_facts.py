@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchrl_koap import ControllerConfig
+from torchrl_koap import ControllerConfig, fit
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.methods import METHODS
@@ -34,6 +34,12 @@ def test_a_label_is_learned_as_the_command_that_it_leads_to(unit):
     everything = with_commands(TASK, data)["action"]  # nobody told, as nothing is hidden
     torch.testing.assert_close(everything, data["next", "observation"][:, :2])
     assert with_commands(CHANGES, labelled) is labelled
+
+
+def test_a_trained_controller_is_judged_by_how_far_commands_are_from_the_robot():
+    data = recordings()
+    seen = fit(data, TASK, planner=False, controller={"steps": 0}, progress=False).seen(data)
+    torch.testing.assert_close(seen["action"], data["next", "observation"][:, :2] - data["state"])
 
 
 def test_a_labelled_step_whose_command_is_not_known_is_none():

@@ -20,6 +20,7 @@ from torchrl_koap.envs.experts.demonstrations import (
     record_demonstrations,
     record_to_folder,
 )
+from torchrl_koap.envs.experts.recording import ar1_noise
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS
@@ -194,3 +195,9 @@ def test_other_demonstrations_are_left_alone(whole, tmp_path, monkeypatch):
     with pytest.raises(FileExistsError, match="interrupted recording with seed 3, not 4, disturbance 0.0, not 0.5"):
         record_to_folder(tmp_path, TASK, COUNT, seed=4, disturbance=0.5)
     assert json.loads((tmp_path / "unfinished" / "request.json").read_text())["seed"] == 3
+
+
+def test_a_drifting_hand_deviates_as_much_at_every_step():
+    noise = ar1_noise(np.random.default_rng(0), 10.0, 0.5, (40, 20_000))
+    assert np.abs(noise.std(1) - 0.5).max() < 0.02
+    assert np.mean(noise[1:] * noise[:-1]) == pytest.approx(0.25 * np.exp(-1 / 10), abs=0.01)
