@@ -53,6 +53,8 @@ def test_the_weights_of_a_training_bit_for_bit(tmp_path):
     assert torch.equal(torch.get_rng_state(), before)
     assert same_weights(trained.planner, load_tensors(tmp_path / "run" / "planner.safetensors")[0])
     assert same_weights(trained.controller, load_tensors(tmp_path / "run" / "controller.safetensors")[0])
+    loaded = Trained.load(tmp_path / "run")
+    assert loaded.hide_labels(loaded.data())[1].seed == 3
 
 
 def test_short_windows_hold_their_label_on_the_frame_that_counts(monkeypatch):
