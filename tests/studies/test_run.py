@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from tiny_runs import koap, read_csv
 
 from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig
 from torchrl_koap.files import one_at_a_time
+from torchrl_koap.runs.config_files import to_json
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies import run as run_module
 
@@ -266,3 +269,9 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
         assert episodes_of(out, cell) == episodes_of(whole_curve, cell)
         name = "controller.safetensors"
         assert (out / cell / name).read_bytes() == (whole_curve / cell / name).read_bytes()
+
+
+def test_fewer_seeds_take_nothing_back(tmp_path):
+    study = run_module.complete(Study(out=tmp_path, seeds=3))
+    RunDirectory(tmp_path).write_json("study.json", to_json(replace(study, out=Path())))
+    assert run_module._together(replace(study, seeds=1)) == study

@@ -203,6 +203,12 @@ def test_a_policy_without_plans_has_averaged_weights(whole_run):
     assert not torch.equal(made[name], saved[f"loss.network_params.{name}"])
 
 
+def test_a_share_of_the_trajectories_is_used_those_with_labels_first(demonstrations, planner, tmp_path):
+    labels = LabelConfig(count=2, trajectories=0.5)
+    found = train_tiny(tmp_path / "run", demonstrations, planner, "linear", labels=labels).results
+    assert found["trajectories_used"] == 4 and found["labels"]["trajectories_touched"] == 2
+
+
 def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):
     states = [np.random.default_rng(index).normal(size=(40, 3)).cumsum(0) for index in range(4)]
     actions = [np.diff(states[0][:, :2], axis=0), None, None, None]
