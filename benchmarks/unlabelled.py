@@ -70,7 +70,7 @@ Cell = tuple[str, int]  # method, number of labelled trajectories
 
 def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
     """Flat data with the robot's own columns as ``state``, and targets, but no commands, as distances from it."""
-    return controller_view(data, task.controller_columns("robot"), distances=tuple(enumerate(task.targets)))
+    return controller_view(data, task.controller_columns("robot"), distances=task.distances)
 
 
 def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:

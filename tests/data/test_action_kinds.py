@@ -47,8 +47,8 @@ def test_a_name_that_is_the_same_allows_for_targets_that_lie_farther_away():
 
 def test_one_absolute_column_beside_changes():
     mixed = [np.column_stack([steps[:, 0], aims[:, 1]]) for steps, aims in zip(DELTAS, TARGETS, strict=True)]
-    assert warnings(PATHS, mixed)[0].endswith("--action-kind delta absolute")
-    assert not warnings(PATHS, mixed, action_kind=["delta", "absolute"])
+    assert warnings(PATHS, mixed)[0].endswith("--action-kind delta absolute --targets 'elbow pos'")
+    assert not warnings(PATHS, mixed, action_kind=["delta", "absolute"], targets=JOINTS[1:2])
 
 
 def test_a_gripper_of_two_values():
@@ -116,14 +116,12 @@ def test_targets_in_other_units_than_their_columns_are_raw():
     assert not warnings(PATHS, offset, action_kind="absolute", targets=JOINTS[:2])
 
 
-def test_a_switch_beside_targets_is_to_be_brought_to_its_column():
-    """Of another kind, it would leave the others without targets."""
+def test_a_switch_beside_targets_is_raw_and_the_others_keep_theirs():
     paths = [40 * path + 90 for path in PATHS]
     steps = [np.stack([path[1:, 0], path[1:, 1] > 90], -1) for path in paths]
     (said,) = warnings(paths, steps, action_kind="absolute", targets=JOINTS[:2])
-    assert said.endswith("bring them to the unit of their columns, as 0 and 1 of a gripper to its widths")
-    scaled = [steps * (1, 80) + (0, 50) for steps in steps]
-    assert not warnings(paths, scaled, action_kind="absolute", targets=JOINTS[:2])
+    assert said.endswith("convert again with --action-kind absolute raw --targets shoulder.pos")
+    assert not warnings(paths, steps, action_kind=["absolute", "raw"], targets=JOINTS[:1])
 
 
 def test_normalised_targets_of_columns_in_degrees_are_raw_however_they_are_declared():
@@ -135,7 +133,7 @@ def test_normalised_targets_of_columns_in_degrees_are_raw_however_they_are_decla
     assert [said[-3:] for said in warnings(paths, steps)] == ["raw"]
     assert not warnings(paths, steps, action_kind="raw")
     (said,) = warnings(PATHS, TARGETS, action_kind="absolute", targets=JOINTS[1::-1])
-    assert said.endswith("--action-kind absolute and other --targets")
+    assert said.endswith("--action-kind absolute --targets shoulder.pos 'elbow pos'")
 
 
 def test_raw_actions_that_are_something_better():

@@ -14,6 +14,7 @@ from torchrl_koap.data import (
     open_dataset,
     read_recordings,
     save_demonstrations,
+    select_state,
 )
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.keys import validate
@@ -66,16 +67,30 @@ def test_columns_of_one_role_may_lie_apart():
 
 def test_absolute_actions_are_targets_of_columns():
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, robot=["state_0", "state_1"], action_kind="absolute")
-    assert task.targets == (0, 1)
+    assert task.targets == {0: 0, 1: 1}
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="absolute", targets=[1, 0])
-    assert task.targets == (1, 0)
+    assert task.targets == {0: 1, 1: 0}
 
 
 def test_every_action_may_be_of_its_own_kind():
     kinds = ("delta", "absolute")
-    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds)
+    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds, targets=["state_3"])
     assert [action.kind for action in task.actions.values()] == list(kinds)
-    assert task.delta_actions == (0,) and task.targets == ()
+    assert task.delta_actions == (0,) and task.targets == {1: 3}
+    with pytest.raises(DataError, match="absolute actions are 1, the robot's columns are 4.* target of none is 'raw'"):
+        make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds)
+
+
+def test_joints_beside_a_switch_are_learnt_as_distances():
+    """A hand that is told 0 or 1 must not make the joints be decoded as places."""
+    steps, opens = ACTIONS[0][:, :1], STATES[0][1:, 2:3] > 0
+    aims = [np.hstack([STATES[0][:-1, :1] + steps, opens]), None, None]
+    options = {"action_kind": ("absolute", "raw"), "targets": [0], "robot": [0, 1], "control_hz": 20}
+    data, task = make_demonstrations(STATES, aims, **options)
+    data = select_state(data, task.state_of)
+    view = controller_view(data, task.robot, distances=task.distances)["action"][:29]
+    torch.testing.assert_close(view, torch.from_numpy(np.hstack([steps, opens])).float(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(task.action_rule(data["state"][:29], view), data["action"][:29])
 
 
 def test_raw_actions_are_about_no_column():
@@ -117,9 +132,9 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
         ({"robot": [0, 0]}, "robot .* holds q1 more than once"),
         (
             {"action_kind": "absolute"},
-            r"have 2 columns, the robot's columns are 4: name in targets \(--targets\) the col",
+            r"are 2, the robot's columns are 4: name in targets \(--targets\) the col",
         ),
-        ({"action_kind": "raw", "targets": [0, 1]}, "targets .* are for action_kind .* 'absolute' of all actions"),
+        ({"action_kind": "raw", "targets": [0, 1]}, "targets .* are for action_kind .* 'absolute'"),
         ({"action_kind": "absolute", "targets": [0, 3], "command": [3]}, "column 'cup_y' is a target and a command"),
         ({"action_units": ["m"]}, "action_units .* names 1 columns, there are 2"),
         ({"state_units": ["m"]}, "state_units .* names 1 columns, there are 4"),

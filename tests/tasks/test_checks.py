@@ -27,7 +27,6 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
             "actions: 'x' is of kind 'change'; known: delta, absolute, raw, gripper",
         ),
         ({"actions": {"x": Action(column=5)}}, "actions: the state has 5 columns, got 5"),
-        ({"actions": {"x": Action("m", "absolute", 0), "y": Action()}}, "name the column .* or none names one"),
         ({"actions": {"x": Action("m", "gripper"), "y": Action("m", "gripper")}}, "at most one is a gripper"),
         ({"robot": (0, 9)}, "robot: the state has 5 columns, got 9"),
         ({"interchangeable": (("box",),)}, "interchangeable: no body 'box'"),

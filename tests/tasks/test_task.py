@@ -39,11 +39,14 @@ def test_actions_say_what_they_move():
     silent = Task(**(TOY | {"robot": (3, 4, 0)}))
     assert silent.moved_columns() == () and silent.moved_columns(or_robot=True) == (3, 4)
     reached = Task(**(TOY | {"actions": {name: Action("m", "absolute", column=2) for name in "xy"}, "robot": (3, 4)}))
-    assert reached.targets == (2, 2) and reached.moved_columns() == () and reached.delta_actions == ()
+    assert reached.targets == {0: 2, 1: 2} and reached.moved_columns() == () and reached.delta_actions == ()
     states = torch.arange(5.0).expand(1, 3, 5)
     assert reached.action_rule(states, torch.ones(1, 3, 2)).tolist() == [[[3.0, 3.0]] * 3]
     mixed = Task(**(TOY | {"actions": {"a": Action("rad"), "grip": Action("m", "gripper", column=4)}}))
-    assert mixed.gripper == (1, 4) and mixed.delta_actions == (0,) and mixed.targets == ()
+    assert mixed.gripper == (1, 4) and mixed.delta_actions == (0,) and not mixed.targets
+    part = Task(**(TOY | {"actions": {"grip": Action("", "raw"), "x": Action("m", "absolute", column=2)}}))
+    assert part.targets == {1: 2} and part.distances == ((1, 2),) and part.moved_columns() == ()
+    assert part.action_rule(states, torch.ones(1, 3, 2)).tolist() == [[[1.0, 3.0]] * 3]
     assert get_task("stacking").moved_columns() == ()  # its axes do not share a filter
 
 

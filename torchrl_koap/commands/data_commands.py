@@ -138,7 +138,7 @@ class Convert(Command):
         action_kind: kind of each action column, or one for all: "delta" (velocities, efforts, changes), "absolute"
             (targets of state columns) or "raw" (neither, such as normalised targets); with --resample "change" (over
             one frame, summed) or "velocity" (or effort, held) instead of "delta" (default: delta).
-        targets: for absolute actions the state column that each is the target of (default: the robot's).
+        targets: for each absolute action the state column that it is the target of (default: the robot's).
         action_units: unit of each action column, or one for all.
         state_units: unit of each state column, or one for all.
         max_steps: steps after which an episode counts as failed (default: 1.5 times the longest demonstration).

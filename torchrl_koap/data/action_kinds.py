@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -70,19 +70,16 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     wrong |= aimed if len(aimed) == task.action_dim and set(kinds.values()) == {"raw"} else set()
     if wrong:
         reached = [labels.names[likely[name].column] for name in kinds if name in wrong]
-        asked = _asked(task, dict.fromkeys(wrong, "absolute"))
-        if len(wrong) == task.action_dim and [likely[name].column for name in kinds] != list(task.robot):
-            asked += f" --targets {shlex.join(reached)}"
         yield (
             f"actions lie within {max(likely[name].distance for name in wrong):.2g} of {some(reached)} on average: they"
-            f" look like absolute targets; convert again with --action-kind {asked}"
+            f" look like absolute targets; {_cure(task, labels, {name: likely[name] for name in wrong})}"
         )
     levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
     switches = [name for name, kind in kinds.items() if kind == "delta" and levels[name] == 2]
     if switches:
         yield (
-            f"{some(switches)}: an action of two values, such as a gripper's that opens and closes: convert again with"
-            f" --action-kind {_asked(task, dict.fromkeys(switches, 'raw'))}"
+            f"{some(switches)}: an action of two values, such as a gripper's that opens and closes:"
+            f" {_cure(task, labels, {name: replace(likely[name], kind='raw') for name in switches})}"
         )
     wrong.update(switches)
     changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
@@ -143,10 +140,15 @@ def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
     return found
 
 
-def _asked(task: Task, likely: Mapping[str, ActionKind]) -> str:
-    """What ``--action-kind`` should say where some actions are of another kind."""
-    kinds = [likely.get(name, action.kind) for name, action in task.actions.items()]
-    return kinds[0] if len(set(kinds)) == 1 else " ".join(kinds)
+def _cure(task: Task, labels: _Labels, found: Mapping[str, LikelyKind]) -> str:
+    """How to convert again where some actions are of another kind, or the targets of another column."""
+    actions = {name: found.get(name, action) for name, action in task.actions.items()}
+    kinds = [action.kind for action in actions.values()]
+    targets = [action.column for action in actions.values() if action.kind == "absolute"]
+    asked = f"convert again with --action-kind {kinds[0] if len(set(kinds)) == 1 else ' '.join(kinds)}"
+    if targets == list(task.robot) or not targets:
+        return asked
+    return f"{asked} --targets {shlex.join([labels.names[column] for column in targets if column is not None])}"
 
 
 def _targets_far_away(labels: _Labels, task: Task, likely: Mapping[str, LikelyKind]) -> Iterator[str]:
@@ -160,12 +162,7 @@ def _targets_far_away(labels: _Labels, task: Task, likely: Mapping[str, LikelyKi
         if NEARER * min(others) < away or min(away, (steps - level).std()) > NAMED * level.std():
             far[name] = f"{name!r} by {away:.2g} from {target!r}"
     if far:
-        kinds = {name: likely[name].kind for name in far}
-        targets = " and other --targets" if "absolute" in kinds.values() else ""
-        cure = f"convert again with --action-kind {_asked(task, kinds)}{targets}"
-        # beside raw ones, the other actions would have no targets
-        if len(far) < task.action_dim and set(kinds.values()) == {"raw"}:
-            cure = "bring them to the unit of their columns, as 0 and 1 of a gripper to its widths"
+        cure = _cure(task, labels, {name: likely[name] for name in far})
         yield f"absolute actions lie away from their targets on average, {some([*far.values()])}: {cure}"
 
 

@@ -115,7 +115,7 @@ def make_demonstrations(
             near to, such as torques or normalised targets. One for all actions or one for each, such as of a gripper
             that is commanded by its width beside joints that are commanded by changes. ``"change"`` (over one frame)
             and ``"velocity"`` (or effort) say which ``"delta"`` is meant, as ``resample`` needs to know.
-        targets (sequence of str or int, optional): where all actions are absolute, the state column that each is the
+        targets (sequence of str or int, optional): for every absolute action the state column that it is the
             target of. Default: the robot's columns, if there are as many.
         resample (float, optional): frames per second that are wanted, where ``control_hz`` is that of the arrays; see
             :func:`~torchrl_koap.data.read_recordings`.
@@ -202,7 +202,9 @@ def make_demonstrations(
         for column in commanded
         if origin[column]
     ]
-    added = origin[reached] if reached and len(reached) == len(acting) else np.zeros(len(acting))
+    added, absolute = np.zeros(len(acting)), [index for index, kind in enumerate(kinds) if kind == "absolute"]
+    if len(reached) == len(absolute):
+        added[absolute] = origin[reached]
     actions = [steps - added for steps in recordings.actions]
     problems += [
         f"action column {acting[column]!r} is at {at:.3g}: subtract that from it, here and on the robot"
@@ -225,7 +227,7 @@ def make_demonstrations(
     refuse(f"task {name!r}", problems)
     constants = constant_columns(np.concatenate(actions))
     data = flatten_trajectories([frames - origin for frames in recordings.states], actions)
-    moved = [others.index(column) for column in reached]
+    moved = dict(zip(absolute, map(others.index, reached), strict=True))
     parts = _parts(names, set(own), set(commanded))
     task = Task(
         name=name,
@@ -233,8 +235,8 @@ def make_demonstrations(
         observation_units=own_units,
         observation_origin=tuple(origin.tolist()) if origin.any() else (),
         actions={
-            name: Action(*facts)
-            for name, *facts in zip(acting, units, kinds, moved or (None,) * len(acting), constants, strict=True)
+            name: Action(unit, kind, moved.get(index), constant)
+            for index, (name, unit, kind, constant) in enumerate(zip(acting, units, kinds, constants, strict=True))
         },
         position=next(part for part in parts if part != _COMMAND),
         max_steps=int(max_steps)
@@ -301,16 +303,17 @@ def _targets(
     problems: list[str],
 ) -> list[int]:
     """State columns that absolute actions are the targets of."""
-    if set(kinds) != {"absolute"}:
+    number = kinds.count("absolute")
+    if not number:
         if given is not None:
-            problems.append(f"{option('targets')} are for {option('action_kind')} 'absolute' of all actions")
+            problems.append(f"{option('targets')} are for {option('action_kind')} 'absolute'")
         return []
     columns = list(own) if given is None else _columns(given, names, "targets", problems)
-    if len(columns) != len(kinds):
+    if len(columns) != number:
         what = "the robot's columns are" if given is None else "targets are"
         problems.append(
-            f"absolute actions have {len(kinds)} columns, {what} {len(columns)}: name in {option('targets')} the"
-            f" column that each action is the target of (known: {', '.join(names)})"
+            f"absolute actions are {number}, {what} {len(columns)}: name in {option('targets')} the column that each"
+            f" is the target of (known: {', '.join(names)}); an action that is the target of none is 'raw'"
         )
     return columns
 

@@ -25,6 +25,7 @@ from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics, StatePl
 from torchrl_koap.modules.planning.energy_score import energy_score, relative_score, sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 
@@ -204,7 +205,7 @@ def errors_of_chunks(
     ridge is a linear policy of the same frames. Arguments, all columns of the state included, and result as of
     :func:`errors_outside_budget`.
     """
-    history, targets = policy.history, list(task.targets)
+    history, targets = policy.history, tuple(task.targets.items())
     episodes = episodes_outside(data, labelled)
     keys = ["state", "action", "has_action", "episode"]
     now = history - 1
@@ -219,7 +220,7 @@ def errors_of_chunks(
 
     def moved(action: Tensor, states: Tensor) -> Tensor:
         """Absolute actions as distances from where their columns are in the present frame."""
-        return action - states[:, now, targets] if targets else action
+        return shift_actions(action, states[:, now], targets, sign=-1)
 
     past, device = windows["state"][:, :history].float(), device_of(policy)
     true, seen = (moved(part["action"][:, now], part["state"]) for part in (windows, known))

@@ -129,7 +129,7 @@ def rollouts_to_tensors(episodes: Sequence[TensorDict], task: Task, *, interval:
         "action": pad([episode[ACTION] for episode in episodes], padding_value=torch.nan),
     }
     if task.env is None:
-        about = task.targets or task.moved_columns() or task.robot or range(task.state_dim)
+        about = tuple(task.targets.values()) or task.moved_columns() or task.robot or range(task.state_dim)
         chosen, plans = list(about[:SHOWN]), made
         tensors["column"] = torch.tensor(chosen)
         tensors["state"] = pad([task.state_of(seen)[:, chosen] for seen in frames], padding_value=torch.nan)

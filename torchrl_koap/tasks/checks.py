@@ -49,9 +49,6 @@ def _action_faults(task: Task) -> Iterator[str]:
             yield f"actions: {name!r} is of kind {action.kind!r}; known: {', '.join(get_args(ActionKind))}"
         elif action.kind == "raw" and action.column is not None:
             yield f"actions: {name!r} is raw, of which no column is known, got column {action.column}"
-    with_target = {action.kind == "absolute" and action.column is not None for action in actions.values()}
-    if len(with_target) > 1:
-        yield "actions: all are absolute and name the column that they are the target of, or none names one"
     if task.defaults.commands and (task.command is None or not task.delta_actions):
         yield "defaults.commands: no action is the change of a command that the observation repeats (command)"
     if sum(action.kind == "gripper" for action in actions.values()) > 1:

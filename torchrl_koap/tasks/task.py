@@ -155,11 +155,10 @@ class Task(Columns):
         return tuple(index for index, action in enumerate(self.actions.values()) if action.kind == "delta")
 
     @cached_property
-    def targets(self) -> tuple[int, ...]:
-        """State column that each action is the target of, where all are absolute and name one; else empty."""
-        columns = [action.column for action in self.actions.values() if action.kind == "absolute"]
-        known = tuple(column for column in columns if column is not None)
-        return known if len(known) == self.action_dim else ()
+    def targets(self) -> dict[int, int]:
+        """Action column and state column of each absolute action that names the column that it is the target of."""
+        absolute = {index: a.column for index, a in enumerate(self.actions.values()) if a.kind == "absolute"}
+        return {index: column for index, column in absolute.items() if column is not None}
 
     @cached_property
     def distances(self) -> tuple[tuple[int, int], ...]:
@@ -168,7 +167,7 @@ class Task(Columns):
         These are absolute actions with targets, and commands that move a known column.
         """
         if self.targets:
-            return tuple(enumerate(self.targets))
+            return tuple(self.targets.items())
         moved = self.moved_columns(or_robot=True)
         known = self.defaults.commands and len(moved) == len(self.delta_actions)
         return tuple(zip(self.delta_actions, moved, strict=True)) if known else ()
@@ -178,8 +177,8 @@ class Task(Columns):
         """What was subtracted from every observation column and every action; None: nothing."""
         if not self.observation_origin:
             return None
-        columns = [self.state_columns[column] for column in self.targets] or [None] * self.action_dim
-        return self.observation_origin, tuple(0.0 if c is None else self.observation_origin[c] for c in columns)
+        places = {index: self.observation_origin[self.state_columns[c]] for index, c in self.targets.items()}
+        return self.observation_origin, tuple(places.get(index, 0.0) for index in range(self.action_dim))
 
     @cached_property
     def gripper(self) -> tuple[int, int] | None:

@@ -41,7 +41,7 @@ def action_facts(task: Task, columns: Sequence[int]) -> dict[str, Any]:
     axes = list(task.moved_columns())
     guessed = not axes
     if guessed:
-        moved = task.targets or (task.robot if task.delta_actions else ())
+        moved = tuple(task.targets.values()) or (task.robot if task.delta_actions else ())
         if task.env is None and len(moved) == task.action_dim and set(moved) <= set(columns):
             axes = [list(columns).index(column) for column in moved]
     alike = any(action.kind != "raw" for action in task.actions.values())

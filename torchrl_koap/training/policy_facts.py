@@ -46,8 +46,8 @@ def commanded_columns(task: Task) -> dict[str, list[int]] | None:
 
     None where the observation does not repeat the command, or it is not known what it moves.
     """
-    actions = list(range(task.action_dim) if task.targets else task.delta_actions)
-    moved = list(task.targets or task.moved_columns(or_robot=True))
+    actions = list(task.targets or task.delta_actions)
+    moved = list(task.targets.values() or task.moved_columns(or_robot=True))
     if task.command is None:
         return None
     commands = list(range(task.observation_dim))[task.command_columns][: len(actions)]
