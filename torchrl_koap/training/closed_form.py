@@ -23,7 +23,7 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     keys = ["state", "action", "has_action", "episode"]
     labelled = torch.isin(data["episode"], data["episode"][data["has_action"].squeeze(-1)])
     windows = cut_windows(data[labelled], controller.num_window_frames, select=keys, pad_before=controller.num_past)
-    mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
+    mask = windows["has_action"].squeeze(-1).clone()
     # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again
     mask[:, : controller.num_past], mask[:, controller.num_past + 1 :] = False, False
     for name, own in (("state", controller.in_key), ("action", controller.out_key)):

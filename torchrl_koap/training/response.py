@@ -139,7 +139,7 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
         good &= ~changes[row - back].isnan().any(-1) & ~positions[row - back].isnan().any(-1)
     row = row[good & ~positions[row].isnan().any(-1)]
     broken = torch.ones_like(row, dtype=torch.bool)
-    broken[1:] = (row.diff() != 1) | (episode[row[1:]] != episode[row[:-1]])
+    broken[1:] = row.diff() != 1  # before each row of an episode some are left out
     segment = broken.cumsum(0) - 1
     known = ~after[row - 1].isnan().any(-1)
     # where the command is hidden, it is counted from the beginning of the stretch
