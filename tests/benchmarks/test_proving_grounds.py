@@ -41,7 +41,7 @@ def test_recordings_become_a_data_set(name, tmp_path):
     ground.write(tmp_path / "data")
     steps, task = open_dataset(str(tmp_path / "data"))
     recordings = len(steps["episode"].unique())
-    assert (recordings, len(steps), task.state_dim, task.robot, task.targets) == WRITTEN[name]
+    assert (recordings, len(steps), task.state_dim, task.robot, tuple(task.targets.values())) == WRITTEN[name]
     assert steps["has_action"].all()
 
 
@@ -52,7 +52,12 @@ def test_frames_of_recorded_states_become_columns(monkeypatch, tmp_path):
     monkeypatch.setattr("torchrl_koap.vision.embedding.load_backbone", lambda network: load_backbone(OWN))
     pusht.write_pixels(tmp_path / "data")
     steps, task = open_dataset(str(tmp_path / "data"))
-    assert len(steps) == 87 and task.robot == (0, 1) and task.targets == (0, 1) and task.state_dim == 2 + 32
+    assert (
+        len(steps) == 87
+        and task.robot == (0, 1)
+        and tuple(task.targets.values()) == (0, 1)
+        and task.state_dim == 2 + 32
+    )
     env, other = pusht.make_pixels(), pusht.make_pixels()
     env.reset(seed=3), other.reset(seed=1)
     for step in range(40):  # the agent runs into the block
