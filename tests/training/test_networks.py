@@ -1,14 +1,18 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """From options to planners and controllers."""
 
+import numpy as np
 import pytest
 import torch
 from small_networks import controller_of
 from tensordict import TensorDict
+from torch import nn
 
-from torchrl_koap import PlannerConfig, TrainConfig
+from torchrl_koap import PlannerConfig, TrainConfig, Trained, fit, make_demonstrations, save_demonstrations, train
 from torchrl_koap.data import LabelBudget, open_dataset
+from torchrl_koap.modules.planning.denoisers import Denoiser
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training import defaults, networks, register_network
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.networks import NETWORKS, build_planner, sizes_of
@@ -30,6 +34,41 @@ def test_every_network_plans(network, frames, task):
     assert planner.sample(torch.zeros(3, frames, task.state_dim)).shape == (3, 14, task.state_dim)
     assert (planner.relative, planner.history) == (task.defaults.relative, frames)
     assert sizes_of(planner) == {"network": network, "width": 16, "octaves": 2, "frames": frames}
+
+
+class Transformer(Denoiser):
+    """A network from outside: attention over the frames."""
+
+    def __init__(self, state_dim, condition_dim, *, width, frequencies, horizon):
+        super().__init__(state_dim, condition_dim, frequencies=frequencies, condition_width=width)
+        self.first, self.last = nn.Linear(state_dim + self.context_dim, width), nn.Linear(width, state_dim)
+        self.place = nn.Parameter(0.1 * torch.randn(horizon, width))
+        self.layer = nn.TransformerEncoderLayer(width, 2, 2 * width, dropout=0.0, batch_first=True)
+
+    def denoise(self, x, step, condition):
+        context = torch.cat([condition, step], -1).unsqueeze(1).expand(-1, x.shape[1], -1)
+        return self.last(self.layer(self.first(torch.cat([x, context], -1)) + self.place))
+
+
+def test_a_network_from_outside_is_trained_saved_and_loaded_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(networks, "NETWORKS", dict(NETWORKS))
+    monkeypatch.setattr(defaults, "NETWORKS", networks.NETWORKS)
+    register_network("transformer", Transformer, width=16, octaves=0)
+    states = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(4)]
+    folder = save_demonstrations(tmp_path / "arm", states, [np.diff(path, axis=0) for path in states], control_hz=30)
+    config = PlannerConfig(network="transformer", steps=3)
+    trained = train(TrainConfig(out=tmp_path / "run", dataset=str(folder), method="linear", planner=config))
+    section = trained.config.planner
+    assert (section.width, section.octaves, section.batch_size) == (16, 0, 512)
+    loaded = Trained.load(tmp_path / "run").planner
+    assert isinstance(loaded.denoiser, Transformer)
+    assert torch.equal(loaded.denoiser.place, trained.planner.denoiser.place)
+    with pytest.raises(ValueError, match="there is a network 'transformer' already"):
+        register_network("transformer", Transformer)
+    with pytest.raises(ValueError, match="unknown default of a network 'widht'; did you mean 'width'"):
+        register_network("other", Transformer, widht=8)
+    with pytest.raises(ValueError, match="its denoiser is a Transformer: register it"):
+        fit(*make_demonstrations(states, [np.diff(path, axis=0) for path in states], control_hz=30), planner=loaded)
 
 
 @pytest.mark.parametrize(

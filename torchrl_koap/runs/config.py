@@ -62,7 +62,7 @@ class PlannerConfig:
 
     Attributes:
         steps: updates at most.
-        network: "unet" or "mlp".
+        network: "unet", "mlp" or one that a plugin registers.
         width: channels of the first level of "unet" (the second has twice as many), or hidden width of "mlp".
         octaves: octaves of the Fourier features of the observed states; 0: the states themselves.
         batch_size: windows per update.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -17,11 +18,46 @@ from torchrl_koap.training.method import Method
 from torchrl_koap.training.policy_facts import state_reader
 
 WEIGHT_DECAY = 1e-4  # decoupled, of all networks that denoise
+
+
+def _unet(columns: int, condition_dim: int, *, width: int, frequencies: int, horizon: int) -> nn.Module:
+    return TemporalUnet(columns, condition_dim, channels=(width, 2 * width), frequencies=frequencies)
+
+
 # the networks of planners, and what they are built and trained with where nothing else is asked for
 NETWORKS: dict[str, dict[str, Any]] = {
-    "unet": {"width": 64, "octaves": 4, "batch_size": 128, "learning_rate": 3e-3},
-    "mlp": {"width": 512, "octaves": 1, "batch_size": 512, "learning_rate": 1e-3},
+    "unet": {"build": _unet, "width": 64, "octaves": 4, "batch_size": 128, "learning_rate": 3e-3},
+    "mlp": {"build": MLPDenoiser, "width": 512, "octaves": 1, "batch_size": 512, "learning_rate": 1e-3},
 }
+
+
+def register_network(name: str, build: Callable[..., nn.Module], **defaults: float) -> None:
+    """Adds a network of planners and Diffusion Policy, which ``--planner.network`` then knows by its name.
+
+    Args:
+        name (str): its name.
+        build (callable): ``build(columns, condition_dim, width=, frequencies=, horizon=)``, the denoiser of a
+            :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`: its width, the octaves of the condition
+            and the frames of a sequence.
+        **defaults: ``width``, ``octaves``, ``batch_size`` and ``learning_rate`` where nothing else is asked for.
+            Default: those of ``"mlp"``.
+
+    Raises:
+        ValueError: if there is a network of that name already, or for an unknown default.
+
+    Examples:
+        >>> from torchrl_koap.modules import MLPDenoiser
+        >>> from torchrl_koap.training import register_network
+        >>> register_network("mlp", MLPDenoiser)
+        Traceback (most recent call last):
+        ValueError: there is a network 'mlp' already
+    """
+    if name in NETWORKS:
+        raise ValueError(f"there is a network {name!r} already")
+    usual = NETWORKS["mlp"]
+    for option in defaults:
+        lookup(usual, option, "default of a network")
+    NETWORKS[name] = {**usual, **defaults, "build": build}
 
 
 def build_planner(task: Task, section: PlannerConfig) -> StatePlanner:
@@ -36,18 +72,12 @@ def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
 
 def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
     """What planner and Diffusion Policy take alike, with a network for sequences of that many columns."""
-    lookup(NETWORKS, section.network, "planner.network")
+    build = lookup(NETWORKS, section.network, "planner.network")["build"]
     pairs = task.relative_columns()
     features = RelativePositionFeatures(pairs) if pairs else None
     seen = section.frames * task.state_dim + (0 if features is None else features.num_features)
-    if section.network == "unet":
-        network: nn.Module = TemporalUnet(
-            size, seen, channels=(section.width, 2 * section.width), frequencies=section.octaves
-        )
-    else:
-        network = MLPDenoiser(size, seen, horizon=HORIZON, width=section.width, frequencies=section.octaves)
     return {
-        "denoiser": network,
+        "denoiser": build(size, seen, width=section.width, frequencies=section.octaves, horizon=HORIZON),
         "state_dim": task.state_dim,
         "history": section.frames,
         "horizon": HORIZON,
@@ -79,9 +109,14 @@ def build_controller(
 
 
 def sizes_of(planner: StatePlanner) -> dict[str, Any]:
-    """Options that a planner was built with."""
+    """Options that a planner was built with; a ValueError for one with a network from outside the library."""
     network = planner.denoiser
     unet = isinstance(network, TemporalUnet)
+    if not isinstance(network, TemporalUnet | MLPDenoiser):
+        raise ValueError(
+            f"planner: its denoiser is a {type(network).__name__}: register it (register_network), and give its name as"
+            ' {"network": NAME} instead'
+        )
     width = network.shrink[0].out_channels if unet else network.first.out_features
     octaves = len(network.encoder.frequencies)
     return {"network": "unet" if unet else "mlp", "width": width, "octaves": octaves, "frames": planner.history}
