@@ -51,6 +51,12 @@ def test_a_run_of_seven_joints(run):
     assert any(fault.startswith("plans are worse than standing still (columns in rad)") for fault in result["faults"])
 
 
+@pytest.mark.parametrize("name", ["episodes", "rollouts_per_context", "batch_size"])
+def test_options_of_rollouts_are_refused_where_there_are_none(run, name):
+    with pytest.raises(ValueError, match=f"{name}: task 'arm' has no environment to roll out in: name one with --env"):
+        evaluate(run, EvalConfig(threads=1, **{name: 4}))
+
+
 def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
     evaluate(run, FEW)
     page = write_report(run).read_text()

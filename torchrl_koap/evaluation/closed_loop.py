@@ -69,6 +69,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task
     if task.env is None and config.env is None:
+        usual = EvalConfig()
+        for name in ("episodes", "rollouts_per_context", "batch_size", "contexts_file"):
+            if getattr(config, name) != getattr(usual, name):
+                raise ValueError(f"{name}: task {task.name!r} has no environment to roll out in: name one with --env")
         return _judge_offline(run, trained, config)
     if config.execution.strategy == "oracle" and config.env is not None:
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
