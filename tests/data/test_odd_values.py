@@ -88,3 +88,8 @@ def test_a_trajectory_in_another_unit():
     frames[2] = np.degrees(frames[2])
     (warning,) = scale_warnings(frames, called, ["q"], "column")
     assert re.fullmatch("column 'q' reaches .* times as far as usual in c: another unit, or .*", warning)
+    joints = [np.hstack([np.degrees(np.sin(TIME + index)) + 90, np.zeros_like(TIME)]) for index in range(4)]
+    assert not [*scale_warnings(joints, called, ["q", "still"], "column")]
+    joints[1] = np.radians(joints[1])
+    (warning,) = scale_warnings(joints, called, ["q", "still"], "column")
+    assert warning.startswith("no column moves a twentieth as far as usual in b: another unit")

@@ -106,7 +106,10 @@ def mark_warnings(rows: np.ndarray, names: Sequence[str], kind: str) -> Iterator
 def scale_warnings(
     trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str], kind: str
 ) -> Iterator[str]:
-    """Finds trajectories in which a column reaches twenty times as far as in three quarters of the others."""
+    """Finds trajectories in which a column reaches twenty times as far as in three quarters of the others.
+
+    Also found are those in which no column moves a twentieth as far as in three quarters of them.
+    """
     known = [(name, rows) for name, rows in zip(called, trajectories, strict=True) if len(rows)]
     if len(known) < 3:
         return
@@ -121,6 +124,11 @@ def scale_warnings(
                 f"{kind} {name!r} reaches {times:.3g} times as far as usual in {where}: another unit, or a measurement"
                 " that failed?"
             )
+    moved = np.stack([np.ptp(rows, axis=0) for _, rows in known])
+    usual = np.sort(moved, axis=0)[(len(known) + 2) // 4]
+    little = np.flatnonzero((OTHER * moved < usual)[:, usual > 0].all(1) & moved[:, usual > 0].any(1))
+    if len(little):
+        yield f"no {kind} moves a twentieth as far as usual in {some([known[at][0] for at in little])}: another unit?"
 
 
 def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> Iterator[str]:
