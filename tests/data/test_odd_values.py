@@ -92,4 +92,4 @@ def test_a_trajectory_in_another_unit():
     assert not [*scale_warnings(joints, called, ["q", "still"], "column")]
     joints[1] = np.radians(joints[1])
     (warning,) = scale_warnings(joints, called, ["q", "still"], "column")
-    assert warning.startswith("no column moves a twentieth as far as usual in b: another unit")
+    assert warning.startswith("most columns move less than a twentieth as far as usual in b: another unit")

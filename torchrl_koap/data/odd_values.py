@@ -108,7 +108,7 @@ def scale_warnings(
 ) -> Iterator[str]:
     """Finds trajectories in which a column reaches twenty times as far as in three quarters of the others.
 
-    Also found are those in which no column moves a twentieth as far as in three quarters of them.
+    Also found are those in which most columns move, but less than a twentieth as far as in half of the others.
     """
     known = [(name, rows) for name, rows in zip(called, trajectories, strict=True) if len(rows)]
     if len(known) < 3:
@@ -125,10 +125,12 @@ def scale_warnings(
                 " that failed?"
             )
     moved = np.stack([np.ptp(rows, axis=0) for _, rows in known])
-    usual = np.sort(moved, axis=0)[(len(known) + 2) // 4]
-    little = np.flatnonzero((OTHER * moved < usual)[:, usual > 0].all(1) & moved[:, usual > 0].any(1))
+    usual = np.median(moved, axis=0)
+    few = (moved > 0) & (OTHER * moved < usual)
+    little = np.flatnonzero(2 * few.sum(1) > (usual > 0).sum())
     if len(little):
-        yield f"no {kind} moves a twentieth as far as usual in {some([known[at][0] for at in little])}: another unit?"
+        where = some([known[index][0] for index in little])
+        yield f"most {kind}s move less than a twentieth as far as usual in {where}: another unit?"
 
 
 def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> Iterator[str]:
