@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import statistics
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,11 +80,13 @@ def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, An
     observations = 0.01 * np.random.default_rng(0).standard_normal((config.steps, trained.task.observation_dim))
     if trained.cameras:
         observations = [Observer(trained.task, trained.cameras).example()] * config.steps
-    if not config.async_replan:
-        policy.check_rate(rate)
-        return run_control_loop(Agent(policy), observations, control_hz=rate)
-    with AsynchronousAgent(policy, control_hz=rate) as agent:
-        return run_control_loop(agent, observations, control_hz=rate)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "at the start of this episode")  # made-up observations
+        if not config.async_replan:
+            policy.check_rate(rate)
+            return run_control_loop(Agent(policy), observations, control_hz=rate)
+        with AsynchronousAgent(policy, control_hz=rate) as agent:
+            return run_control_loop(agent, observations, control_hz=rate)
 
 
 def run_control_loop(agent: Agent, observations: Sequence[Any] | np.ndarray, *, control_hz: float) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A policy in a control loop: the actions of a rollout, one robot or a batch, and clear refusals."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -75,6 +77,19 @@ def test_reset_forgets_the_episode_before():
         runs.append(actions)
     np.testing.assert_array_equal(*runs)
     assert agent.latency()["steps"] == 12 and agent.latency()["p50"] <= agent.latency()["p99"] <= agent.latency()["max"]
+
+
+def test_a_start_far_from_the_demonstrations_is_told():
+    policy = policy_of()
+    policy.planner.fit_normalizers(torch.rand(50, 16, 2))
+    agent = ready(policy)
+    with pytest.warns(UserWarning, match=r"columns \[1\] of the state lie beyond the demonstrated range by more than"):
+        agent.act(np.array([1.9, 57.3]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        agent.act(np.array([1.9, 57.3]))  # told once in an episode
+        agent.reset()
+        agent.act(np.array([-0.9, 1.9]))
 
 
 def test_refusals():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,6 +17,7 @@ from torch import Tensor
 from torchrl_koap.keys import observed_numbers
 from torchrl_koap.modules.execution.policy import IS_INIT, PlanningPolicy
 from torchrl_koap.modules.execution.policy_env import NoiseStreams
+from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
 KEPT = 10_000  # latencies of the last steps
 
@@ -38,6 +40,9 @@ class Agent:
 
     Keyword Args:
         seed (int): seed of the plans' start noise; robot ``i`` of a batch draws with ``seed + i``.
+
+    Warns:
+        UserWarning: if an episode starts far outside of the demonstrated range of a state column.
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
@@ -155,6 +160,15 @@ class Agent:
             columns = bad.any(0).nonzero().flatten().tolist()
             raise ValueError(f"columns {columns} of the observation are NaN or infinite as {self.dtype}")
         if self._shape is None:
-            self.policy.state_of(read)  # refuses another width before anything is kept
+            state = self.policy.state_of(read)  # refuses another width before anything is kept
+            planner = self.policy.planner
+            far = planner.far(state).any(0) if isinstance(planner, ConditionalSampler) else state.new_zeros(0)
+            if far.any():
+                columns = far.nonzero().flatten().tolist()
+                warnings.warn(
+                    f"at the start of this episode columns {columns} of the state lie beyond the demonstrated range by"
+                    " more than that range: another unit, or another robot?",
+                    stacklevel=4,
+                )
         self._shape = shape
         return read

@@ -129,6 +129,12 @@ class ConditionalSampler(TensorDictModuleBase):
             )
         return self.condition_normalizer(self.condition(history))
 
+    def far(self, state: Tensor) -> Tensor:
+        """Says which columns of states ``[*B, d]`` are beyond the range fitted to by more than that range, as bool."""
+        end, fitted = self.history * self.state_dim, self.condition_normalizer
+        now = slice(end - self.state_dim, end)
+        return (state - fitted.offset[now]).abs() > 3 * fitted.scale[now]
+
     def sample(self, history: Tensor, noise: Tensor | None = None, *, prefix: Tensor | None = None) -> Tensor:
         """Samples sequences ``[*B, H, width]`` for histories ``[*B, h, d]``, both in raw units.
 
