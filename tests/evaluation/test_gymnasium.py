@@ -3,6 +3,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 from offline_runs import record
@@ -13,6 +14,7 @@ from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfi
 from torchrl_koap.evaluation import InspectConfig, closed_loop, inspect
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.reports.inspection_plots import draw_experiments
+from torchrl_koap.reports.rows import as_text, evaluation_rows
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.runs.run_directory import RunDirectoryError
 
@@ -77,6 +79,16 @@ def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
     assert [row["outcome"] for row in found["episode"]] == ["success", "error", "success"]
     assert found["errors"] == [{"seed": 11, "step": 1, "error": "reset: RuntimeError: no place"}]
     assert any("failed by an error of the environment: seed 11, step 1" in fault for fault in found["faults"])
+
+
+def test_an_episode_that_an_error_ended_is_not_in_the_mean_return(arm_run):
+    config = EvalConfig(episodes=3, seed=10, env="toy_gym:ToyBreaks-v0", env_kwargs=("terminates=won",), threads=1)
+    found = evaluate(arm_run, config)
+    assert found["mean_return"] == 1.0 and found["rates"]["success"] == rate([True, False, True])
+    row = as_text(evaluation_rows(RunFacts.read(arm_run)))["environment"]
+    assert row.endswith("mean return 1 (1 rollouts that an error ended are left out)")
+    found = evaluate(arm_run, replace(config, episodes=1, seed=11))
+    assert found["mean_return"] is None and found["left_out_of_return"] == 1
 
 
 def test_limited_commands_are_those_of_the_rollouts(arm_run, monkeypatch):

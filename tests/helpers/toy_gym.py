@@ -41,8 +41,8 @@ class Reach(gymnasium.Env):
 
 
 class Breaks(Reach):
-    def __init__(self, at=None):
-        super().__init__(key="is_success")
+    def __init__(self, at=None, **options):
+        super().__init__(key="is_success", **options)
         self.at = at
 
     def reset(self, *, seed=None, options=None):

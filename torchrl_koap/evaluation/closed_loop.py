@@ -103,7 +103,11 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     result |= where.facts
     if where.record is not None:
         result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
-        result["mean_return"] = statistics.fmean(float(episode["next", "reward"].sum()) for episode in episodes)
+        # rewards that an error cut short are no return
+        played = [episode for episode, row in zip(episodes, rows, strict=True) if row["outcome"] != "error"]
+        returns = [float(episode["next", "reward"].sum()) for episode in played]
+        result["mean_return"] = statistics.fmean(returns) if returns else None
+        result["left_out_of_return"] = len(episodes) - len(returns)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(

@@ -189,7 +189,9 @@ def _environment(run: RunFacts) -> Row | None:
     success = f"success: info[{made['success_key']!r}]" if made.get("success_key") else made.get("success")
     limit = f"at most {made['step_limit']}" if made.get("step_limit") else None
     total = number(made.get("mean_return"))
-    gained = None if total is None else f"mean return {total:.4g}"
+    left = run.evaluated("left_out_of_return")
+    without = f" ({left:g} rollouts that an error ended are left out)" if left else ""
+    gained = None if total is None else f"mean return {total:.4g}{without}"
     return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, success, gained))))
 
 
