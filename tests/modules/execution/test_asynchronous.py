@@ -128,6 +128,23 @@ def test_refusals():
         AsynchronousAgent(policy_of(strategy="open_loop"), control_hz=30)
 
 
+def test_who_was_closed_says_so_at_once():
+    agent = make_agent()
+    agent.reset()
+    agent.act(np.zeros(2))
+    agent.close()
+    for call in (lambda: agent.act(np.zeros(2)), agent.reset, lambda: agent.reset(np.zeros(2))):
+        with pytest.raises(RuntimeError, match="the agent was closed: make a new one"):
+            call()
+    agent.close()
+
+
+@pytest.mark.parametrize("wrong", ["runs/arm", object()])
+def test_what_is_no_policy_is_refused_as_by_the_agent(wrong):
+    with pytest.raises(TypeError, match=r"policy must come from load_policy\(\) or Trained.policy\(\), got"):
+        AsynchronousAgent(wrong, control_hz=30)
+
+
 def test_plans_are_followed_as_the_policy_follows_them():
     planner, law = small_planner(), ResponseModel([0, 1], [0, 1], [0, 1])
     law.weight[[0, 1], [0, 1], 2] = 0.3

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,6 +42,8 @@ class AsynchronousAgent(Agent):
         seed (int): as for :class:`Agent`.
 
     Raises:
+        RuntimeError: if it is asked to act or :meth:`reset` after :meth:`close`.
+        TypeError: for anything else than a policy, such as the name of its file.
         ValueError: for another strategy, or a rate that is not positive.
 
     Examples:
@@ -56,8 +59,11 @@ class AsynchronousAgent(Agent):
     """
 
     _plan: Tensor | None  # [n, H, d], the current one
+    _pending: Future[tuple[Tensor, float]] | None = None
+    _closed = False
 
     def __init__(self, policy: PlanningPolicy, *, control_hz: float, seed: int = 0):
+        super().__init__(policy, seed=seed)
         if policy.execution.strategy != "feedback":
             raise ValueError(
                 f"plans are made asynchronously with strategy 'feedback', not {policy.execution.strategy!r}"
@@ -66,8 +72,6 @@ class AsynchronousAgent(Agent):
         self.control_hz = control_hz
         self._delay = 1  # steps that a plan takes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="planner")
-        self._pending: Future[tuple[Tensor, float]] | None = None
-        super().__init__(policy, seed=seed)
 
     def __enter__(self) -> AsynchronousAgent:
         return self
@@ -76,7 +80,8 @@ class AsynchronousAgent(Agent):
         self.close()
 
     def close(self) -> None:
-        """Waits for the plan in progress, and ends the thread."""
+        """Waits for the plan in progress, and ends the thread: the agent acts no more."""
+        self._closed = True
         self._thread.shutdown(wait=True)
 
     def reset(self, observation: object = None) -> None:
@@ -85,9 +90,18 @@ class AsynchronousAgent(Agent):
         From the first observation, ``[obs]`` or ``[n, obs]``, the first plan is made now; without one it is made in the
         first :meth:`act`, which waits for it.
         """
+        self._refuse_closed()
         super().reset()
         if observation is not None:
             self._make_first(self._checked(observation).unsqueeze(-2).expand(-1, self.policy.history, -1))
+
+    def _checked(self, observation: Any) -> Tensor:
+        self._refuse_closed()
+        return super()._checked(observation)
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise RuntimeError("the agent was closed: make a new one")
 
     def _forget(self) -> None:
         super()._forget()
