@@ -105,7 +105,7 @@ def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
 
 def check_new(folder: str | Path) -> None:
     """Raises a FileExistsError where a folder holds a data set, recordings or a run already."""
-    if find_format(folder) is not None or (Path(folder) / "config.json").exists():
+    if (Path(folder) / "config.json").exists() or find_format(folder) is not None:
         raise FileExistsError(f"{folder} holds a data set, recordings or a run already; choose another --out")
 
 

@@ -1,11 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The format of a folder, file or name decides who reads it; what is written is read back."""
 
+import re
+
 import numpy as np
 import pytest
 from recording_writers import WRITERS, columns
 
-from torchrl_koap.data import make_recordings, read_recordings, save_demonstrations
+from torchrl_koap.data import make_recordings, open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.formats import FORMATS, write_recordings
 from torchrl_koap.files import DataError
 
@@ -48,6 +50,13 @@ def test_nothing_to_read(tmp_path):
         read_recordings(tmp_path)
     with pytest.raises(FileNotFoundError, match="none does not exist"):
         read_recordings(tmp_path / "none")
+
+
+def test_a_run_is_no_recording(trained_run, demonstrations):
+    said = f"it is a run of `koap train`, which was trained on the data set {demonstrations}"
+    for read in (read_recordings, open_dataset):
+        with pytest.raises(DataError, match=re.escape(said)):
+            read(trained_run)
 
 
 @pytest.mark.parametrize("kind", [name for name, form in FORMATS.items() if form.write is not None])

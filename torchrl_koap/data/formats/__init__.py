@@ -22,7 +22,7 @@ from torchrl_koap.data.formats.tables import read_tables, table_files
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
 from torchrl_koap.data.ted import load_ted, read_about, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import option
+from torchrl_koap.files import DataError, option, read_json
 from torchrl_koap.lookup import lookup
 
 __all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recordings", "write_recordings"]
@@ -187,7 +187,10 @@ def read_recordings(
 
 
 def find_format(source: str | Path) -> str | None:
-    """Which of the :data:`FORMATS` recordings are in; None if in none of them."""
+    """Which of the :data:`FORMATS` recordings are in; None if in none of them. A DataError refuses a run."""
+    config = Path(source) / "config.json"
+    if config.is_file() and config.with_name("metrics.csv").is_file() and "dataset" in (run := read_json(config)):
+        raise DataError(source, f"it is a run of `koap train`, which was trained on the data set {run['dataset']}")
     return next((name for name, form in FORMATS.items() if form.matches(str(source))), None)
 
 
