@@ -33,8 +33,16 @@ def test_signals_are_like_ctrl_c(number, status, monkeypatch, capsys):
         assert signal.getsignal(number) is before
     finally:
         signal.signal(number, earlier)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("koap: interrupted") and line.endswith("go on when called again")
+    by = "" if number == signal.SIGINT else f" by {number.name}"
+    assert capsys.readouterr().err == f"koap: interrupted{by}\n"
+
+
+@pytest.mark.parametrize("command", ["demos", "embed", "curve", "bench", "eval", "convert"])
+def test_only_a_command_that_goes_on_when_called_again_says_so(command, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "_run", Mock(side_effect=KeyboardInterrupt))
+    assert cli.main([command, "x"]) == 130
+    goes_on = "" if command in ("eval", "convert") else f"; `koap {command}` goes on when called again"
+    assert capsys.readouterr().err == f"koap: interrupted{goes_on}\n"
 
 
 def test_what_is_ignored_stays_ignored():

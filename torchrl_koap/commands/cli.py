@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         discard_output()
         return 141
     except KeyboardInterrupt as error:
-        message, status = describe_interrupt(error)
+        message, status = describe_interrupt(error, *arguments[:1])
         _complain(message)
         return status
     except Exception as error:

@@ -16,7 +16,7 @@ from types import FrameType
 # SIGHUP: the terminal was closed; other systems than Unix do not know it
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 _LEAST_COLUMNS = 40  # the help of a terminal with a single column never ends
-KEPT = "`koap demos`, `koap embed` and `koap curve` go on when called again"
+_GO_ON = ("demos", "embed", "curve", "bench")  # commands that go on when called again
 
 
 class ReadEnough(Exception):
@@ -31,14 +31,15 @@ class Interrupted(KeyboardInterrupt):
         super().__init__()
 
 
-def describe_interrupt(error: KeyboardInterrupt) -> tuple[str, int]:
-    """Returns what to say of an interrupt, and the exit status that shells expect of it.
+def describe_interrupt(error: KeyboardInterrupt, command: str = "") -> tuple[str, int]:
+    """Returns what to say of an interrupt of a command, and the exit status that shells expect of it.
 
     Its argument, if it has one, says how to go on.
     """
     number = error.number if isinstance(error, Interrupted) else signal.SIGINT
     by = "" if number == signal.SIGINT else f" by {signal.Signals(number).name}"
-    return f"interrupted{by}; {error.args[0] if error.args else KEPT}", 128 + number
+    how = error.args or ([f"`koap {command}` goes on when called again"] if command in _GO_ON else [])
+    return "; ".join([f"interrupted{by}", *how]), 128 + number
 
 
 @contextlib.contextmanager
