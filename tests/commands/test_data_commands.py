@@ -29,6 +29,19 @@ def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):
     assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
 
 
+@pytest.mark.parametrize("to", [(), ("--to", "npz")])
+def test_actions_that_are_known_in_part_are_counted(to, tmp_path, capsys):
+    rows = np.random.default_rng(0).normal(size=(30, 2))
+    (tmp_path / "raw").mkdir()
+    for name, unknown in {"a": 0, "b": 3}.items():
+        actions = rows[1:].copy()
+        actions[:unknown, 0] = np.nan
+        np.savez(tmp_path / "raw" / f"{name}.npz", states=rows, actions=actions, control_hz=9.0)
+    assert koap("convert", tmp_path / "raw", "--out", tmp_path / "arm", *to) == 0
+    said = r"skipped +actions of which only some columns are known \(3 in trajectory b.npz\)"
+    assert re.search(said, capsys.readouterr().out)
+
+
 def test_without_labels_no_training_is_proposed(tmp_path, capsys):
     (tmp_path / "raw").mkdir()
     np.savez(tmp_path / "raw" / "a.npz", states=np.random.default_rng(0).normal(size=(30, 2)), control_hz=9.0)

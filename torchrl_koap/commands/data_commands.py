@@ -193,7 +193,6 @@ class Convert(Command):
             "action kind": ", ".join(self.action_kind) or "delta (default)",
             "labels look": describe_likely(likely_kinds(data, task)) or "like no kind: too few",
             "constant in each trajectory": ", ".join(goal_columns(recordings)) or "nothing",
-            "skipped": ", ".join(recordings.skipped) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],
             **_numbered([str(warning.message) for warning in unlikely], data),
@@ -283,6 +282,7 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
         "actions": ", ".join(recordings.action_names),
         "frames per second": recordings.control_hz,
         "cameras": ", ".join(recordings.cameras) or "none",
+        "skipped": ", ".join(recordings.skipped) or "nothing",
     }
 
 

@@ -21,8 +21,10 @@ def test_one_action_per_frame_or_per_transition():
 def test_what_has_no_label():
     steps = np.ones((4, 2))
     steps[1, 0] = np.nan  # half an action is none
-    recordings = make_recordings([FRAMES, FRAMES, FRAMES], [None, steps, np.full((5, 2), np.nan)])
-    assert recordings.num_labels == 3 and recordings.skipped == ("1 actions of which only some columns are known",)
+    last = np.append(np.ones((4, 2)), [[1, np.nan]], axis=0)  # leads to no frame
+    recordings = make_recordings([FRAMES] * 4, [None, steps, np.full((5, 2), np.nan), last])
+    assert recordings.num_labels == 7
+    assert recordings.skipped == ("actions of which only some columns are known (1 in trajectory 1)",)
     assert np.isnan(recordings.actions[1][1]).all() and np.isnan(recordings.actions[0]).all()
     assert recordings.actions[0].shape == (4, 2)
 

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from torchrl_koap.data.formats.frames import Clip
-from torchrl_koap.files import DataError, gathered, option, refuse
+from torchrl_koap.files import DataError, gathered, option, refuse, some
 
 FRAMES, STEPS = "[T, d]", "[T, a] or [T - 1, a]"
 
@@ -164,14 +164,14 @@ def make_recordings(
     if control_hz is not None:
         problems += wrong_rate(control_hz, "control_hz")
     refuse(source, [*gathered(faults), *problems])
-    unknown = [np.isnan(array).sum(-1) for array in known if array is not None]
-    partly = sum(int(((0 < columns) & (columns < wide)).sum()) for columns in unknown)
     steps = [
         np.full((len(seen) - 1, wide), np.nan) if done is None else done[: len(seen) - 1]
         for seen, done in zip(frames, known, strict=True)
     ]  # an action of which some columns are unknown is unknown
+    partly = [int((np.isnan(part).any(-1) & ~np.isnan(part).all(-1)).sum()) for part in steps]
+    where = some([f"{number} in {name}" for number, name in zip(partly, what, strict=True) if number])
     steps = [np.where(np.isnan(part).any(-1, keepdims=True), np.nan, part) for part in steps]
-    skipped = [*skipped, *([f"{partly} actions of which only some columns are known"] if partly else [])]
+    skipped = [*skipped, *([f"actions of which only some columns are known ({where})"] if where else [])]
     return Recordings(
         frames,
         steps,
