@@ -11,8 +11,10 @@ import pytest
 from command_calls import fails
 from tiny_runs import TINY, koap, read_csv
 
+from torchrl_koap.lookup import _run_file
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.weights import load_tensors
+from torchrl_koap.training import Trained
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.methods import METHODS, get_method, register_method
 
@@ -116,8 +118,20 @@ def test_a_plugin_may_be_a_file_that_no_import_finds(tmp_path):
     (tmp_path / "mine.py").write_text("raise SystemError('it was run')")
     with pytest.raises(PluginError, match="mine.py' failed when it was imported: SystemError: it was run"):
         load_plugins([str(tmp_path / "mine.py")])
-    with pytest.raises(PluginError, match="none.py' failed when it was imported: FileNotFoundError"):
+    with pytest.raises(PluginError, match="there is no file '.*/none.py', which was named as a plugin"):
         load_plugins([str(tmp_path / "none.py")])
+
+
+def test_a_run_is_read_from_another_folder_than_that_of_its_plugin_file(demonstrations, tmp_path, monkeypatch):
+    monkeypatch.chdir(PLUGINS)
+    words = ("--plugin", f"./{NAME}.py", "--plugin", "json", "--method", NAME, "--dataset", demonstrations, *TINY)
+    assert koap("train", *words, "--out", tmp_path / "run") == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["run"]["plugins"] == [str(PLUGINS / f"{NAME}.py"), "json"]
+    monkeypatch.chdir(tmp_path)
+    METHODS.pop(NAME)
+    _run_file.cache_clear()  # as another process
+    assert Trained.load("run").method.name == NAME
 
 
 def test_what_is_no_method_is_refused():

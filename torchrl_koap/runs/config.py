@@ -13,7 +13,7 @@ from torchrl_koap.data import LabelBudget
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.device import PRECISIONS, check_machine
-from torchrl_koap.runs.plugins import Plugins
+from torchrl_koap.runs.plugins import Plugins, absolute_files
 from torchrl_koap.runs.progress import LOGGERS
 from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import HISTORY
@@ -131,7 +131,7 @@ class RunConfig:
         logger: "csv" (metrics.csv alone), or also "wandb" (offline unless WANDB_MODE says otherwise) or "tensorboard".
         resume: go on with an interrupted run; options that are not given are those it was started with.
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
-            reads the run.
+            reads the run, which keeps the absolute paths of files.
 
     Raises:
         ValueError: for a number out of range, or an unknown device, precision or logger.
@@ -147,6 +147,7 @@ class RunConfig:
 
     def __post_init__(self):
         _check("run", self, seed=_FROM_0)
+        object.__setattr__(self, "plugins", absolute_files(self.plugins))
         check_machine(self.threads, self.device)
         lookup(PRECISIONS, self.precision, "precision")
         lookup(LOGGERS, self.logger, "logger")

@@ -27,8 +27,7 @@ def load_plugins(names: Sequence[str]) -> None:
     The current directory is searched after the Python path, so that a file beside the data is found. A PluginError
     names a module that is not found, and where it was looked for, or what went wrong in its import.
     """
-    if isinstance(names, str):
-        raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")
+    names = absolute_files(names)
     here = os.getcwd()
     if names and here not in sys.path and "" not in sys.path:
         sys.path.append(here)
@@ -37,7 +36,18 @@ def load_plugins(names: Sequence[str]) -> None:
         _load(name)
 
 
+def absolute_files(names: Sequence[str]) -> tuple[str, ...]:
+    """Plugins with files by their absolute paths, which are the same from every folder; module names as they are."""
+    if isinstance(names, str):
+        raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")
+    return tuple(
+        os.path.abspath(os.path.expanduser(name)) if name.endswith(".py") else name for name in map(str, names)
+    )
+
+
 def _load(name: str) -> None:
+    if name.endswith(".py") and not os.path.isfile(name):
+        raise PluginError(f"there is no file {name!r}, which was named as a plugin")
     try:
         import_code(name)
     except Exception as error:
