@@ -67,12 +67,18 @@ def resolve(reference: Any, what: str) -> Any:
 
 def import_code(module: str) -> ModuleType:
     """Imports a module by its dotted name, or runs a file ``*.py``, which no import finds, once."""
-    return _run_file(module) if module.endswith(".py") else importlib.import_module(module)
+    return _run_file(absolute(module)) if module.endswith(".py") else importlib.import_module(module)
+
+
+def absolute(reference: str) -> str:
+    """Makes a file ``*.py``, or one of an import string ``"file.py:name"``, one that any folder finds."""
+    is_file = reference.partition(":")[0].endswith(".py")
+    return str(Path(reference).expanduser().resolve()) if is_file else reference
 
 
 @functools.cache
 def _run_file(path: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(Path(path).stem, Path(path).expanduser().resolve())
+    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} is no Python file")
     module = importlib.util.module_from_spec(spec)

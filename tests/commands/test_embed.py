@@ -11,6 +11,7 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Trained, load_policy
 from torchrl_koap.data.ted import load_ted
+from torchrl_koap.evaluation import loop_on_labels
 from torchrl_koap.runs.run_directory import copy_run
 from torchrl_koap.runs.weights import CheckpointError
 
@@ -65,6 +66,24 @@ def test_a_robot_gives_numbers_and_frames_to_run_and_file(run, tmp_path):
         np.testing.assert_allclose(agent.act(given), action, rtol=1e-3, atol=1e-4)
     with pytest.raises(CheckpointError, match="embeds frames by code of tiny_network: name it in plugins"):
         Trained.load(file)
+
+
+def test_a_plugin_is_taken_for_a_network_s_file_that_lies_elsewhere(run, tmp_path, monkeypatch):
+    trained = Trained.load(run)
+    trained.cameras["top"].about["network"] = "/elsewhere/net.py:random_layer"
+    file = trained.save(tmp_path / "policy.safetensors")
+    (tmp_path / "net.py").write_text("from tiny_network import random_layer\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError, match="embeds frames by code of net.py: name it in plugins"):
+        Trained.load(file)
+    loaded = Trained.load(file, plugins=["net.py"])
+    assert loaded.cameras["top"].about["network"] == f"{tmp_path}/net.py:random_layer"
+    assert loaded.policy().observe.example()["top"].shape == (16, 24, 3)
+    with pytest.raises(ValueError, match="camera 'top': network: module '/elsewhere/net.py' cannot be imported"):
+        trained.policy()
+    monkeypatch.setattr(loop_on_labels, "_EXPLAINED", -1)
+    monkeypatch.setattr(loop_on_labels, "_DRIFT", 1e9)
+    assert loop_on_labels.check_loop(trained, trained.data(), trained.data())["robots"] == 12  # its data are embedded
 
 
 def test_an_environment_gives_its_pictures(run, tmp_path):

@@ -128,6 +128,15 @@ def test_networks_may_be_modules_files_and_without_maps(tmp_path):
         load_backbone("builtins:int")
 
 
+def test_a_network_s_file_is_found_from_any_folder(tmp_path, monkeypatch):
+    (tmp_path / "own.py").write_text("from torch.nn import AvgPool2d\nnetwork, runs = AvgPool2d(8), []\n")
+    monkeypatch.chdir(tmp_path)
+    backbone = load_backbone("./own.py:network")
+    monkeypatch.chdir("/")
+    assert backbone.name == f"{tmp_path}/own.py:network"
+    assert load_backbone(backbone.name).stages is backbone.stages  # the file is run once
+
+
 def test_networks_that_are_missing(monkeypatch):
     for name, said in {
         "none.pth": "wanted an import string",

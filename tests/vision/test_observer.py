@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_koap.tasks import Action, Task
-from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, load_backbone, load_encoder
+from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, WeightsError, load_backbone, load_encoder
 
 OWN = "tiny_network:random_layer"
 FRAME = np.random.default_rng(0).integers(0, 256, (16, 24, 3), dtype=np.uint8)
@@ -68,3 +68,14 @@ def test_a_camera_needs_its_part_of_the_task():
     task = Task(name="arm", observation_parts={"top": 3, "x": 1}, actions={"a": Action("m")}, position="x")
     with pytest.raises(ValueError, match="camera 'wrist' has embeddings of 4 columns, task 'arm' has none"):
         Observer(task, cameras)
+
+
+def test_networks_are_loaded_before_the_first_frame(monkeypatch):
+    observe, cameras = make()
+    task = Task(name="arm", observation_parts={"wrist": 4}, actions={"a": Action("m")}, position="wrist")
+    monkeypatch.setattr("torchrl_koap.vision.observer.load_encoder", pytest.fail)
+    assert observe(observe.example()).shape == (11,)
+    monkeypatch.undo()
+    cameras["wrist"].about["network"] = "/nowhere/net.py:network"
+    with pytest.raises(WeightsError, match="^camera 'wrist': network: module '/nowhere/net.py' cannot be"):
+        Observer(task, {"wrist": cameras["wrist"]})

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -78,6 +78,7 @@ def check_loop(
     if not _replay_error(response, data) < _DRIFT:
         return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
     asked = (execution or ExecutionConfig()).on(trained.execution)
+    trained = replace(trained, cameras={})  # labels hold embeddings
     free = trained.policy(asked.replaced(limits=math.inf))
     steps = min(STEPS, task.max_steps)
     commands, *where = _roll(free, response, data, steps, seed)

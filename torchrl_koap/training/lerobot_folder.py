@@ -72,8 +72,9 @@ def write_lerobot_folder(trained: Trained, out: str | Path) -> dict[str, Any]:
     inputs = {
         name: {"type": "ENV" if name == SURROUNDINGS else "STATE", "shape": [len(numbers[name])]} for name in numbers
     }
+    example = Observer(trained.task, trained.cameras).example()
     for name, feature in cameras.items():
-        height, width, colours = Observer(trained.task, trained.cameras).example()[name].shape
+        height, width, colours = example[name].shape
         inputs[feature] = {"type": "VISUAL", "shape": [colours, height, width]}
     outputs = {ACTION: {"type": "ACTION", "shape": [trained.task.action_dim]}}
     config = {"type": _KIND, "n_obs_steps": policy.history, "input_features": inputs, "output_features": outputs}

@@ -16,6 +16,7 @@ from torchrl_koap.data import open_dataset
 from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.files import some
+from torchrl_koap.lookup import absolute
 from torchrl_koap.modules import Execution, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.modules.execution.followers import Follower
 from torchrl_koap.runs.config import TrainConfig
@@ -78,7 +79,7 @@ class Trained:
         """Loads a run directory, ``"pretrained:NAME"``, or a file of :meth:`save`.
 
         Plugins are modules that register the task or method, or hold the network that embeds frames. Those of a run are
-        imported first; a file cannot have them imported itself.
+        imported first; a file cannot have them imported itself. One is taken for a network's file of the same name.
 
         Raises:
             RunDirectoryError: if the folder is no finished run.
@@ -87,7 +88,13 @@ class Trained:
         """
         load_plugins(plugins)
         path = find_run(where)
-        return cls._from_file(path, plugins) if path.is_file() else cls._from_folder(path)
+        trained = cls._from_file(path, plugins) if path.is_file() else cls._from_folder(path)
+        own = {Path(name).name: absolute(name) for name in plugins}
+        for projection in trained.cameras.values():
+            file, _, name = projection.about["network"].rpartition(":")
+            if Path(file).name in own:
+                projection.about["network"] = f"{own[Path(file).name]}:{name}"
+        return trained
 
     @classmethod
     def _from_folder(cls, path: Path) -> Trained:
@@ -127,7 +134,8 @@ class Trained:
             hint = f"; it was made with the plugins {', '.join(map(str, needs))}" if needs else ""
             raise CheckpointError(f"{path} cannot be built: {problem}{hint}") from error
         load_parts(path, tensors, {"planner": planner, "controller": controller})
-        code = {facts["network"].rpartition(":")[0] for facts in about.get(CAMERAS, {}).values()} - {"", *plugins}
+        code = {Path(facts["network"].rpartition(":")[0]).name for facts in about.get(CAMERAS, {}).values()}
+        code -= {"", *(Path(name).name for name in plugins)}
         if code:  # a file that somebody sent must not decide what is run
             raise CheckpointError(f"{path} embeds frames by code of {some(sorted(code))}: name it in plugins")
         results = {"command_ranges": about.get("command_ranges")}

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_koap.files import sha256_of
-from torchrl_koap.lookup import resolve
+from torchrl_koap.lookup import absolute, resolve
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torchvision normalises
 NETWORK = "efficientnet_lite0"
@@ -79,6 +79,7 @@ def load_backbone(network: str | None = None) -> Backbone:
     """
     if network in (None, NETWORK):
         return Backbone(*_lite0(_BLOCKS), NETWORK)
+    network = absolute(network)
     found = resolve(network, "network")
     stages = found if isinstance(found, nn.Module) else found()
     if not isinstance(stages, nn.Module):

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_koap.data.formats.frames import fault_of
 from torchrl_koap.keys import observed_numbers
 from torchrl_koap.tasks import Task
+from torchrl_koap.vision.backbones import WeightsError
 from torchrl_koap.vision.encoder import FrozenImageEncoder, Projection, load_encoder
 
 STATE = "state"
@@ -23,11 +24,11 @@ class Observer:
 
     Args:
         task (Task): whose observation; a part with the name of a camera is that camera's embedding.
-        cameras (mapping): projection of every camera; its network is loaded with the first frame.
+        cameras (mapping): projection of every camera; its network is loaded here.
 
     Raises:
-        ValueError: if the task has no part of a camera's name and size. In use, for entries that are missing, unknown,
-            of another width or no frames.
+        ValueError: if the task has no part of a camera's name and size, or its network cannot be loaded. In use, for
+            entries that are missing, unknown, of another width or no frames.
 
     Examples:
         >>> import numpy as np
@@ -50,7 +51,7 @@ class Observer:
         self._numbers = {name: width for name, width in widths.items() if name not in cameras}  # no embeddings
         self._needed = [*([] if self._numbers.keys() <= {*task.hidden} else [STATE]), *cameras]
         self.state_dim = sum(self._numbers.values())  # columns that are no embedding
-        self._encoders: dict[str, FrozenImageEncoder] = {}
+        self._encoders = {name: _load(name, projection) for name, projection in cameras.items()}
 
     @classmethod
     def of(cls, task: Task, cameras: Mapping[str, Projection]) -> Observer | None:
@@ -91,6 +92,11 @@ class Observer:
         fault = fault_of(given if given.ndim < 4 else given[(0,) * (given.ndim - 3)])
         if fault is not None:
             raise ValueError(f"the frame of camera {name!r} {fault}")
-        if name not in self._encoders:
-            self._encoders[name] = load_encoder(self.cameras[name])
         return self._encoders[name].embed(torch.from_numpy(np.ascontiguousarray(given)))
+
+
+def _load(name: str, projection: Projection) -> FrozenImageEncoder:
+    try:
+        return load_encoder(projection)
+    except ValueError as error:
+        raise WeightsError(f"camera {name!r}: {error}") from error
