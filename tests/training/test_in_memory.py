@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Fitting in memory does what `koap train` does, on data that lack labels."""
 
+from pathlib import Path
+
 import numpy as np
 import offline_runs
 import pytest
@@ -11,12 +13,15 @@ from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.data import LabelBudget, cut_windows, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.data.ted import load_ted
 from torchrl_koap.files import DataError
-from torchrl_koap.modules import StatePlanner, TemporalUnet
+from torchrl_koap.modules import LinearInverseDynamics, StatePlanner, TemporalUnet
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.objectives import DiffusionPolicyLoss, KOAPLoss
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import WINDOW
+from torchrl_koap.training import METHODS, Method
 from torchrl_koap.training import planner as planner_training
+from torchrl_koap.training.controller import check_lengths
+from torchrl_koap.training.defaults import resolve
 
 NAMES = ["q1", "q2", "goal_1", "goal_2"]
 SMALL = {"batch_size": 8, "width": 8}
@@ -179,6 +184,35 @@ def test_a_short_recording_is_refused_before_the_planner_is_trained(preset, monk
     data, task = make_demonstrations(**few_labels(states=[states[0][:9], *states[1:]], actions=[None, *actions[1:]]))
     with pytest.raises(ValueError, match=r"1 of 6 trajectories are shorter than a window .*: 0 \(8 steps\)"):
         fit(data, task, controller={"preset": preset})
+
+
+class Failing(LinearInverseDynamics):
+    def predict(self, state, frames=None):
+        return {}["speed"]
+
+
+@pytest.mark.parametrize(
+    ("network", "says"),
+    [
+        (LinearInverseDynamics(4, 3), r"method 'odd': its network gave \[1, 16, 3\], wanted \[1, 16, 2\]"),
+        (Failing(4, 2), r"method 'odd': its network failed on .* \[1, 16, 4\]: KeyError: 'speed'"),
+    ],
+)
+def test_a_method_that_cannot_act_is_refused_before_the_planner_is_trained(network, says, monkeypatch):
+    for module in ("in_memory", "on_disk"):
+        monkeypatch.setattr(f"torchrl_koap.training.{module}.learn_planner", pytest.fail)
+    monkeypatch.setitem(METHODS, "odd", Method("odd", "", lambda *_: network, closed_form=True))
+    data, task = make_demonstrations(**few_labels())
+    with pytest.raises(ValueError, match=says):
+        fit(data, task, method="odd", controller={"columns": "all"})
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_is_asked_of_a_method_before_its_training_leaves_random_numbers_as_they_are(method):
+    data, task = make_demonstrations(**few_labels())
+    before = torch.get_rng_state()
+    check_lengths(task, resolve(TrainConfig(out=Path(), method=method), task), data)
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_refusals():

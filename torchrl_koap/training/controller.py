@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
@@ -23,7 +23,7 @@ from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import FITTED, augmentation
-from torchrl_koap.training.policy_facts import command_ranges, controller_data, with_commands
+from torchrl_koap.training.policy_facts import command_ranges, controller_data, state_reader, with_commands
 from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
@@ -60,13 +60,32 @@ def learn_controller(
 
 
 def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None:
-    """Refuses flat data ``[N]`` of which a trajectory is shorter than a window, before anything is trained."""
+    """Refuses flat data ``[N]`` of which a trajectory is shorter than a window, before anything is trained.
+
+    A controller that does not give actions of the task's width is refused, too.
+    """
     method, window, past = get_method(config.method), WINDOW, 1
     if method.plans and method.fit is None:
         with torch.random.fork_rng(devices=[]):
-            controller = build_controller(task, method, config.controller)
-        window, past = max(WINDOW, controller.num_window_frames), controller.num_past
+            controller = build_controller(task, method, config.controller).eval()
+            window, past = max(WINDOW, controller.num_window_frames), controller.num_past
+            _check_actions(task, config, controller, window)
     WindowTable.build(data, window, pad_before=past)
+
+
+def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, window: int) -> None:
+    """Runs a controller once on a window of zeros."""
+    states, wanted = torch.zeros(1, window, state_reader(task, config.controller).width), [1, window, task.action_dim]
+    try:
+        with torch.no_grad():
+            given = controller.predict(states)  # in normalised units: statistics would hide a width of 1
+            if list(given.shape) == wanted:
+                given = controller(TensorDict({"state": states}, [1]))[controller.out_keys[-1]]
+    except Exception as error:
+        said = f"its network failed on a window of states {list(states.shape)}: {type(error).__name__}: {error}"
+        raise ValueError(f"method {config.method!r}: {said}") from error
+    if list(given.shape) != wanted:
+        raise ValueError(f"method {config.method!r}: its network gave {list(given.shape)}, wanted {wanted}")
 
 
 def _train_network(
