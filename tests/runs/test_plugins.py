@@ -118,7 +118,7 @@ def test_a_plugin_may_be_a_file_that_no_import_finds(tmp_path):
     (tmp_path / "mine.py").write_text("raise SystemError('it was run')")
     with pytest.raises(PluginError, match="mine.py' failed when it was imported: SystemError: it was run"):
         load_plugins([str(tmp_path / "mine.py")])
-    with pytest.raises(PluginError, match="there is no file '.*/none.py', which was named as a plugin"):
+    with pytest.raises(PluginError, match="there is no plugin file '.*/none.py'"):
         load_plugins([str(tmp_path / "none.py")])
 
 

@@ -1,6 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A training as one file acts as it did, and files that cannot be used are named."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, load_policy
 from torchrl_koap.commands.doctor import check_run
+from torchrl_koap.runs.plugins import PluginError
 from torchrl_koap.runs.run_directory import RunDirectoryError, copy_run
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
@@ -90,6 +92,16 @@ def test_a_robot_that_nobody_registered(own, tmp_path):
     np.testing.assert_array_equal(actions(loaded.policy(), PATH[:, :3]), actions(own.policy(), PATH[:, :3]))
     again = Trained.load(loaded.save(tmp_path / "again.safetensors"))
     np.testing.assert_array_equal(actions(again.policy(), PATH[:, :3]), actions(own.policy(), PATH[:, :3]))
+
+
+def test_a_plugin_that_was_moved_is_taken_from_where_it_is_now(copied_run, tmp_path):
+    config = json.loads((copied_run / "config.json").read_text())
+    config["run"]["plugins"] = [str(tmp_path / "there" / "mine.py")]
+    (copied_run / "config.json").write_text(json.dumps(config))
+    with pytest.raises(PluginError, match="there is no plugin file '.*/there/mine.py'; --plugin says where"):
+        Trained.load(copied_run)
+    (tmp_path / "mine.py").write_text("LOADED = True\n")
+    assert Trained.load(copied_run, plugins=[str(tmp_path / "mine.py")]).planner is not None
 
 
 def test_files_that_cannot_be_used_are_named(own, trained_run, tmp_path):

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from torchrl_koap.lookup import import_code
+from torchrl_koap.lookup import absolute, import_code
 
 # a field of options: tuple of module names, on the command line `--plugin NAME`, as often as there are any
 Plugins = Annotated[tuple[str, ...], tyro.conf.arg(name="plugin", metavar="MODULE"), tyro.conf.UseAppendAction]
@@ -40,14 +40,12 @@ def absolute_files(names: Sequence[str]) -> tuple[str, ...]:
     """Plugins with files by their absolute paths, which are the same from every folder; module names as they are."""
     if isinstance(names, str):
         raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")
-    return tuple(
-        os.path.abspath(os.path.expanduser(name)) if name.endswith(".py") else name for name in map(str, names)
-    )
+    return tuple(absolute(str(name)) for name in names)
 
 
 def _load(name: str) -> None:
     if name.endswith(".py") and not os.path.isfile(name):
-        raise PluginError(f"there is no file {name!r}, which was named as a plugin")
+        raise PluginError(f"there is no plugin file {name!r}; --plugin says where one is now")
     try:
         import_code(name)
     except Exception as error:

@@ -79,7 +79,7 @@ class Trained:
         """Loads a run directory, ``"pretrained:NAME"``, or a file of :meth:`save`.
 
         Plugins are modules that register the task or method, or hold the network that embeds frames. Those of a run are
-        imported first; a file cannot have them imported itself. One is taken for a network's file of the same name.
+        imported first; a file cannot have them imported itself. Files among them replace recorded ones of their names.
 
         Raises:
             RunDirectoryError: if the folder is no finished run.
@@ -88,7 +88,7 @@ class Trained:
         """
         load_plugins(plugins)
         path = find_run(where)
-        trained = cls._from_file(path, plugins) if path.is_file() else cls._from_folder(path)
+        trained = cls._from_file(path, plugins) if path.is_file() else cls._from_folder(path, plugins)
         own = {Path(name).name: absolute(name) for name in plugins}
         for projection in trained.cameras.values():
             file, _, name = projection.about["network"].rpartition(":")
@@ -97,10 +97,11 @@ class Trained:
         return trained
 
     @classmethod
-    def _from_folder(cls, path: Path) -> Trained:
+    def _from_folder(cls, path: Path, plugins: Sequence[str]) -> Trained:
         run = RunDirectory(path)
         config, content = read_config(run), run.read_json("config.json")
-        load_plugins(config.run.plugins)
+        given = {Path(name).name for name in plugins}
+        load_plugins([name for name in config.run.plugins if Path(name).name not in given])
         try:
             task = task_from(config.task, content.get("task_definition"))
             planner, controller = build_networks(task, config)
