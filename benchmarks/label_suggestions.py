@@ -68,7 +68,7 @@ def error_of(
     controller.action_normalizer.load_state_dict(normalizer.state_dict())
     fit_closed_form(controller, labelled, **action_facts(task, task.controller_columns("robot")))
     with torch.no_grad():
-        decoded = controller.raw_action(controller.decode(test["latent_action"]), test["state"])
+        decoded = controller.raw_action(controller.decode(test["latent_action"]))
         return 1e3 * (decoded - test["action"]).square().mean().sqrt().item()
 
 

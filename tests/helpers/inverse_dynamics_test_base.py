@@ -95,15 +95,6 @@ class InverseDynamicsTestBase:
         other.load_state_dict(network.state_dict())
         assert torch.equal(other(TensorDict({"state": state}, [2, 4]))["action"], action)
 
-    def test_columns_that_are_not_read_and_targets_of_actions(self):
-        plain, state = self.fitted(self.make_network()), torch.randn(4, T, 5)
-        network = self.make_network(columns=(4, 0, 2), targets=(1, 3))
-        network.load_state_dict(plain.state_dict())
-        distance = plain(TensorDict({"state": state[..., [4, 0, 2]]}, [4]))["action"]
-        action = network(TensorDict({"state": state}, [4]))["action"]
-        torch.testing.assert_close(action, distance + state[..., [1, 3]])
-        torch.testing.assert_close(network.normalize_action(action, state), network.predict(state))
-
     def test_a_missing_entry_is_named(self):
         network = self.make_network()
         network.set_keys(state=("in", "x"))

@@ -28,7 +28,7 @@ class NearestNeighbours(InverseDynamics):
     def fit_labels(self, windows, mask, **_):
         """Remembers the windows of the labelled frames."""
         self.windows = self.reader(self.normalize_state(windows["state"]))[mask].clone()
-        self.actions = self.normalize_action(windows["action"][mask], windows["state"][mask])
+        self.actions = self.normalize_action(windows["action"][mask])
         return {"labels_used": int(mask.sum())}
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):

@@ -30,15 +30,15 @@ _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are rea
 def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase, *, every: int = 1) -> TensorDict:
     """Infers the latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
 
-    Where ``every`` is above 1, one step of so many is looked at. Entries ``[M]``: ``latent_action [M, m]``, ``state``,
-    ``action``, ``has_action [M]``, ``episode [M]``.
+    Where ``every`` is above 1, one step of so many is looked at. Entries ``[M]``: ``latent_action [M, m]``, ``action``,
+    ``has_action [M]``, ``episode [M]``.
     """
     now = controller.num_past
     table = WindowTable.build(data, controller.num_window_frames, pad_before=now)
     states, rows = data[STATE], torch.arange(0, len(table.starts), every, device=table.starts.device)
     latent = [controller.infer(states[table.frames(part)[0]], range(now, now + 1))[:, 0] for part in rows.split(4096)]
     here = data[table.starts[rows] + now]
-    entries = {"latent_action": torch.cat(latent)} | {key: here[key] for key in (STATE, ACTION, EPISODE)}
+    entries = {"latent_action": torch.cat(latent)} | {key: here[key] for key in (ACTION, EPISODE)}
     return TensorDict(entries | {HAS_ACTION: here[HAS_ACTION].squeeze(-1)}, [len(rows)])
 
 
@@ -187,7 +187,7 @@ def analyse_latent(
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()
     with torch.no_grad():
-        decoded = controller.raw_action(controller.decode(latent[~fit]), steps[STATE][~fit])
+        decoded = controller.raw_action(controller.decode(latent[~fit]))
         own = explained(decoded, action[~fit])
     result[OUTSIDE_THE_BUDGET] = {
         "labels_read": len(steps),

@@ -32,10 +32,7 @@ class InverseDynamics(TensorDictModuleBase):
             ``num_window_frames`` and :meth:`valid_frames` of its own.
 
     Keyword Args:
-        columns (sequence of int, optional): state columns that are read. Default: all.
-        targets (sequence of int): for actions that say where to go, the state column of each: an action is learned as
-            the distance to it. Default: actions are learned as they are.
-        state_normalizer (nn.Module, optional): maps the columns that are read to the networks' units.
+        state_normalizer (nn.Module, optional): maps states to the networks' units.
         action_normalizer (nn.Module, optional): its ``inverse`` maps predicted actions to raw units.
 
     It reads the window of raw states ``[*B, T, d]`` from ``"state"`` and writes raw actions ``[*B, T, act]`` to
@@ -63,8 +60,6 @@ class InverseDynamics(TensorDictModuleBase):
         self,
         reader: WindowReader | None = None,
         *,
-        columns: Sequence[int] | None = None,
-        targets: Sequence[int] = (),
         state_normalizer: nn.Module | None = None,
         action_normalizer: nn.Module | None = None,
     ):
@@ -72,8 +67,6 @@ class InverseDynamics(TensorDictModuleBase):
         self.in_keys, self.out_keys = [STATE], [ACTION]
         self._out_key: NestedKey = ACTION  # out_keys may be selected
         self.register_module("reader", reader)  # where a part holds it, a property of the subclass finds it there
-        self.columns = None if columns is None else list(columns)
-        self.targets = list(targets)
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
 
     @property
@@ -109,19 +102,16 @@ class InverseDynamics(TensorDictModuleBase):
         return self.reader.valid_frames(num_frames)
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Selects the columns of raw states ``[*B, T, d]`` that are read, in the networks' units."""
-        state = state if self.columns is None else state[..., self.columns]
+        """Maps raw states ``[*B, T, d]`` to the networks' units."""
         return state if self.state_normalizer is None else self.state_normalizer(state)
 
-    def normalize_action(self, action: Tensor, state: Tensor) -> Tensor:
-        """Maps raw actions ``[*B, act]``, taken in states ``[*B, d]``, to the networks' units."""
-        action = action - state[..., self.targets] if self.targets else action
+    def normalize_action(self, action: Tensor) -> Tensor:
+        """Maps raw actions ``[*B, act]`` to the networks' units."""
         return action if self.action_normalizer is None else self.action_normalizer(action)
 
-    def raw_action(self, action: Tensor, state: Tensor) -> Tensor:
+    def raw_action(self, action: Tensor) -> Tensor:
         """Inverts :meth:`normalize_action`."""
-        action = action if self.action_normalizer is None else self.action_normalizer.inverse(action)
-        return action + state[..., self.targets] if self.targets else action
+        return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
 
     def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
         """Sets before training what is known of raw states ``[*B, T, d]`` without labels: the spread of every step.
@@ -195,14 +185,14 @@ class InverseDynamics(TensorDictModuleBase):
             raise ValueError(f"no labelled frame lies in frames {frames.start}..{frames.stop - 1} of any window")
         states, action, mask = states[rows], action[rows], mask[rows]
         inputs = torch.cat([read(some, frames) for some in states.split(BATCH)])[mask]
-        action = self.normalize_action(action[:, part][mask], states[:, part][mask])
+        action = self.normalize_action(action[:, part][mask])
         return inputs, action, None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)[mask]
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of every frame."""
         state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
-        return tensordict.set(self.out_key, self.raw_action(self.predict(state), state))
+        return tensordict.set(self.out_key, self.raw_action(self.predict(state)))
 
 
 class LatentInverseDynamics(InverseDynamics):
@@ -243,4 +233,4 @@ class LatentInverseDynamics(InverseDynamics):
         state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
         latent = self.infer(state)
         tensordict.set(self.latent_key, latent)
-        return tensordict.set(self.out_key, self.raw_action(self.decode(latent), state))
+        return tensordict.set(self.out_key, self.raw_action(self.decode(latent)))

@@ -142,7 +142,7 @@ class WindowLoss(NetworkLoss):
         counts = self._read_mask(tensordict, "has_action", state)[..., frames] & recorded[..., frames]
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         action = torch.where(counts.unsqueeze(-1), action, 0.0)
-        return self.network.normalize_action(action, state[..., frames, :]), counts
+        return self.network.normalize_action(action), counts
 
     def _action_error(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Mean squared error ``[*B, frames]`` of actions that must have as many columns as they are decoded to."""

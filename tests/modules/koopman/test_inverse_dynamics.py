@@ -89,7 +89,7 @@ def test_decoder_is_fitted_on_the_labelled_frames_that_count():
     assert result["labels_used"] == len(rows)
     model.eval()
     latent = torch.stack([model.infer(data["state"])[i, t] for i, t in rows])
-    target = torch.stack([model.normalize_action(data["action"][i, t], data["state"][i, t]) for i, t in rows])
+    target = torch.stack([model.normalize_action(data["action"][i, t]) for i, t in rows])
     number = torch.tensor([i // 3 for i, _ in rows])
     expected = ridge(latent, target, groups=number, input_noise=INPUT_NOISE)
     assert result["penalty"] == expected.penalty

@@ -75,7 +75,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         lifting (KoopmanLifting or CompactLifting): the networks ``g``.
         operator (KoopmanOperator): the matrix ``K``.
         penalty (float): ridge of the decoder where fewer than three trajectories have labels. Defaults to ``0.15``.
-        **kwargs: columns and normalisers, see :class:`~torchrl_koap.modules.InverseDynamics`.
+        **kwargs: normalisers, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
         ValueError: if the sizes of the parts do not fit together, or the decoder does not read what the network writes.

@@ -99,16 +99,14 @@ def make_koopman_inverse_dynamics(
     preset: str = "default",
     state_normalizer: nn.Module | None = None,
     action_normalizer: nn.Module | None = None,
-    columns: tuple[int, ...] | None = None,
-    targets: tuple[int, ...] = (),
     **overrides,
 ) -> KoopmanInverseDynamics:
     """Builds a :class:`KoopmanInverseDynamics` from a preset; keywords override single choices.
 
-    Normalisers, ``columns`` and ``targets`` are those of :class:`~torchrl_koap.modules.InverseDynamics`.
+    Normalisers are those of :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Args:
-        state_dim (int): number of state columns that are read.
+        state_dim (int): number of state columns.
         action_dim (int): size of an action.
 
     Keyword Args:
@@ -164,8 +162,6 @@ def make_koopman_inverse_dynamics(
         lifting=lifting,
         operator=operator,
         penalty=choice["penalty"],
-        columns=columns,
-        targets=targets,
         state_normalizer=state_normalizer,
         action_normalizer=action_normalizer,
     )
