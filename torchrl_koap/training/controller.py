@@ -80,7 +80,7 @@ def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, windo
         with torch.no_grad():
             given = controller.predict(states)  # in normalised units: statistics would hide a width of 1
             if list(given.shape) == wanted:
-                given = controller(TensorDict({"state": states}, [1]))[controller.out_keys[-1]]
+                given = controller(TensorDict({controller.in_key: states}, [1]))[controller.out_key]
     except Exception as error:
         said = f"its network failed on a window of states {list(states.shape)}: {type(error).__name__}: {error}"
         raise ValueError(f"method {config.method!r}: {said}") from error
