@@ -36,6 +36,16 @@ def test_standard_and_rms(dtype):
     assert Normalizer.fit(torch.zeros(3, 1), mode="rms").scale.item() == 1.0
 
 
+@pytest.mark.parametrize("mode", ["minmax", "standard", "shared", "rms", "moving"])
+def test_many_columns_are_as_each_of_them(mode):
+    values = torch.randn(300, 70) * torch.linspace(1, 5, 70)
+    whole = Normalizer.fit(values, mode=mode)
+    each = [Normalizer.fit(column, mode="standard" if mode == "shared" else mode) for column in values.split(1, -1)]
+    torch.testing.assert_close(whole.offset, torch.cat([one.offset for one in each]))
+    scale = torch.cat([one.scale for one in each])
+    torch.testing.assert_close(whole.scale, scale.amax().expand(70) if mode == "shared" else scale)
+
+
 def test_a_column_that_rarely_moves_is_scaled_by_how_far_it_moves_then():
     values = torch.tensor([5.0, 5.0, 0.0]).repeat(20_000, 1)
     values[::20, 0] = 5.0 + 3.0 * torch.tensor([1.0, -1.0]).repeat(500)

@@ -99,7 +99,7 @@ def test_of_much_data_some_windows_are_as_good_as_all(monkeypatch):
 
     monkeypatch.setattr(StatePlanner, "fit_normalizers", noted)
     every = scale()
-    monkeypatch.setattr(planner_file, "FITTED", 300)
+    monkeypatch.setattr(planner_file, "MOST_WINDOWS", 300)
     torch.testing.assert_close(scale(), every, rtol=0.1, atol=0)
     assert taken == [18 * 58, 300]  # two trajectories are held out
 

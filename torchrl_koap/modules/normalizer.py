@@ -21,10 +21,11 @@ def _moving(values: Tensor) -> tuple[Tensor, Tensor]:
     return rest, (apart.square() * moving).sum(0).div(moving.sum(0).clamp(min=1)).sqrt()
 
 
+_COLUMNS = 32  # at a time
 MODES = {
     "minmax": _minmax,
     "standard": lambda x: (x.mean(0), x.std(0, correction=0)),
-    "shared": lambda x: (x.mean(0), x.std(0, correction=0).amax().expand(x.shape[-1]).clone()),
+    "shared": lambda x: (x.mean(0), x.std(0, correction=0)),  # and of these the largest
     "rms": lambda x: (torch.zeros_like(x[0]), x.square().mean(0).sqrt()),
     "moving": _moving,
 }
@@ -111,9 +112,12 @@ class Normalizer(nn.Module):
             count = int(bad.any(-1).sum())
             raise ValueError(f"{count} of {len(rows)} rows are NaN or infinite, in columns {columns}")
 
-        rows = rows.double()
-        offset, scale = statistics(rows)
-        rounding = 4 * torch.finfo(values.dtype).eps * rows.abs().amax(0)
+        # in double precision, of some columns at a time: of all of them it may take gigabytes
+        parts = [(*statistics(part), part.abs().amax(0)) for part in map(Tensor.double, rows.split(_COLUMNS, -1))]
+        offset, scale, largest = map(torch.cat, zip(*parts, strict=True))
+        if mode == "shared":
+            scale = scale.amax().expand_as(scale)
+        rounding = 4 * torch.finfo(values.dtype).eps * largest
         scale = torch.where(scale <= rounding, 1.0, scale)
         scale = torch.where(scale.to(values.dtype) > 0, scale, 1.0)  # too small for the type of the values
         return cls(rows.shape[-1], offset=offset.to(values.dtype), scale=scale.to(values.dtype))

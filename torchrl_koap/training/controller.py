@@ -22,11 +22,12 @@ from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
-from torchrl_koap.training.planner import FITTED, augmentation
+from torchrl_koap.training.planner import MOST_WINDOWS, augmentation
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, state_reader, with_commands
 from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
+FITTED = 50_000  # windows that statistics without labels are fitted to
 _KEYS = ["state", "action", "has_action"]
 
 
@@ -142,7 +143,7 @@ def _train_sampler(
     has_action = data["has_action"].squeeze(-1)
     seen = data[torch.isin(data["episode"], data["episode"][has_action])]
     extended = extrapolate_ends(seen, HORIZON - 1)
-    states = cut_windows(extended, WINDOW, select=["state"], pad_before=1, most=FITTED)["state"]
+    states = cut_windows(extended, WINDOW, select=["state"], pad_before=1, most=MOST_WINDOWS)["state"]
     sampler.fit_normalizers(states, data["action"][has_action])
     sampler.to(config.run.device)
     # at the end of a demonstration only the steps that were recorded count

@@ -35,7 +35,7 @@ from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner
 
 SITUATIONS, SAMPLES = 64, 4  # held out, and plans in each, that weights are chosen by
-FITTED = 50_000  # windows that statistics without labels are taken of
+MOST_WINDOWS = 400_000  # windows that statistics are taken of; fewer miss rare steps, which scale plans
 RECORDED = 8192  # windows, of which the nearest one is looked for
 CHECKS = 30  # scores in a training at most
 COST = 0.05  # share of the training time that they may take
@@ -66,7 +66,7 @@ def learn_planner(
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
     extended = extrapolate_ends(data, planner.horizon - 1)
-    windows = cut_windows(extended, length, select=["state"], pad_before=1, most=FITTED)["state"]
+    windows = cut_windows(extended, length, select=["state"], pad_before=1, most=MOST_WINDOWS)["state"]
     planner.fit_normalizers(windows[:, unseen:])
     planner.to(config.run.device)
     augment = augmentation(task, windows)
