@@ -209,14 +209,13 @@ def errors_of_chunks(
     episodes = episodes_outside(data, labelled)
     keys = ["state", "action", "has_action", "episode"]
     now = history - 1
-    windows = cut_windows(data, now + policy.horizon, select=keys, pad_before=now).cpu()
-    windows = windows[windows["has_action"][:, now, 0]]
-    known = cut_windows(labelled, history + 1, select=keys, pad_before=now).cpu()
-    known = known[known["has_action"][:, now, 0]]
-    windows = windows[torch.isin(windows["episode"][:, -1], episodes.cpu())]
+    outside = data[torch.isin(data["episode"], episodes)]
+    windows = cut_windows(outside, now + policy.horizon, select=keys, pad_before=now).cpu()
+    windows = spread_evenly(windows[windows["has_action"][:, now, 0]], SITUATIONS)
     if not len(windows):
         return {"note": "no trajectory outside the budget has labels"}
-    windows = spread_evenly(windows, SITUATIONS)
+    known = cut_windows(labelled, history + 1, select=keys, pad_before=now).cpu()
+    known = known[known["has_action"][:, now, 0]]
 
     def moved(action: Tensor, states: Tensor) -> Tensor:
         """Absolute actions as distances from where their columns are in the present frame."""

@@ -71,6 +71,7 @@ def learn_planner(
     planner.to(config.run.device)
     augment = augmentation(task, windows)
     score = None if held_out is None else plan_score(planner, held_out, spread_evenly(windows, RECORDED), task)
+    del windows  # may be larger than the data
     buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
     weights = column_weights(task)

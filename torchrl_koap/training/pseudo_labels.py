@@ -36,9 +36,11 @@ def relabel(controller: InverseDynamics, data: TensorDictBase, *, window: int) -
     continued = extrapolate_ends(data, window - 1 - now)
     # one window per hidden step, in the order of the data: the one that has the step at frame `now`
     frames, _ = WindowTable.build(continued, window, counted=range(now, window - 1), pad_before=now).frames(hidden)
-    parts = [TensorDict({controller.in_key: continued[STATE][part]}, part.shape) for part in frames.split(_BATCH)]
-    if hidden.any():
-        action[hidden] = torch.cat([controller(part)[controller.out_key][:, now] for part in parts])
+    rows = hidden.nonzero().squeeze(-1)
+    for first in range(0, len(rows), _BATCH):
+        part = slice(first, first + _BATCH)
+        windows = TensorDict({controller.in_key: continued[STATE][frames[part]]}, frames[part].shape)
+        action[rows[part]] = controller(windows)[controller.out_key][:, now]
     if bad := int((~action[hidden].isfinite().all(-1)).sum()):
         raise ValueError(f"the controller's actions are not finite in {bad} of {int(hidden.sum())} steps")
     return data.copy().update({ACTION: action, HAS_ACTION: torch.ones_like(data[HAS_ACTION])})
