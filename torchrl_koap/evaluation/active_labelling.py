@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -202,7 +202,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     data, report = trained.hide_labels(recorded)
     each = -(-len(data) // _MOST_STEPS)  # that one step stands for
     steps = infer_steps(controller, trained.seen(data), every=each)
-    choices = rank_trajectories(
+    ranked = rank_trajectories(
         steps["latent_action"],
         steps[EPISODE],
         steps[HAS_ACTION],
@@ -210,14 +210,10 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         count=config.count,
         bias=bool(controller.action_decoder.linear.bias.any()),
     )
+    choices = [replace(choice, score=choice.score / each) for choice in ranked]
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
     rows = [
-        {
-            "rank": rank,
-            "steps": int((unlabelled == choice.episode).sum()),
-            "episode": choice.episode,
-            "score": choice.score / each,
-        }
+        {"rank": rank, "steps": int((unlabelled == choice.episode).sum()), **asdict(choice)}
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()

@@ -14,6 +14,10 @@ def _minmax(values: Tensor) -> tuple[Tensor, Tensor]:
     return (high + low) / 2, (high - low) / 2
 
 
+def _standard(values: Tensor) -> tuple[Tensor, Tensor]:
+    return values.mean(0), values.std(0, correction=0)
+
+
 def _moving(values: Tensor) -> tuple[Tensor, Tensor]:
     rest = values[:: -(-len(values) // 10_000)].median(0).values  # the median of all takes seconds
     apart = (values - rest).abs()
@@ -22,10 +26,11 @@ def _moving(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 _COLUMNS = 32  # at a time
+# offset and scale of each column; those of "shared" take the largest scale together
 MODES = {
     "minmax": _minmax,
-    "standard": lambda x: (x.mean(0), x.std(0, correction=0)),
-    "shared": lambda x: (x.mean(0), x.std(0, correction=0)),  # and of these the largest
+    "standard": _standard,
+    "shared": _standard,
     "rms": lambda x: (torch.zeros_like(x[0]), x.square().mean(0).sqrt()),
     "moving": _moving,
 }

@@ -16,7 +16,6 @@ from torchrl_koap.data import open_dataset
 from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.files import some
-from torchrl_koap.lookup import absolute
 from torchrl_koap.modules import Execution, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.modules.execution.followers import Follower
 from torchrl_koap.runs.config import TrainConfig
@@ -89,11 +88,8 @@ class Trained:
         load_plugins(plugins)
         path = find_run(where)
         trained = cls._from_file(path, plugins) if path.is_file() else cls._from_folder(path, plugins)
-        own = {Path(name).name: absolute(name) for name in plugins}
         for projection in trained.cameras.values():
-            file, _, name = projection.about["network"].rpartition(":")
-            if Path(file).name in own:
-                projection.about["network"] = f"{own[Path(file).name]}:{name}"
+            projection.find_network(plugins)
         return trained
 
     @classmethod

@@ -19,6 +19,7 @@ from torchrl.envs.transforms import ObservationTransform
 from torchrl_koap.data.ted import stored_folder
 from torchrl_koap.files import check_file, option, replacing_file
 from torchrl_koap.keys import read_entry
+from torchrl_koap.lookup import absolute
 from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
 
 BATCH = 32  # frames that go through the network at once
@@ -226,6 +227,13 @@ class Projection(nn.Module):
         with replacing_file(path) as aside:
             save_file(tensors, aside, self.about)
         return Path(path)
+
+    def find_network(self, files: Sequence[str]) -> None:
+        """Takes the file of its network from among those given, if one has the same name."""
+        file, _, name = self.about["network"].rpartition(":")
+        for each in files:
+            if Path(each).name == Path(file).name:
+                self.about["network"] = f"{absolute(each)}:{name}"
 
     def kept(self, features: Tensor) -> float:
         """Computes the share of the variance of features ``[N, F]`` that reconstructed ones keep."""
