@@ -18,7 +18,7 @@ def test_data_of_an_own_task_are_validated_without_naming_it(arm, capsys):
     assert koap("validate", arm) == 0
     assert "no problem found" in capsys.readouterr().out
     assert koap("validate", arm, "--task", "sorting") == 1
-    assert "holds its own task 'arm'; --task sorting does not fit it" in capsys.readouterr().err
+    assert "holds its own task 'arm', not 'sorting'" in capsys.readouterr().err
 
 
 def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):

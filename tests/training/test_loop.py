@@ -324,6 +324,15 @@ def test_a_hundred_gradients_tell_the_usual_length():
         assert factor == pytest.approx(wanted)
 
 
+def test_a_training_whose_first_gradients_are_zero_begins_later():
+    x = nn.Parameter(torch.zeros(1))
+    limit = OutlierLimit([x], decay=0.999)
+    for length in [0.0] * (SETTLED + 1) + [3.0]:
+        x.grad = torch.full_like(x, length)
+        factor = limit().item()
+    assert factor == 1.0 and x.grad.item() == 3.0
+
+
 @pytest.mark.parametrize("updates, averaged", [(8, [4, 8]), (6, [4, 6]), (1, [1])])
 def test_the_average_is_stepped_every_fourth_update_and_at_the_end(updates, averaged):
     class Average:

@@ -96,7 +96,7 @@ def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
         return get_task(name or DEFAULT_TASK)
     own = stored_task(folder)
     if name not in (None, own.name):
-        raise ValueError(f"dataset {str(dataset)!r} holds its own task {own.name!r}; --task {name} does not fit it")
+        raise ValueError(f"dataset {str(dataset)!r} holds its own task {own.name!r}, not {name!r}")
     if name is not None and TASKS.get(name, own) != own:
         said = f"dataset {str(dataset)!r} holds its own task {name!r}, which differs from the registered one"
         warnings.warn(f"{said}: the data set's is used; save the data again to use the other", stacklevel=2)

@@ -102,7 +102,7 @@ register_task(
         observation_units=_SCOOPING.observation_units + ("m",) * 2,
         hidden=("spoon", "bowl"),
         env_options={"task": "scooping_moving_bowl"},
-        # the nearest other picture may show the bowl elsewhere: no gain (docs/results/scooping.md)
+        # the nearest other picture may show the bowl elsewhere
         defaults=replace(_SCOOPING.defaults, neighbor_recovery=0.0),
         scene=replace(
             _SCOOPING.scene,

@@ -227,7 +227,7 @@ class OutlierLimit(nn.Module):
         length = torch.nn.utils.get_total_norm(gradients)
         typical = (self.mean_square / (1 - self.decay**self.seen)).sqrt()
         factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or not finite
-        factor = torch.where(self.seen < SETTLED, 1.0, factor).to(length)
+        factor = torch.where((self.seen < SETTLED) | (typical == 0), 1.0, factor).to(length)
         if factor.is_cuda or factor < 1:  # not read on a GPU, which would have to be waited for
             torch._foreach_mul_(gradients, factor)
         self.mean_square.lerp_((factor * length).square().to(self.mean_square), 1 - self.decay)
