@@ -121,4 +121,4 @@ def test_labels_that_say_little_are_named(trained):
     noisy = recordings(noise=1.0)[0]
     noisy["next", "observation"] = noisy["observation"] + torch.randn(noisy["observation"].shape)
     found = check_loop(trained[0], noisy, noisy)
-    assert "of its motion, which is too little" in found["note"] and found["faults"] == []
+    assert "of how all state columns change, which is too little" in found["note"] and found["faults"] == []

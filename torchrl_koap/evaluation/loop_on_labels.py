@@ -73,8 +73,8 @@ def check_loop(
         return {"note": "no command changes in the labels", "faults": []}
     response = _fit(data)
     if response.explained < _EXPLAINED:
-        share = f"{max(response.explained, 0):.0%} of its motion, which is too little"
-        return {"note": f"a linear model of the robot explains {share}", "faults": []}
+        share = f"{max(response.explained, 0):.0%} of how all state columns change, which is too little"
+        return {"note": f"a linear model explains {share}", "faults": []}
     if not _replay_error(response, data) < _DRIFT:
         return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
     asked = (execution or ExecutionConfig()).on(trained.execution)
