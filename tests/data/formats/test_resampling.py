@@ -55,6 +55,16 @@ def test_steps_with_an_unlabelled_part(kind, known):
     np.testing.assert_array_equal(np.isfinite(found.actions[0][:4, 0]), known)
 
 
+def test_quaternions_keep_their_length_where_their_sign_changes():
+    """The small column would be interpolated through zero, the large one would not."""
+    half = 1.1 - TIME
+    turn = np.stack([np.cos(half), np.sin(half), 0 * TIME, 0 * TIME]) * np.where(TIME < 1, 1, -1)
+    (found,) = resampled(recorded(*turn, TIME), 33).states
+    np.testing.assert_allclose(np.linalg.norm(found[:, :4], axis=1), 1, atol=1e-3)
+    apart = np.abs(found[:, 0] * np.cos(1.1 - found[:, 4]) + found[:, 1] * np.sin(1.1 - found[:, 4]))
+    assert apart.min() > np.cos(1 / 40)  # half a recorded step
+
+
 def test_leaps_are_not_filled():
     angle = (3 * TIME + 1 + np.pi) % (2 * np.pi) - np.pi
     quaternion = np.cos(TIME) * np.where(TIME < 1, 1, -1)

@@ -19,6 +19,7 @@ LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and
 MOST = 2.0  # new frames in one recorded step
 _LEVELS = 10  # a column of no more integers is a switch
 _SAME = 1e-3  # share of a step that is rounding
+_UNIT = 0.01  # how far the length of a quaternion may be from 1
 
 
 def resampled(
@@ -75,6 +76,7 @@ def resampled(
     columns = np.concatenate(recordings.states).T
     switches = [bool((each == each.round()).all()) and len(np.unique(each)) <= _LEVELS for each in columns]
     bounds = np.where(switches, 0, leap_bounds(recordings.states)[0])
+    starts = quaternion_starts(recordings.states)
     parts: list[tuple[str, np.ndarray, np.ndarray, int, np.ndarray]] = []
     gaps: list[str] = []
     short: list[str] = []
@@ -91,7 +93,7 @@ def resampled(
                 continue
             labels = _actions(steps[start : end - 1], at[span], new, adding, UNEVEN * step)
             rows = start + np.searchsorted((at[span][1:] + at[span][:-1]) / 2, new)
-            parts.append((called, _states(frames[span], at[span], new, bounds), labels, number, rows))
+            parts.append((called, _states(frames[span], at[span], new, bounds, starts), labels, number, rows))
     if not parts:
         raise DataError("these recordings", f"no trajectory has two frames at {control_hz:g} Hz")
     notes = [f"{len(gaps)} gaps in time, where trajectories were split: {some(gaps)}"] if gaps else []
@@ -119,13 +121,33 @@ def leap_bounds(trajectories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndar
     return np.maximum(LEAP * spans, UNUSUAL * usual), usual
 
 
-def _states(frames: np.ndarray, times: np.ndarray, new: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+def quaternion_starts(trajectories: Sequence[np.ndarray]) -> list[int]:
+    """Finds where quaternions begin in ``[T_i, d]``: the first of four neighbouring columns of length 1."""
+    return [
+        start
+        for start in range(trajectories[0].shape[1] - 3)
+        if all((np.abs(np.linalg.norm(rows[:, start : start + 4], axis=1) - 1) <= _UNIT).all() for rows in trajectories)
+    ]
+
+
+def sign_flips(frames: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+    """Marks the steps ``[T - 1, d]`` in which a quaternion of four columns changes its sign."""
+    flips = np.zeros((len(frames) - 1, frames.shape[1]), dtype=bool)
+    for start in starts:
+        turn = frames[:, start : start + 4]
+        flips[:, start : start + 4] |= ((turn[1:] * turn[:-1]).sum(1) < 0)[:, None]
+    return flips
+
+
+def _states(
+    frames: np.ndarray, times: np.ndarray, new: np.ndarray, bounds: np.ndarray, starts: Sequence[int]
+) -> np.ndarray:
     """States ``[T, d]`` at new times within the recorded ones."""
     before = np.clip(np.searchsorted(times, new, side="right") - 1, 0, len(times) - 2)
     share = np.clip((new - times[before]) / (times[before + 1] - times[before]), 0, 1)[:, None]
     step = frames[before + 1] - frames[before]
     return np.where(
-        np.abs(step) > bounds,
+        (np.abs(step) > bounds) | sign_flips(frames, starts)[before],
         np.where(share < 0.5, frames[before], frames[before + 1]),
         frames[before] + share * step,
     )
