@@ -73,6 +73,13 @@ def test_signs_of_quaternions(signs):
     assert not [*quaternion_warnings([np.hstack([turn, TIME])] * 2, names)]
 
 
+def test_a_quaternion_that_leaps_in_one_column_is_no_wrapped_angle():
+    turn = np.hstack([np.cos(TIME / 9), np.sin(TIME / 9), 0 * TIME, 0 * TIME]) * np.where(TIME < 1, 1, -1)
+    assert seen(turn) == []
+    (warning,) = quaternion_warnings([turn], ["w", "x", "y", "z"])
+    assert "in 1 frames" in warning and warning.endswith("do the same on the robot")
+
+
 @pytest.mark.parametrize("kind", ["column", "action"])
 def test_marks_of_what_is_missing(kind):
     rows = np.where(np.arange(60)[:, None] % 7, np.sin(TIME), -999)

@@ -7,24 +7,25 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds
+from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds, quaternion_starts, sign_flips
 from torchrl_koap.files import some
 
 AWAY, OFTEN = 10.0, 3  # a mark lies that many ranges of the others away from them, and stands so often
 OTHER = 20.0  # times as far as in most trajectories
-_UNIT = 0.01  # how far the length of a quaternion may be from 1
 
 
 def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
     """Finds columns of ``[T_i, d]`` whose largest step is above 1/3 of their range and twenty times the usual one.
 
-    It says why, and what would mend them.
+    It says why, and what would mend them. :func:`quaternion_warnings` tells of quaternions that change their sign.
     """
     bound, usual = leap_bounds(trajectories)
     low, high = (end(np.concatenate(trajectories), axis=0) for end in (np.min, np.max))
     found: dict[str, list[str]] = {}
+    starts = quaternion_starts(trajectories)
+    leaps = [(np.abs(np.diff(frames, axis=0)) > bound) & ~sign_flips(frames, starts) for frames in trajectories]
     for column, name in enumerate(names):
-        where = [np.flatnonzero(np.abs(np.diff(frames[:, column])) > bound[column]) for frames in trajectories]
+        where = [np.flatnonzero(leap[:, column]) for leap in leaps]
         number = sum(map(len, where))
         if not number:
             continue
@@ -66,23 +67,16 @@ def _cause(values: np.ndarray, near: float, flipped: bool, most: bool, wraps: bo
 
 
 def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
-    """Finds four neighbouring columns of length 1 whose sign changes often, or from one trajectory to another.
-
-    A few changes inside of trajectories are leaps already.
-    """
-    bound, _ = leap_bounds(trajectories)
-    for start in range(len(names) - 3):
+    """Finds four neighbouring columns of length 1 whose sign changes, also from one trajectory to another."""
+    for start in quaternion_starts(trajectories):
         turns = [frames[:, start : start + 4] for frames in trajectories]
-        if any((np.abs(np.linalg.norm(turn, axis=1) - 1) > _UNIT).any() for turn in turns):
-            continue
-        steps = np.concatenate([np.diff(turn, axis=0)[(turn[1:] * turn[:-1]).sum(1) < 0] for turn in turns])
-        leaps = bool((np.abs(steps) > bound[start : start + 4]).any())
+        flips = sum(int(sign_flips(turn, [0])[:, 0].sum()) for turn in turns)
         opposite = sum(bool(np.linalg.norm(turn[0] + turns[0][0]) < 0.5) for turn in turns)
-        if (len(steps) and not leaps) or opposite:
-            said = f"in {len(steps)} frames, and in {opposite} trajectories against that of the first"
+        if flips or opposite:
             yield (
-                f"columns {', '.join(names[start : start + 4])} are a quaternion that changes its sign {said}: flip it"
-                " where its product with the frame before, or with the first of all, is negative"
+                f"columns {', '.join(names[start : start + 4])} are a quaternion that changes its sign in {flips}"
+                f" frames, and in {opposite} trajectories against that of the first: flip it where its product with the"
+                " frame before is negative, in first frames that with the first of all; do the same on the robot"
             )
 
 
