@@ -61,6 +61,13 @@ def test_a_gripper_of_two_values():
         demonstrations(PATHS, opening, action_kind=["delta", "gripper"])
 
 
+def test_targets_and_a_gripper_have_one_cure():
+    steps = [np.column_stack([aims, aims[:, 0] > 0]) for aims in TARGETS]
+    said = warnings(PATHS, steps, acting=("a", "b", "grip"))
+    cure = "again with --action-kind absolute absolute raw --targets shoulder.pos 'elbow pos'"
+    assert len(said) == 2 and all(each.endswith(cure) for each in said)
+
+
 @pytest.mark.parametrize("scale", [1, 10], ids=["change", "velocity"])
 def test_changes(scale):
     steps = [scale * step for step in DELTAS]

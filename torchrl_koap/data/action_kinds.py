@@ -68,19 +68,18 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     aimed = {name for name, each in likely.items() if each.kind == "absolute"}
     wrong = {name for name in aimed if kinds[name] == "delta"}
     wrong |= aimed if len(aimed) == task.action_dim and set(kinds.values()) == {"raw"} else set()
+    levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
+    switches = [name for name, kind in kinds.items() if kind == "delta" and levels[name] == 2]
+    found = {name: likely[name] for name in wrong} | {name: replace(likely[name], kind="raw") for name in switches}
+    cure = _cure(task, labels, found)
     if wrong:
         reached = [labels.names[likely[name].column] for name in kinds if name in wrong]
         yield (
             f"actions lie within {max(likely[name].distance for name in wrong):.2g} of {some(reached)} on average: they"
-            f" look like absolute targets; {_cure(task, labels, {name: likely[name] for name in wrong})}"
+            f" look like absolute targets; {cure}"
         )
-    levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
-    switches = [name for name, kind in kinds.items() if kind == "delta" and levels[name] == 2]
     if switches:
-        yield (
-            f"{some(switches)}: an action of two values, such as a gripper's that opens and closes:"
-            f" {_cure(task, labels, {name: replace(likely[name], kind='raw') for name in switches})}"
-        )
+        yield f"{some(switches)}: an action of two values, such as a gripper's that opens and closes: {cure}"
     wrong.update(switches)
     changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
     still = [each for each in changes if each.kind == "raw" and _clear(each.follows_column, each.follows_change)]
