@@ -68,6 +68,22 @@ def test_targets_and_a_gripper_have_one_cure():
     assert len(said) == 2 and all(each.endswith(cure) for each in said)
 
 
+def test_quaternions_of_targets_are_one_target_whose_sign_is_that_of_the_state():
+    def turned(half):
+        return np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], 1)
+
+    turns = [turned(path[:, 0] / 9) for path in PATHS]
+    aims = [turn[1:] for turn in turns]
+    described = {"names": [*"wxyz"], "acting": [f"to_{name}" for name in "wxyz"]}
+    targets = {"action_kind": "absolute", "targets": [*"wxyz"]}
+    assert warnings(turns, aims, **described)[0].endswith("again with --action-kind absolute --targets w x y z")
+    assert not warnings(turns, aims, **described, **targets)
+    (said,) = warnings(turns, [*aims[:3], -aims[3]], **described, **targets)
+    assert said.startswith("actions to_w, to_x, to_y, to_z are a quaternion of the other sign than w, x, y, z in 59 of")
+    others = likely_kinds(*demonstrations(turns, [turned(path[1:, 1] / 9) for path in PATHS], **described))
+    assert "absolute" not in {each.kind for each in others.values()}
+
+
 @pytest.mark.parametrize("scale", [1, 10], ids=["change", "velocity"])
 def test_changes(scale):
     steps = [scale * step for step in DELTAS]

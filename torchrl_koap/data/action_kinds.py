@@ -11,6 +11,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_koap import keys
+from torchrl_koap.data.formats.resampling import quaternion_starts
 from torchrl_koap.files import some
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionKind
@@ -41,6 +42,7 @@ class _Labels:
     level: np.ndarray
     change: np.ndarray
     names: list[str]  # of the columns
+    turns: list[tuple[int, int, int]]  # quaternions: first action, first column of its target, labels of other sign
 
 
 def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
@@ -55,14 +57,22 @@ def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
 def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     """Finds actions of flat data ``[N]`` that contradict their kind.
 
-    Changes look wrong where they lie at the next value of a state column, or follow columns more than their changes;
-    or have two values alone; absolute targets where they lie at the change of their column, per frame or per second, or
-    far from the column; raw actions where all of them are near columns, or all follow changes.
+    Quaternions of targets look wrong where their sign is not that of the state. Changes look wrong where they lie at
+    the next value of a state column, or follow columns more than their changes; or have two values alone; absolute
+    targets where they lie at the change of their column, per frame or per second, or far from the column; raw actions
+    where all of them are near columns, or all follow changes.
     """
     labels = _labels(data, task)
     if labels is None:
         return
     likely = _likely(labels, task)
+    for start, column, against in labels.turns:
+        if against:
+            yield (
+                f"actions {', '.join([*task.actions][start : start + 4])} are a quaternion of the other sign than"
+                f" {', '.join(labels.names[column : column + 4])} in {against} of {len(labels.actions)} labels: mend"
+                " the signs of the state first, then flip the action where the product of both is negative"
+            )
     yield from _targets_far_away(labels, task, likely)
     kinds = {name: action.kind for name, action in task.actions.items()}
     aimed = {name for name, each in likely.items() if each.kind == "absolute"}
@@ -117,7 +127,16 @@ def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))
     seen = list(task.state_columns)
     names = [task.observation_names[column] for column in seen]
-    return _Labels(actions + added, (after + origin)[:, seen], (after - before)[:, seen], names)
+    actions, level, turns = actions + added, (after + origin)[:, seen], []
+    for start in quaternion_starts([actions]):
+        for column in quaternion_starts([level]):
+            turn, there = actions[:, start : start + 4], level[:, column : column + 4]
+            products = (turn * there).sum(1)
+            other = np.abs((turn * np.roll(there, len(there) // 2, axis=0)).sum(1))  # at another time
+            if (1 - np.abs(products)).mean() < NEAR * (1 - other).mean():
+                turns.append((start, column, int((products < 0).sum())))
+                turn *= np.where(products < 0, -1, 1)[:, None]
+    return _Labels(actions, level, (after - before)[:, seen], names, turns)
 
 
 def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
@@ -136,6 +155,9 @@ def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
         kind: ActionKind = "absolute" if len(fits) else "delta" if moves else "raw"
         column = int(fits[share[fits].argmin()] if len(fits) else share.argmin())
         found[name] = LikelyKind(kind, column, float(distance[column]), float(level.max()), float(change.max()))
+    for start, column, _ in labels.turns:  # parts of one target, also those near 0
+        for name, at in zip([*task.actions][start : start + 4], range(column, column + 4), strict=True):
+            found[name] = replace(found.get(name, LikelyKind("raw", 0, 0.0, 0.0, 0.0)), kind="absolute", column=at)
     return found
 
 
