@@ -33,6 +33,7 @@ def leaping(frames, at, change):
     ("columns", "message"),
     [
         ((3 * TIME + 1 + np.pi) % (2 * np.pi) - np.pi, r"'q0' from 3.14 to -3.05 \(frame 22 of trajectory 0\): angles"),
+        (np.hstack([np.pi - (4 * TIME) % (2 * np.pi), TIME / 9, 0.1 * TIME**2]), "'q0' .*: angles that were wrapped"),
         ((170 * TIME + 180) % 360 - 180, "angles that were wrapped by 360"),
         ((900 * TIME + 2600) % 4096, "a count or an angle that was wrapped by 4.0.e.03"),
         (np.hstack([np.cos(TIME), np.sin(TIME)]) * np.where(TIME < 1, 1, -1), "'q0' .*, 'q1' .*: a quaternion"),
@@ -47,6 +48,13 @@ def leaping(frames, at, change):
 def test_leaps_are_named_with_their_cause(columns, message):
     (warning,) = seen(columns)
     assert re.search(message, warning)
+
+
+@pytest.mark.parametrize("axis", [(0.9, 0.43589, 0), (0, 0.6, 0.8)])
+def test_a_rotation_vector_turns_over_at_pi(axis):
+    vector = ((3 * TIME + np.pi) % (2 * np.pi) - np.pi) * np.array(axis)
+    warnings = seen(np.hstack([TIME**2, vector, TIME**3]))
+    assert warnings and all("a rotation vector, which turns over at pi" in warning for warning in warnings)
 
 
 def test_switches_and_smooth_columns_do_not_leap():

@@ -38,13 +38,30 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
         ends = np.sort(frames[at : at + 2, column]) - [low[column], high[column]]
         wraps = bool((np.abs(ends) < 0.05 * (high - low)[column]).all())
         near = UNUSUAL * usual[column]
-        why = _cause(frames[at : at + 3, column], near, flipped.sum() > 1, leaping > 0.5, wraps)
+        known = list(zip(trajectories, where, strict=True))
+        start, end = (np.concatenate([path[leap + late] for path, leap in known]) for late in (0, 1))
+        if _turns_over(start, end, column):
+            why = "a rotation vector, which turns over at pi? give quaternions or 6-D rotations; do not unwrap it"
+        else:
+            why = _cause(frames[at : at + 3, column], near, flipped.sum() > 1, leaping > 0.5, wraps)
         more = f" and {number - 1} times more" if number > 1 else ""
         found.setdefault(why, []).append(
             f"{name!r} from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of"
             f" {called[trajectory]}{more})"
         )
     return [f"columns leap: {', '.join(which)}: {why}" for why, which in found.items()]
+
+
+def _turns_over(before: np.ndarray, after: np.ndarray, column: int) -> bool:
+    """Whether three neighbouring columns are a rotation vector whose axis turns over at pi, by leaps ``[n, d]``."""
+    for start in range(max(column - 2, 0), min(column, before.shape[1] - 3) + 1):
+        vector, reached = before[:, start : start + 3], after[:, start : start + 3]
+        length = np.linalg.norm(vector, axis=1, keepdims=True)
+        apart = reached - vector * (1 - 2 * np.pi / np.maximum(length, 1))
+        others = np.delete(reached - vector, column - start, axis=1)  # as if the column leapt alone
+        if (length <= 1.1 * np.pi).all() and 2 * np.abs(apart).sum() < np.abs(others).sum():
+            return True
+    return False
 
 
 def _cause(values: np.ndarray, near: float, flipped: bool, most: bool, wraps: bool) -> str:
