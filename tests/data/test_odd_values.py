@@ -12,6 +12,7 @@ from torchrl_koap.data.odd_values import (
     quaternion_warnings,
     scale_warnings,
     spike_warnings,
+    turn_warnings,
 )
 
 TIME = np.linspace(0, 2, 60)[:, None]
@@ -86,6 +87,17 @@ def test_a_quaternion_that_leaps_in_one_column_is_no_wrapped_angle():
     assert seen(turn) == []
     (warning,) = quaternion_warnings([turn], ["w", "x", "y", "z"])
     assert "in 1 frames" in warning and warning.endswith("do the same on the robot")
+
+
+@pytest.mark.parametrize("turn", [2 * np.pi, 360])
+def test_the_same_angle_a_turn_apart(turn):
+    """A roll near pi that was unwrapped in each trajectory by itself; a wrist that winds has no gap."""
+    roll = turn / 2 * (1 + 0.05 * np.sin(TIME))
+    (warning,) = turn_warnings([roll, roll - turn, roll + 0.01], ["roll"])
+    assert f"in 1 trajectories and about {turn:.3g} above" in warning
+    winding = [roll, roll - turn, roll - turn / 2]
+    assert not [*turn_warnings([roll, roll + 0.01], ["roll"]), *turn_warnings(winding, ["roll"])]
+    assert not [*turn_warnings([roll], ["roll"]), *turn_warnings([roll, roll + 3 * turn], ["roll"])]
 
 
 @pytest.mark.parametrize("kind", ["column", "action"])

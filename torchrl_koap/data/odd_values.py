@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Numbers that are unlikely in a column: leaps, marks of what is missing, other units, signs of quaternions."""
+"""Numbers that are unlikely in a column: leaps, marks of what is missing, other units, signs of quaternions, turns."""
 
 from __future__ import annotations
 
@@ -95,6 +95,24 @@ def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]
                 f" frames, and in {opposite} trajectories against that of the first: flip it where its product with the"
                 " frame before is negative, in first frames that with the first of all; do the same on the robot"
             )
+
+
+def turn_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
+    """Finds columns near one angle in some trajectories and near the same one, a turn farther, in all others."""
+    low, high = (np.stack([end(frames, axis=0) for frames in trajectories]) for end in (np.min, np.max))
+    for column, name in enumerate(names):
+        order = np.argsort(low[:, column])
+        bottom, top = low[order, column], np.maximum.accumulate(high[order, column])
+        gap = bottom[1:] - top[:-1]
+        for turn in (2 * np.pi, 360.0) if len(gap) else ():
+            at = int(gap.argmax())
+            apart = (bottom[at + 1] + top[-1] - bottom[0] - top[at]) / 2
+            if gap[at] > turn / 2 and abs(apart - turn) < turn / 8:
+                yield (
+                    f"column {name!r} lies within {bottom[0]:.3g} to {top[at]:.3g} in {at + 1} trajectories and about"
+                    f" {turn:.3g} above in all others: the same angle? add {turn:.3g} where it is below, also on the"
+                    " robot, or give sine and cosine"
+                )
 
 
 def mark_warnings(rows: np.ndarray, names: Sequence[str], kind: str) -> Iterator[str]:

@@ -21,6 +21,7 @@ from torchrl_koap.data.odd_values import (
     quaternion_warnings,
     scale_warnings,
     spike_warnings,
+    turn_warnings,
 )
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import DataError, option, some
@@ -37,9 +38,9 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, are in another
     unit, or reach a place beyond 100 m or rad; state columns that never change, equal another one, leap, hold marks of
-    what is missing, are clocks or quaternions that change their sign; frames at both ends in which nothing moves;
-    actions of another kind than declared, that never change, leap for one frame or hold marks; labels that stand alone;
-    an unlikely rate; plans that are short against the motion.
+    what is missing, are clocks, quaternions that change their sign or angles a turn apart; frames at both ends in which
+    nothing moves; actions of another kind than declared, that never change, leap for one frame or hold marks; labels
+    that stand alone; an unlikely rate; plans that are short against the motion.
 
     ``names`` are what to call each trajectory, such as its file. Default: their numbers.
     """
@@ -59,6 +60,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *_column_warnings(state, task.state_names),
         *leap_warnings(frames, called, task.state_names),
         *quaternion_warnings(frames, task.state_names),
+        *turn_warnings(frames, task.state_names),
         *mark_warnings(np.concatenate(frames), task.state_names, "column"),
         *scale_warnings(frames, called, task.state_names, "column"),
         *_stillness(frames, called),
