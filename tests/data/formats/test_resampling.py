@@ -86,6 +86,13 @@ def test_an_action_a_little_late_is_that_of_its_step():
     np.testing.assert_array_equal(found.actions[0][:, 0], np.arange(40))
 
 
+def test_one_lost_frame_is_no_gap_though_clocks_jitter():
+    times = np.delete(TIME, 20) + 0.01 * (np.arange(40) == 20)  # 0.11 s apart
+    assert len(resampled(recorded(times, times=times), 20, times=[times]).states) == 1
+    times = np.delete(TIME, [20, 21])
+    assert len(resampled(recorded(times, times=times), 20, times=[times]).states) == 2
+
+
 def test_a_gap_shorter_than_two_new_steps_is_none():
     times = TIME + 0.3 * (TIME > 0.98)
     assert len(resampled(recorded(TIME, times=times), 4, times=[times]).states) == 1

@@ -17,6 +17,7 @@ from torchrl_koap.lookup import lookup
 ADDS_UP = {"delta": None, "change": True, "velocity": False, "absolute": False, "raw": False}
 LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
 MOST = 2.0  # new frames in one recorded step
+GAP = 2.5  # steps without a frame, above which a trajectory ends: one lost frame leaves two, and clocks jitter
 _LEVELS = 10  # a column of no more integers is a switch
 _SAME = 1e-3  # share of a step that is rounding
 _UNIT = 0.01  # how far the length of a quaternion may be from 1
@@ -34,7 +35,7 @@ def resampled(
     States are interpolated linearly. Where a column leaps (a wrapped angle, a quaternion that changes its sign), and in
     columns of at most ten integers (a switch), the nearest frame counts, as of cameras. Changes over one frame are
     summed over the new step; any other action is the current one at its beginning. A step with an unlabelled part has
-    no label. A gap of more than two steps, recorded or new, ends a trajectory; ``skipped`` counts these.
+    no label. A gap of more than 2.5 steps, recorded or new, ends a trajectory; ``skipped`` counts these.
 
     The kind of action is as for :func:`~torchrl_koap.data.make_demonstrations`; ``times`` are the seconds of every
     frame ``[T_i]``, rising, where they are not as ``recordings.control_hz`` says.
@@ -82,7 +83,7 @@ def resampled(
     short: list[str] = []
     each = zip(recordings.sources, recordings.states, recordings.actions, times, usual, strict=True)
     for number, (name, frames, steps, at, step) in enumerate(each):
-        breaks = np.flatnonzero(np.diff(at) > MOST * max(step, 1 / control_hz) * (1 + _SAME))
+        breaks = np.flatnonzero(np.diff(at) > GAP * max(step, 1 / control_hz))
         gaps += [f"{name} ({at[before + 1] - at[before]:.3g} s)" for before in breaks]
         edges = [0, *(breaks + 1), len(at)]
         for part, (start, end) in enumerate(zip(edges, edges[1:], strict=False)):
