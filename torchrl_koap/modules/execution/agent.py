@@ -167,7 +167,7 @@ class Agent:
                 columns = far.nonzero().flatten().tolist()
                 warnings.warn(
                     f"at the start of this episode columns {columns} of the state lie beyond the demonstrated range by"
-                    " more than that range: another unit, or another robot?",
+                    " more than that range: another unit or robot, or a quaternion of the other sign?",
                     stacklevel=4,
                 )
         self._shape = shape
