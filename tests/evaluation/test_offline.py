@@ -164,5 +164,5 @@ def test_a_controller_worse_than_the_mean_is_a_fault():
     faults = offline_faults({"note": ""}, {"left_out": found, "outside_budget": {"note": ""}})
     assert faults == [
         "action b is worse than always giving its mean (each labelled recording left out in turn): 2000 against 1000"
-        " mrad; check --action-kind and --robot, or label a recording that moves it"
+        " mrad; mend what `koap validate` warns of, check --action-kind and --robot, or label a recording that moves it"
     ]
