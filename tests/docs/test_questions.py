@@ -14,12 +14,12 @@ QUESTIONS = {
         "how many recordings actions 50 label 5 delta absolute targets LeRobot --action-kind robot command leader"
         " follower gripper width 0 or 1 rate Hz window 16 frames resample irregular missing NaN shorter pauses length"
         " two arms mobile base hand several tasks language quaternions angles wrap normalise units goals objects"
-        " state speed operator another"
+        " state speed operator another sign heading sine norm rotation vectors roll"
     ),
     "howto/choose_method": "choose method noisy clean recorded command joints",
     "howto/train_faster": "faster GPU cuda minutes loss memory good relative_plan_error",
     "howto/cameras": "camera frames embed pictures run time",
-    "howto/control_loop": "limits stop safety speed driver delay sensor actuator slow plans ROS 2",
+    "howto/control_loop": "signs quaternions limits stop safety speed driver delay sensor actuator slow plans ROS 2",
     "howto/find_failures": "jerk plans oscillation symptom cause remedy fails first",
     "howto/no_simulator": "action error good ridge mean",
     "limits": "fine-tuning more data pretrained another robot hosted issues help cite licence MIT D3IL",
