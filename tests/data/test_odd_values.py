@@ -87,6 +87,9 @@ def test_a_quaternion_that_leaps_in_one_column_is_no_wrapped_angle():
     assert seen(turn) == []
     (warning,) = quaternion_warnings([turn], ["w", "x", "y", "z"])
     assert "in 1 frames" in warning and warning.endswith("do the same on the robot")
+    turn[9] = 0  # a measurement that failed does not hide what the columns are
+    assert [warning] == [*quaternion_warnings([turn], ["w", "x", "y", "z"])]
+    assert seen(turn)[0].endswith("a measurement that failed for a frame? fill it from its neighbours")
 
 
 @pytest.mark.parametrize("turn", [2 * np.pi, 360])
