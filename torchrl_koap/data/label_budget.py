@@ -20,7 +20,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap import keys
-from torchrl_koap.data.trajectories import mark_labels, trajectory_lengths
+from torchrl_koap.data.trajectories import labelled_episodes, mark_labels, trajectory_lengths
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import HISTORY, WINDOW
 
@@ -238,9 +238,8 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
     The difference of two commands is the sum of the actions between them, so only trajectories whose actions are all
     labelled keep theirs. NaN stand in ``observation`` and ``("next", "observation")``; ``state`` never holds commands.
     """
-    lengths = trajectory_lengths(data)
-    hidden = torch.stack([~part.all() for part in data.get(keys.HAS_ACTION).split(lengths.tolist())])
-    rows = hidden.repeat_interleave(lengths)
+    episode = data.get(keys.EPISODE)
+    rows = torch.isin(episode, episode[~data.get(keys.HAS_ACTION).squeeze(-1)])
     result = data.clone()
     for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION):
         value = result.get(key).clone()
@@ -260,21 +259,19 @@ def subsample_trajectories(data: TensorDictBase, fraction: float) -> TensorDictB
     """
     if not 0 < fraction <= 1:
         raise ValueError(f"observation fraction must be in (0, 1], got {fraction}")
-    lengths = trajectory_lengths(data)
-    number = math.floor(fraction * len(lengths) + 0.5)
-    labelled = torch.stack([part.any() for part in data.get(keys.HAS_ACTION).split(lengths.tolist())]).cpu()
+    episodes = data.get(keys.EPISODE).unique_consecutive()
+    number = math.floor(fraction * len(episodes) + 0.5)
+    labelled = torch.isin(episodes, labelled_episodes(data)).cpu()
     if number < max(int(labelled.sum()), 1):
         raise ValueError(
-            f"an observation fraction of {fraction} keeps {number} of {len(lengths)} trajectories,"
+            f"an observation fraction of {fraction} keeps {number} of {len(episodes)} trajectories,"
             f" but {int(labelled.sum())} have labels"
         )
-    if number == len(lengths):
+    if number == len(episodes):
         return data
-    order = torch.randperm(len(lengths), generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(len(episodes), generator=torch.Generator().manual_seed(0))
     order = torch.cat([order[labelled[order]], order[~labelled[order]]])
-    kept = torch.zeros(len(lengths), dtype=torch.bool)
-    kept[order[:number]] = True
-    return data[kept.to(lengths.device).repeat_interleave(lengths)]
+    return data[torch.isin(data.get(keys.EPISODE), episodes[order[:number].to(episodes.device)])]
 
 
 def plural_of(unit: str) -> str:

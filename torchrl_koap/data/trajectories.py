@@ -121,6 +121,11 @@ def trajectory_lengths(data: TensorDictBase) -> torch.Tensor:
     return torch.unique_consecutive(data.get(keys.EPISODE), return_counts=True)[1]
 
 
+def labelled_episodes(data: TensorDictBase) -> torch.Tensor:
+    """Numbers of the trajectories of flat data that have a label, int64 ``[k]``, ascending."""
+    return data.get(keys.EPISODE)[data.get(keys.HAS_ACTION).squeeze(-1)].unique()
+
+
 def select_state(
     data: TensorDictBase, columns: Iterable[int] | Callable[[torch.Tensor], torch.Tensor]
 ) -> TensorDictBase:

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.files import some
 from torchrl_koap.keys import EPISODE, HAS_ACTION
@@ -216,9 +217,9 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         {"rank": rank, "steps": int((unlabelled == choice.episode).sum()), **asdict(choice)}
         for rank, choice in enumerate(choices, 1)
     ]
-    labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
+    labelled = labelled_episodes(data).tolist()
     every = list(dict.fromkeys([*labelled, *(choice.episode for choice in choices)]))
-    known = recorded[EPISODE][recorded[HAS_ACTION].squeeze(-1)].unique().tolist()
+    known = labelled_episodes(recorded).tolist()
     without = [episode for episode in every if episode not in known]
     converted = f"convert them again (--name {shlex.quote(trained.task.name)} --out DATA)"
     first = f"add actions to recordings {some(without)} and {converted}, then " if without else ""

@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
+from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.rollouts import device_of
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics, StatePlanner
@@ -103,9 +104,8 @@ def _score(sampled: Tensor, true: Tensor) -> dict[str, dict[str, Any]]:
 
 def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
     """Returns the numbers of the trajectories of which no label was in the budget."""
-    touched = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
     every = data["episode"].unique()
-    return every[~torch.isin(every, touched.to(every.device))]
+    return every[~torch.isin(every, labelled_episodes(labelled).to(every.device))]
 
 
 @torch.no_grad()
@@ -174,8 +174,7 @@ def errors_left_out(
     controller, which reads the state ``columns``, is not changed. Arguments and result as of
     :func:`errors_outside_budget`.
     """
-    has_action = labelled["has_action"].squeeze(-1)
-    episodes = labelled["episode"][has_action].unique()
+    episodes = labelled_episodes(labelled)
     if len(episodes) < 2:
         return {"note": "only one trajectory has labels: none can be left out"}
     folds = []

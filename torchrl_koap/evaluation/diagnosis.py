@@ -17,9 +17,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.data.trajectories import labelled_episodes, trajectory_lengths
 from torchrl_koap.evaluation.rollouts import device_of, roll_out
-from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
+from torchrl_koap.keys import OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 
@@ -97,10 +97,8 @@ def follow_recordings(
     others are followed. Episodes have the entry :data:`RECORDED` ``[T, 1]``.
     """
     lengths = trajectory_lengths(data).tolist()
-    own = torch.arange(len(lengths))
-    if HAS_ACTION in data.keys():
-        recorded = torch.tensor([part.any().item() for part in data[HAS_ACTION].split(lengths)])
-        own = own[recorded] if recorded.any() else own
+    own = torch.isin(data["episode"].unique_consecutive(), labelled_episodes(data)).nonzero().squeeze(-1)
+    own = own if len(own) else torch.arange(len(lengths))
     chosen = own[torch.linspace(0, len(own) - 1, min(episodes, len(own))).long().unique()].tolist()
     paths = data["state"].split(lengths)
     starts = torch.stack([data[OBSERVATION].split(lengths)[index][0] for index in chosen])

@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import WindowTable
-from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.data.trajectories import labelled_episodes, trajectory_lengths
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
@@ -176,7 +176,7 @@ def analyse_latent(
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
     errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)
     result["multi_step"] = {"steps": horizon, "held_out_trajectories": held_out} | errors
-    known = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique()
+    known = labelled_episodes(data)
     if len(known) < 2:
         note = "fewer than two trajectories have labels to probe latent actions with"
         return result | {OUTSIDE_THE_BUDGET: {"note": note}}

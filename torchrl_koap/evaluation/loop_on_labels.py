@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.findings import MORE
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
@@ -182,7 +183,7 @@ def _replay_error(response: _Response, data: TensorDictBase) -> float:
     """How far recorded actions end beside their recordings, in standard deviations: the median of trajectories."""
     spread = _spread(data)
     apart = []
-    for number in data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()[:ROBOTS]:
+    for number in labelled_episodes(data)[:ROBOTS].tolist():
         rows = data[(data[EPISODE] == number) & data[HAS_ACTION].squeeze(-1)][:STEPS]
         frames, action = rows[OBSERVATION].double(), rows[ACTION].double()
         if len(rows) < 3:

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import cut_windows
+from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.tasks import Task
 
@@ -21,7 +22,7 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     :func:`action_facts`. Returns what :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
     """
     keys = ["state", "action", "has_action", "episode"]
-    labelled = torch.isin(data["episode"], data["episode"][data["has_action"].squeeze(-1)])
+    labelled = torch.isin(data["episode"], labelled_episodes(data))
     windows = cut_windows(data[labelled], controller.num_window_frames, select=keys, pad_before=controller.num_past)
     mask = windows["has_action"].squeeze(-1).clone()
     # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again

@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import WindowTable, spread_evenly
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
@@ -140,11 +141,10 @@ def _train_sampler(
     """A network that samples actions, with the updates that a planner would have."""
     (phase,) = method.phases
     sampler, section = method.build(task, config.planner), config.planner
-    has_action = data["has_action"].squeeze(-1)
-    seen = data[torch.isin(data["episode"], data["episode"][has_action])]
+    seen = data[torch.isin(data["episode"], labelled_episodes(data))]
     extended = extrapolate_ends(seen, HORIZON - 1)
     states = cut_windows(extended, WINDOW, select=["state"], pad_before=1, most=MOST_WINDOWS)["state"]
-    sampler.fit_normalizers(states, data["action"][has_action])
+    sampler.fit_normalizers(states, data["action"][data["has_action"].squeeze(-1)])
     sampler.to(config.run.device)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(

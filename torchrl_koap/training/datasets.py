@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import digest_of
 
@@ -38,11 +38,10 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
         return []
     if not 0 < fraction < 1:
         raise ValueError(f"planner.held_out must be in [0, 1), got {fraction}")
-    lengths = trajectory_lengths(data)
-    total = len(lengths)
+    episodes = data["episode"].unique_consecutive().cpu()
+    total = len(episodes)
     number = min(max(math.floor(fraction * total + 0.5), 1 if total < 10 else 2), total - 1)
-    episodes = data["episode"][torch.cumsum(lengths, 0) - lengths].cpu()
-    labelled = torch.stack([part.any() for part in data["has_action"].split(lengths.tolist())]).cpu()
+    labelled = torch.isin(episodes, labelled_episodes(data).cpu())
     order = torch.randperm(total, generator=torch.Generator().manual_seed(seed))
     order = torch.cat([order[~labelled[order]], order[labelled[order]]])
     return sorted(episodes[order[:number]].tolist())
@@ -79,5 +78,5 @@ def split_held_out(
             f"all {len(episode.unique())} trajectories that are used are held out: nothing is left to"
             " train on; lower planner.held_out or raise labels.trajectories"
         )
-    labelled = torch.isin(episode, episode[data["has_action"].squeeze(-1)].unique())
+    labelled = torch.isin(episode, labelled_episodes(data))
     return data[~held_out], data[held_out], data[~held_out | labelled]
