@@ -120,6 +120,11 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
     }
 
 
+def _around(values: Tensor, row: Tensor, first: int, last: int) -> Tensor:
+    """What stands in ``values [N, ...]`` from ``first`` to ``last`` steps behind rows ``[n]``, both included."""
+    return values[row.unsqueeze(-1) + torch.arange(first, last + 1, device=row.device)]
+
+
 def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[LabelledSteps, Tensor]:
     """The steps that may be fitted to, and the changes of the command ``[N, J]``, NaN where they are not known."""
     memory, axes = response.memory, response.num_axes
@@ -134,10 +139,9 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
         changes = action
         after = data["observation"][:, response.commands].double() + changes
     row = torch.arange(memory, len(episode) - 1, device=episode.device)
-    good = (episode[row - memory] == episode[row + 1]) & ~positions[row + 1].isnan().any(-1)
-    for back in range(1, memory + 1):
-        good &= ~changes[row - back].isnan().any(-1) & ~positions[row - back].isnan().any(-1)
-    row = row[good & ~positions[row].isnan().any(-1)]
+    measured, told = (~values.isnan().any(-1) for values in (positions, changes))
+    good = _around(measured, row, -memory, 1).all(-1) & _around(told, row, -memory, -1).all(-1)
+    row = row[good & (episode[row - memory] == episode[row + 1])]
     broken = torch.ones_like(row, dtype=torch.bool)
     broken[1:] = row.diff() != 1  # before each row of an episode some are left out
     segment = broken.cumsum(0) - 1
@@ -146,8 +150,7 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
     total = changes[row - 1].cumsum(0)
     counted = total - (total - changes[row - 1])[broken][segment]
     command = torch.where(known.unsqueeze(-1), after[row - 1], counted)
-    history = torch.stack([positions[row - back] for back in range(memory, -1, -1)], 1)
-    past = torch.stack([changes[row - back] for back in range(memory, 0, -1)], 1)
+    history, past = _around(positions, row, -memory, 0), _around(changes, row, -memory, -1)
     read = response.coordinates(history, command - positions[row], past)
     steps = (positions[row + 1] - positions[row]).reshape(-1, axes)
     return LabelledSteps(read, steps, segment, known, row), changes
@@ -191,11 +194,11 @@ def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSte
     row = start.row
     positions = data["state"][:, response.states].double()
     return Stretches(
-        torch.stack([positions[row - back] for back in range(memory, -1, -1)], 1),
+        _around(positions, row, -memory, 0),
         positions[row] + start.coordinates[..., memory],  # the lead
-        torch.stack([changes[row - back] for back in range(memory, 0, -1)], 1),
-        torch.stack([changes[row + ahead] for ahead in range(length)], 1).nan_to_num(0.0),  # the last has no effect
-        torch.stack([positions[row + 1 + ahead] for ahead in range(length)], 1),
+        _around(changes, row, -memory, -1),
+        _around(changes, row, 0, length - 1).nan_to_num(0.0),  # the last has no effect
+        _around(positions, row, 1, length),
         start.known,
     )
 
