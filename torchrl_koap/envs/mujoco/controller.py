@@ -84,14 +84,10 @@ def _finger_forces(position, velocity, width, grasping, ctrl):
 @njit(cache=True)
 def _write_log(row, pointers, qpos, q_des):
     """Log row of D3IL's recorder: joints after the substep, TCP position at its beginning."""
-    tcp, objects = _array(pointers[TCP_POS], 3), _array(pointers[OBJECTS], len(row) - LOG_WIDTH)
-    for j in range(7):
-        row[j], row[7 + j] = qpos[j], q_des[j]
-    for k in range(3):
-        row[14 + k] = tcp[k]
+    row[:7], row[7:14] = qpos[:7], q_des
+    row[14:17] = _array(pointers[TCP_POS], 3)
     row[17] = qpos[7] + qpos[8]
-    for k in range(len(objects)):
-        row[LOG_WIDTH + k] = objects[k]
+    row[LOG_WIDTH:] = _array(pointers[OBJECTS], len(row) - LOG_WIDTH)
 
 
 @njit(nogil=True, cache=True)
@@ -114,12 +110,10 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
         norm = np.sqrt(norm)
         for k in range(7):
             target[k] = commands[row, k] if k < 3 else commands[row, k] / norm
-        for j in range(7):
-            q[j] = targets[row, j] if started[row] else qpos[j]
+        q[:] = targets[row] if started[row] else qpos[:7]
         started[row] = True
         for substep in range(substeps):
-            for j in range(7):
-                targets[row, j] = q[j]
+            targets[row] = q
             inverse_kinematics(target, q)
             for j in range(7):
                 speed = (q[j] - targets[row, j]) / TIMESTEP
@@ -128,8 +122,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
             _step_physics(step, model, data[row])
             if substep == 0:
                 _write_log(log[row], pointers[row], qpos, q)
-        for j in range(7):
-            targets[row, j] = q[j]
+        targets[row] = q
 
 
 @njit(nogil=True, cache=True)

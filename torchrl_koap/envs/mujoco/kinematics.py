@@ -125,9 +125,7 @@ def _cholesky(matrix, shift, factor):
 @njit(cache=True)
 def _diagonalise(matrix, vectors):
     """Cyclic Jacobi rotations: ``matrix`` becomes diagonal, the columns of ``vectors`` are the eigenvectors."""
-    for i in range(6):
-        for j in range(6):
-            vectors[i, j] = 1.0 if i == j else 0.0
+    vectors[:] = np.eye(6)
     for _ in range(30):
         off, diagonal = 0.0, 0.0
         for i in range(6):
