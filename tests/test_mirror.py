@@ -13,6 +13,7 @@ COVERED_BY = {
     "commands/doctor.py": "commands/test_cli.py",
     "commands/run_commands.py": "commands/test_eval.py",
     "commands/subcommands.py": "commands/test_cli.py",
+    "data/formats/parquet.py": "data/formats/test_lerobot.py",
     "envs/experts/push_planning.py": "envs/experts/test_aligning.py",
     "envs/gymnasium_episode.py": "envs/test_gymnasium_batch.py",
     "envs/experts/recording.py": "envs/experts/test_demonstrations.py",

@@ -76,6 +76,17 @@ def absolute(reference: str) -> str:
     return str(Path(reference).expanduser().resolve()) if is_file else reference
 
 
+def import_extra(module: str, extra: str, needs: str) -> Any:
+    """Imports an optional package.
+
+    Raises:
+        RuntimeError: if it is not installed; the message begins with what ``needs`` it, and names the extra to install.
+    """
+    if importlib.util.find_spec(module) is None:
+        raise RuntimeError(f"{needs} an extra: pip install 'torchrl_koap[{extra}]'")
+    return importlib.import_module(module)
+
+
 @functools.cache
 def _run_file(path: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(Path(path).stem, path)

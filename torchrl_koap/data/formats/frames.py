@@ -13,7 +13,6 @@ HDF5 files hold ``[T, H, W, 3]`` beside the numbers, LeRobot data sets pictures 
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.kinds import import_pyarrow
+from torchrl_koap.data.formats.parquet import import_pyarrow
 from torchrl_koap.files import read_bytes, some
+from torchrl_koap.lookup import import_extra
 
 PICTURES = (".png", ".jpg", ".jpeg")
 TIMES = "_times.npy"
@@ -157,10 +157,7 @@ def _parquet(clip: Clip) -> Iterator[np.ndarray]:
 
 def _video(clip: Clip) -> Iterator[np.ndarray]:
     """Frames by the time at which they are shown, from the key frame before the first one."""
-    if importlib.util.find_spec("av") is None:
-        raise RuntimeError("videos are read with an extra: pip install 'torchrl_koap[video]'")
-    import av
-
+    av = import_extra("av", "video", "videos are read with")
     try:
         with av.open(clip.file) as container:
             yield from _shown(clip, container, container.streams.video[0])

@@ -23,7 +23,8 @@ import numpy as np
 
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import lerobot_clips
-from torchrl_koap.data.formats.kinds import import_pyarrow, kind_of, number_type, numbers
+from torchrl_koap.data.formats.kinds import kind_of
+from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, read_json, refuse, some
 

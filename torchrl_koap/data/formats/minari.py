@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -13,6 +12,7 @@ from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.kinds import spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, refuse
+from torchrl_koap.lookup import import_extra
 
 PREFIX = "minari:"
 
@@ -24,10 +24,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
     images are skipped. The rate is declared by ``render_fps`` of its environment. The options are those of
     :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
-    if importlib.util.find_spec("minari") is None:
-        raise RuntimeError("Minari data sets are read with an extra: pip install 'torchrl_koap[minari]'")
-    import minari
-
+    minari = import_extra("minari", "minari", "Minari data sets are read with")
     name, local = source.removeprefix(PREFIX), minari.list_local_datasets()
     if name not in local:
         known = ", ".join(sorted(local)) or "none"

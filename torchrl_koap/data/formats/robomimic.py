@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, option, refuse
+from torchrl_koap.lookup import import_extra
 
 NEXT = "next_obs"
 BESIDE = ("episode", "frame", "start", "end")  # what entries beside the observations may be
@@ -41,10 +41,7 @@ def read_robomimic(
     by name. ``next_obs`` is one of the ``drop_columns``, too. The options are those of
     :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
-    if importlib.util.find_spec("h5py") is None:
-        raise RuntimeError("HDF5 files are read with an extra: pip install 'torchrl_koap[hdf5]'")
-    import h5py
-
+    h5py = import_extra("h5py", "hdf5", "HDF5 files are read with")
     file = Path(file)
     if not file.is_file():
         raise FileNotFoundError(f"{file} is no file")

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.kinds import import_pyarrow
 from torchrl_koap.data.formats.lerobot import ACTION, EPISODE, FRAME, STATE
+from torchrl_koap.data.formats.parquet import import_pyarrow
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, option, replacing_file
 
