@@ -28,6 +28,7 @@ COVERED_BY = {
     "evaluation/config.py": "commands/test_eval.py",
     "evaluation/inspection.py": "evaluation/test_diagnosis.py",
     "evaluation/latency.py": "commands/test_eval.py",
+    "evaluation/policies.py": "evaluation/test_oracle.py",
     "modules/execution/factory.py": "modules/execution/test_policy.py",
     "modules/inverse_dynamics.py": "modules/koopman/test_inverse_dynamics.py",
     "modules/planning/sampler.py": "modules/planning/test_planner.py",

@@ -18,6 +18,9 @@ DATA = "mend what `koap validate` warns of"
 MORE = f"{DATA}, then train longer (--steps) or record more"  # what to do about plans
 KIND = f"{DATA}, check --action-kind and --robot, or label a recording that moves it"  # about an action
 _NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, leave it"
+UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of a loop on labels
+_FAR = 3.0  # standard deviations of the recorded states from the nearest of them
+_STAYS = 0.2  # of the way of the demonstrations
 _LEFT = 0.1  # share of recorded paths that a controller may leave
 _WORSE = 2.0  # times the error of a comparable model from which a latent model counts as worse
 
@@ -112,6 +115,28 @@ def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[s
             if row["controller"] > row["mean_action"]:
                 against = _against(row["controller"], row["mean_action"], row["unit"])
                 faults.append(f"action {row['name']} is worse than always giving its mean ({words}): {against}; {KIND}")
+    return faults
+
+
+def loop_faults(loop: Mapping[str, Any]) -> list[str]:
+    """Says what is wrong with a policy in the loop of :func:`~torchrl_koap.evaluation.loop_on_labels.check_loop`."""
+    late, distance, faults = loop["largest_command_late"], loop["distance_to_demonstrations"], []
+    if late > UNSTABLE:
+        faults.append(
+            f"this policy is unstable: on a linear model of the robot, commands grow to {late:.3g} times the largest"
+            f" demonstrated one within {loop['steps']} steps; check --action-kind, or label more recordings"
+        )
+    if distance > _FAR:
+        faults.append(
+            f"this policy leaves its demonstrations: on a linear model of the robot it ends {distance:.3g} standard"
+            f" deviations from the nearest recorded state; {MORE}"
+        )
+    if loop["share_of_way"] < _STAYS:
+        faults.append(
+            f"this policy does not leave the start: on a linear model of the robot it gets {loop['share_of_way']:.2g}"
+            f" times as far as the demonstrations in {loop['steps']} steps; cut pauses at their ends (`koap convert"
+            " --trim-still`), or train longer (--steps)"
+        )
     return faults
 
 

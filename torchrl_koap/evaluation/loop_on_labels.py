@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import statistics
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import spread_evenly
-from torchrl_koap.evaluation.findings import MORE
+from torchrl_koap.evaluation.findings import UNSTABLE, loop_faults
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
 from torchrl_koap.modules.execution.command_limits import ends_of
@@ -23,29 +24,14 @@ from torchrl_koap.training.policy_facts import command_ranges
 from torchrl_koap.training.trained import Trained
 
 STEPS, ROBOTS = 300, 16
-UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of the loop
-FAR = 3.0  # standard deviations of the recorded states from the nearest of them
 AWAY = 1e12  # where states have run away: far from what a network's type can square
-STAYS = 0.2  # of the way of the demonstrations
 _EXPLAINED = 0.5  # of the variance of changes, below which labels do not say how states follow actions
 _DRIFT = 1.0  # standard deviations that recorded actions may end beside their recording
 _ROWS = 4000  # recorded states that distances are measured to
 _PREFERRED = 100.0  # weight of actions: in smooth motions the state alone tells how it goes on
 
-
-@dataclass
-class _Response:
-    """Changes of the observation, linear in action, observation and the change before."""
-
-    scales: tuple[Tensor, Tensor, Tensor]  # of actions, observations and changes
-    weight: Tensor
-    bias: Tensor
-    explained: float
-
-    def step(self, observed: Tensor, change: Tensor, action: Tensor) -> Tensor:
-        """The next change ``[n, obs]``."""
-        inputs = _inputs(self.scales, observed, change, action)
-        return torch.nn.functional.linear(inputs, self.weight, self.bias)
+# the next change of observations [n, obs]: linear in action, observation and the change before
+Response = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def check_loop(
@@ -72,9 +58,9 @@ def check_loop(
     ranges = command_ranges(task, labelled)
     if not any(ranges):
         return {"note": "no command changes in the labels", "faults": []}
-    response = _fit(data)
-    if response.explained < _EXPLAINED:
-        share = f"{max(response.explained, 0):.0%} of how all state columns change, which is too little"
+    response, explained = _fit(data)
+    if explained < _EXPLAINED:
+        share = f"{max(explained, 0):.0%} of how all state columns change, which is too little"
         return {"note": f"a linear model explains {share}", "faults": []}
     if not _replay_error(response, data) < _DRIFT:
         return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
@@ -86,12 +72,13 @@ def check_loop(
     growth, late = _growth(commands, ends_of(ranges), steps)
     if late > UNSTABLE:
         # actions of an expert that knew the states without noise tell that noise: states then explain changes wrongly
-        other = _fit(data, by_states=False)
-        if other.explained >= _EXPLAINED and _replay_error(other, data) < _DRIFT:
+        other, others_share = _fit(data, by_states=False)
+        if others_share >= _EXPLAINED and _replay_error(other, data) < _DRIFT:
             again = _roll(free, other, data, steps, seed)
             grown = _growth(again[0], ends_of(ranges), steps)
             if grown[1] < late:
-                response, (commands, *where), (growth, late) = other, again, grown
+                response, explained = other, others_share
+                (commands, *where), (growth, late) = again, grown
     policy = trained.policy(asked)
     if policy.limits is not None and growth.max() > 1:
         _, *where = _roll(policy, response, data, steps, seed)
@@ -99,7 +86,7 @@ def check_loop(
     found = {
         "steps": steps,
         "robots": commands.shape[1],
-        "explained": response.explained,
+        "explained": explained,
         "largest_command": min(float(growth.max()), 1e30),
         "largest_command_late": min(late, 1e30),
         "distance_to_demonstrations": where[0],
@@ -107,7 +94,7 @@ def check_loop(
         "limited_commands": limited,
         "commands": steps * commands.shape[1],
     }
-    return found | {"faults": _faults(found)}
+    return found | {"faults": loop_faults(found)}
 
 
 def _growth(commands: Tensor, ends: Tensor, steps: int) -> tuple[Tensor, float]:
@@ -115,27 +102,6 @@ def _growth(commands: Tensor, ends: Tensor, steps: int) -> tuple[Tensor, float]:
     growth = ((commands - ends.mean(-1)) / (ends.diff(dim=-1).squeeze(-1) / 2)).nan_to_num(math.inf).abs()
     growth = growth[..., ends[:, 0].isfinite()].amax(-1)
     return growth, float(growth[2 * len(growth) // 3 :].max()) if len(growth) == steps else math.inf
-
-
-def _faults(found: Mapping[str, Any]) -> list[str]:
-    late, distance, faults = found["largest_command_late"], found["distance_to_demonstrations"], []
-    if late > UNSTABLE:
-        faults.append(
-            f"this policy is unstable: on a linear model of the robot, commands grow to {late:.3g} times the largest"
-            f" demonstrated one within {found['steps']} steps; check --action-kind, or label more recordings"
-        )
-    if distance > FAR:
-        faults.append(
-            f"this policy leaves its demonstrations: on a linear model of the robot it ends {distance:.3g} standard"
-            f" deviations from the nearest recorded state; {MORE}"
-        )
-    if found["share_of_way"] < STAYS:
-        faults.append(
-            f"this policy does not leave the start: on a linear model of the robot it gets {found['share_of_way']:.2g}"
-            f" times as far as the demonstrations in {found['steps']} steps; cut pauses at their ends (`koap convert"
-            " --trim-still`), or train longer (--steps)"
-        )
-    return faults
 
 
 def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
@@ -151,8 +117,11 @@ def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
     return {"limited_commands": limited, "faults": [fault]}
 
 
-def _fit(data: TensorDictBase, *, by_states: bool = True) -> _Response:
-    """The ridge of all labelled steps that have one before them; with or without the observations themselves."""
+def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, float]:
+    """The ridge of all labelled steps that have one before them; with or without the observations themselves.
+
+    Beside it stands the share of the changes' variance that it explains on labels left out.
+    """
     episode, observed = data[EPISODE], data[OBSERVATION].double()
     changes = data["next", OBSERVATION].double() - observed
     rows = (data[HAS_ACTION].squeeze(-1) & ~_first(data)).nonzero().squeeze(-1)
@@ -167,19 +136,22 @@ def _fit(data: TensorDictBase, *, by_states: bool = True) -> _Response:
             changes[rows].square().mean(0).sqrt(),
         )
     )
-    inputs = _inputs(scales, seen, changes[rows - 1], action)
+
+    def scaled(*parts: Tensor) -> Tensor:
+        return torch.cat([part / size for part, size in zip(parts, scales, strict=True)], -1)
+
+    def step(observed: Tensor, change: Tensor, action: Tensor) -> Tensor:
+        return torch.nn.functional.linear(scaled(action, observed, change), weight, bias)
+
+    inputs = scaled(action, seen, changes[rows - 1])
     wanted = changes[rows]
     fit = ridge(inputs, wanted[:, moving] / size[moving], groups=episode[rows], penalties=[1e-9, 1e-7, 1e-5, 1e-3, 0.1])
     weight, bias = torch.zeros(observed.shape[-1], inputs.shape[-1]).double(), wanted.mean(0)
     weight[moving], bias[moving] = fit.weight * size[moving, None], fit.bias * size[moving]
-    return _Response(scales, weight, bias, 1 - fit.error**2)
+    return step, 1 - fit.error**2
 
 
-def _inputs(scales: tuple[Tensor, ...], observed: Tensor, change: Tensor, action: Tensor) -> Tensor:
-    return torch.cat([part / size for part, size in zip((action, observed, change), scales, strict=True)], -1)
-
-
-def _replay_error(response: _Response, data: TensorDictBase) -> float:
+def _replay_error(response: Response, data: TensorDictBase) -> float:
     """How far recorded actions end beside their recordings, in standard deviations: the median of trajectories."""
     spread = _spread(data)
     apart = []
@@ -190,14 +162,14 @@ def _replay_error(response: _Response, data: TensorDictBase) -> float:
             continue
         now, change = frames[1], frames[1] - frames[0]
         for step in range(1, len(rows) - 1):
-            change = response.step(now, change, action[step])
+            change = response(now, change, action[step])
             now = now + change
         apart.append(float(((now - frames[-1]) / spread).square().mean().sqrt()))
-    return sorted(apart)[len(apart) // 2] if apart else math.inf
+    return statistics.median_high(apart) if apart else math.inf
 
 
 def _roll(
-    policy: PlanningPolicy, response: _Response, data: TensorDictBase, steps: int, seed: int
+    policy: PlanningPolicy, response: Response, data: TensorDictBase, steps: int, seed: int
 ) -> tuple[Tensor, float, float]:
     """Commands ``[steps, n, act]``, fewer where they are no numbers any more, and where the robots get.
 
@@ -212,7 +184,7 @@ def _roll(
     origin, added = policy.origins or (0.0, 0.0)  # the agent reads and tells the robot's numbers
     for _ in range(steps):
         action = agent.act(now + origin).double().cpu() - added
-        change = response.step(now, change, action)
+        change = response(now, change, action)
         now = now + change
         commands.append(action)
         visited.append(now)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What :func:`~torchrl_koap.modules.make_policy` is told of a task."""
+"""What a task says of its data to a controller, and of the robot to :func:`~torchrl_koap.modules.make_policy`."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.evaluation.diagnosis import RecordedPlanner, hand_on
-from torchrl_koap.evaluation.policies import OracleFollower
+from torchrl_koap.evaluation.oracle import OracleFollower
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.modules import Execution, MLPDenoiser, StatePlanner, make_policy
 from torchrl_koap.tasks import get_task
