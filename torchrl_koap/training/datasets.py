@@ -11,9 +11,14 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.data.trajectories import labelled_episodes
+from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import digest_of
+from torchrl_koap.tasks import Task
+from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.policy_facts import tells_commands
 
 # what is derived from these may differ from version to version
 _RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("next", "observation"), ("next", "done"))
@@ -23,6 +28,12 @@ def fingerprint(data: TensorDictBase) -> dict[str, Any]:
     """What tells flat data ``[N]`` from others: their size, and a checksum of what was recorded."""
     present = set(data.keys(True, True))
     return {"steps": len(data), "sha256": digest_of((name, data.get(name)) for name in _RECORDED if name in present)}
+
+
+def within_budget(task: Task, config: TrainConfig, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
+    """Hides the labels of flat data ``[N]`` that a training of these options does not see; the budget reports."""
+    told = tells_commands(task, get_method(config.method))
+    return config.labels.budget(config.run.seed).apply(data, command=task.command_columns, tell_commands=told)
 
 
 def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int = 0) -> list[int]:

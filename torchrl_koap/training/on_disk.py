@@ -28,13 +28,19 @@ from torchrl_koap.runs.weights import load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.controller import check_lengths, learn_controller
-from torchrl_koap.training.datasets import choose_held_out, fingerprint, held_out_by, held_out_facts, split_held_out
+from torchrl_koap.training.datasets import (
+    choose_held_out,
+    fingerprint,
+    held_out_by,
+    held_out_facts,
+    split_held_out,
+    within_budget,
+)
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_planner
 from torchrl_koap.training.planner import learn_planner
-from torchrl_koap.training.policy_facts import tells_commands
 from torchrl_koap.training.trained import Trained, build_networks, facts_of
 from torchrl_koap.vision.encoder import cameras_of
 
@@ -175,8 +181,7 @@ def _read_data(
         data["action"] = torch.full_like(data["action"], torch.nan)
         data["has_action"] = torch.zeros_like(data["has_action"])
         return subsample_trajectories(data, share).to(config.run.device), held_out, None
-    budget, told = config.labels.budget(seed), tells_commands(task, get_method(config.method))
-    labelled, report = budget.apply(data, command=task.command_columns, tell_commands=told)
+    labelled, report = within_budget(task, config, data)
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:

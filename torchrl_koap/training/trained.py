@@ -25,16 +25,11 @@ from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryE
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
+from torchrl_koap.training.datasets import within_budget
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
-from torchrl_koap.training.policy_facts import (
-    controller_data,
-    policy_facts,
-    state_reader,
-    tells_commands,
-    with_commands,
-)
+from torchrl_koap.training.policy_facts import controller_data, policy_facts, state_reader, with_commands
 from torchrl_koap.vision import Observer, Projection
 from torchrl_koap.vision.encoder import load_cameras
 
@@ -202,14 +197,6 @@ class Trained:
         Raises:
             ValueError: as :func:`~torchrl_koap.modules.make_policy`, for a strategy of plans where actions are sampled,
                 or where a planner or a controller was trained alone.
-
-        Examples:
-            >>> import numpy as np
-            >>> from torchrl_koap import Agent, Trained
-            >>> agent = Agent(Trained.load("pretrained:avoiding").policy(), seed=0)
-            >>> agent.reset()
-            >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded, measured xy to a change of xy (m)
-            (2,)
         """
         execution = self.execution if execution is None else execution
         missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
@@ -249,9 +236,7 @@ class Trained:
         Raises:
             RunDirectoryError: if they are not the demonstrations that it was trained on.
         """
-        budget = self.config.labels.budget(self.config.run.seed)
-        told = tells_commands(self.task, self.method)
-        hidden, report = budget.apply(data, command=self.task.command_columns, tell_commands=told)
+        hidden, report = within_budget(self.task, self.config, data)
         if "labels" not in self.results:
             raise RunDirectoryError(f"{self.folder}: summary.json has no entry 'labels'")
         recorded = self.results["labels"]
