@@ -14,7 +14,14 @@ from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 from torchrl_koap.training import loop as loop_file
-from torchrl_koap.training.loop import SETTLED, DivergedError, OutlierLimit, moving_average, train_phase, warmup_cosine
+from torchrl_koap.training.loop import (
+    SETTLED,
+    AdaptiveClipping,
+    DivergedError,
+    moving_average,
+    train_phase,
+    warmup_cosine,
+)
 
 
 class Interrupt(KeyboardInterrupt):
@@ -299,7 +306,7 @@ def test_a_single_batch_does_not_undo_a_training(monkeypatch):
 
 def test_a_gradient_far_longer_than_those_before_is_shortened():
     x = nn.Parameter(torch.zeros(1, dtype=torch.float64))
-    limit = OutlierLimit([x], decay=0.9)
+    limit = AdaptiveClipping([x], decay=0.9)
     for update in range(SETTLED):
         x.grad = torch.full_like(x, 30.0 if update == 0 else -3.0)
         assert limit().item() == 1.0, update
@@ -317,7 +324,7 @@ def test_a_gradient_far_longer_than_those_before_is_shortened():
 def test_a_hundred_gradients_tell_the_usual_length():
     x = nn.Parameter(torch.zeros(1))
     for usual, wanted in ((3.0, 0.25), (0.0, 1.0)):
-        limit = OutlierLimit([x], decay=0.999)
+        limit = AdaptiveClipping([x], decay=0.999)
         for length in [usual] * SETTLED + [20 * usual]:
             x.grad = torch.full_like(x, length)
             factor = limit().item()

@@ -68,8 +68,8 @@ def train_phase(
 ) -> dict[str, float]:
     """Minimises the sum of all ``loss_*`` entries of a TorchRL ``LossModule`` with AdamW, in ``num_steps`` updates.
 
-    The rate is that of :func:`warmup_cosine`, and a gradient far longer than those before it is shortened
-    (:class:`OutlierLimit`). ``target_update`` is stepped every fourth update; ``best`` scores the averages, keeps good
+    The rate is that of :func:`warmup_cosine`, and a gradient far longer than those before it is clipped
+    (:class:`AdaptiveClipping`). ``target_update`` is stepped every fourth update; ``best`` scores averages, keeps good
     ones and ends the training early. ``sample`` returns a batch, by torch's global generator. ``run``, ``logger`` and
     ``resume`` are as of :class:`Phases`: on a CPU a training goes on bit for bit. ``replay`` records an update once as
     a CUDA graph: the loss must take the same path for every batch, as denoising losses do. ``progress`` is called with
@@ -93,8 +93,8 @@ def train_phase(
         loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True, capturable=replay
     )
     checkpoint = None if run is None else run.path / "checkpoints" / f"{phase}.safetensors"
-    limit = OutlierLimit(loss_module.parameters(), decay=optimizer.param_groups[0]["betas"][1]).to(device)
-    state = nn.ModuleDict({"loss": loss_module, "limit": limit} | ({} if best is None else {"best": best}))
+    clip = AdaptiveClipping(loss_module.parameters(), decay=optimizer.param_groups[0]["betas"][1]).to(device)
+    state = nn.ModuleDict({"loss": loss_module, "limit": clip} | ({} if best is None else {"best": best}))
     start = 0
     if resume and checkpoint is not None:
         if checkpoint.exists():
@@ -109,7 +109,7 @@ def train_phase(
         losses = loss_module(batch)
         terms = losses.select(*(key for key in losses.keys() if key.startswith("loss_")))
         sum(terms.values()).backward()
-        limit()
+        clip()
         optimizer.step()
         optimizer.zero_grad()
         return terms.detach()
@@ -194,8 +194,8 @@ def _interrupts_let_through() -> Iterator[None]:
         raise
 
 
-class OutlierLimit(nn.Module):
-    """Shortens the gradient to five times the root mean square length of earlier ones, where it is longer.
+class AdaptiveClipping(nn.Module):
+    """Adaptive gradient clipping: no gradient is longer than five times the root mean square of earlier lengths.
 
     Where gradients have become short, so has the second moment that AdamW divides by. One that is several times as long
     then moves every parameter by several learning rates, the next one is longer still, and within twenty updates the
