@@ -20,7 +20,7 @@ from torchrl_koap.evaluation import diagnosis, inspection
 from torchrl_koap.evaluation.diagnosis import (
     RECORDED_FUTURE,
     contexts_of,
-    coverage,
+    distance_to_demonstrations,
     follow_recordings,
     left_recordings,
     planner_rollout,
@@ -113,8 +113,9 @@ def test_states_beside_the_demonstrations_are_far():
     near, far = episode(0), episode(0)
     near["observation"][:, 2:] = shown[:8] + 0.001
     far["observation"][:, 2:] = shown[:8] + 5
-    assert coverage(AVOIDING, [near], data)["visited_95"] < 1.5 * coverage(AVOIDING, [near], data)["demonstrated_95"]
-    assert coverage(AVOIDING, [far], data)["visited_95"] > 5
+    distances = distance_to_demonstrations(AVOIDING, [near], data)
+    assert distances["visited_95"] < 1.5 * distances["demonstrated_95"]
+    assert distance_to_demonstrations(AVOIDING, [far], data)["visited_95"] > 5
 
 
 @pytest.mark.parametrize("command", ["eval --no-report", "eval --no-report --strategy oracle", "inspect"])

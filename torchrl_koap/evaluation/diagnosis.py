@@ -154,7 +154,7 @@ def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *
     return sum(error[task.position][-1] > beyond for error in errors if task.position in error)
 
 
-def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:
+def distance_to_demonstrations(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:
     """Measures how far visited states are from the nearest demonstrated one, and demonstrated ones, in spreads.
 
     Every second demonstration is compared with the others, so that both figures are distances to strangers: their 95 %

@@ -15,7 +15,7 @@ from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.evaluation.closed_loop import RolloutEnvironment, find_environment
 from torchrl_koap.evaluation.config import EvalConfig
 from torchrl_koap.evaluation.diagnosis import (
-    coverage,
+    distance_to_demonstrations,
     follow_recordings,
     left_recordings,
     planner_rollout,
@@ -118,7 +118,7 @@ def _experiments(
         found |= {
             "both": rate([outcome_of(episode) == "success" for episode in closed]),
             "plan_to_execution": tracking_errors(task, closed, interval),
-            "distance_to_demonstrations": coverage(task, closed, data),
+            "distance_to_demonstrations": distance_to_demonstrations(task, closed, data),
         }
         if config.env is None:  # the controller alone follows recordings from where they started
             followed = follow_recordings(policy, task, data, where.make_env, episodes=config.episodes)
