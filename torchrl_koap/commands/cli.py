@@ -151,9 +151,8 @@ def _commands() -> tuple[Any, ...]:
 def _one_line(error: BaseException) -> str:
     """The message of an error, the problems it lists one after the other."""
     message = str(error.args[0] if isinstance(error, KeyError) and error.args else error)
-    said = "; ".join(line.strip().removeprefix("- ") for line in message.splitlines() if line.strip()).replace(
-        ":;", ":"
-    )
+    lines = [line.strip().removeprefix("- ") for line in message.splitlines() if line.strip()]
+    said = "; ".join(lines).replace(":;", ":")
     if isinstance(error, MemoryError):
         return f"out of memory{f': {said}' if said else ''}; try fewer episodes, or smaller batches"
     return said or type(error).__name__

@@ -239,9 +239,7 @@ def make_demonstrations(
             for index, (name, unit, kind, constant) in enumerate(zip(acting, units, kinds, constants, strict=True))
         },
         position=next(part for part in parts if part != _COMMAND),
-        max_steps=int(max_steps)
-        if max_steps is not None
-        else round(_SLACK * max(len(frames) for frames in recordings.states)),
+        max_steps=round(_SLACK * max(map(len, recordings.states))) if max_steps is None else int(max_steps),
         control_hz=float(rate),
         command=_COMMAND if commanded else None,
         robot=tuple(others.index(column) for column in own),

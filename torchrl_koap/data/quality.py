@@ -84,10 +84,9 @@ def _trajectory_warnings(
     first: dict[bytes, str] = {}
     names, units = task.observation_names, task.known_units
     looked_at = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
-    entries = [data.get(key) for key in (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)]
-    for name, observed, steps, has_action, last in zip(
-        called, *(entry.split(lengths) for entry in entries), strict=True
-    ):
+    read = (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)
+    parts = [data.get(key).split(lengths) for key in read]
+    for name, observed, steps, has_action, last in zip(called, *parts, strict=True):
         same = first.setdefault(_digest(observed, steps, last[-1:]), name)
         if same is not name:
             yield f"{name} repeats {same}: every step is the same"

@@ -142,15 +142,14 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
         raise ValueError(f"{key} must be numbers [T, d], got {frames.dtype} {list(frames.shape)}")
     states, unclear, unread, steps = _named(frames, entries.get("state_names"), "state"), [], [], None
     for name, values in entries.items():
-        kind = kind_of(name)[0]
-        counted = _counted(values, len(frames), kind)
-        single = values.shape in ((len(frames),), (len(frames), 1)) and values.dtype.kind in "fiub"
         if name in read:
             continue
-        if kind == "other" or kind is None and not single and counted is None:
+        kind = kind_of(name)[0]
+        single = values.shape in ((len(frames),), (len(frames), 1)) and values.dtype.kind in "fiub"
+        flags = None if single else _counted(values, len(frames), kind)
+        if kind == "other" or kind is None and not single and flags is None:
             unread.append(name)
             continue
-        flags = None if single else counted
         if flags is not None and kind == "start":
             flags = np.roll(flags, 1)  # the first frame of an episode lies behind the last one of another
         states[name] = _frame_entry(name, values, len(frames)) if flags is None else flags
