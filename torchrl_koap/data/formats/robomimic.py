@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,12 +65,13 @@ def _read(
     stream: Any, file: Path, observations: Sequence[str] | None, *, use_next: bool
 ) -> tuple[list[Piece], float | None, list[str]]:
     """Demonstrations, the rate that is declared, and what is not read."""
-    if not _is_group(stream.get("data")):
+    if not isinstance(stream.get("data"), Mapping):  # as groups are
         wanted = "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions)"
         raise DataError(file, f"no group 'data', {wanted}; the file holds {', '.join(stream) or 'nothing'}")
     data = stream["data"]
-    demos = sorted((name for name in data if _is_group(data.get(name))), key=_number)
-    faults = [(f"data/{name}", "it has no group 'obs'") for name in demos if not _is_group(data[name].get("obs"))]
+    demos = sorted((name for name in data if isinstance(data.get(name), Mapping)), key=_number)
+    lacking = [name for name in demos if not isinstance(data[name].get("obs"), Mapping)]
+    faults = [(f"data/{name}", "it has no group 'obs'") for name in lacking]
     if faults or not demos:
         raise DataError(file, gathered(faults) or "'data' holds no trajectories")
     first = data[demos[0]]
@@ -153,12 +154,6 @@ def _number(name: str) -> tuple[int, str]:
 
 def _is_table(entry: Any) -> bool:
     return len(_shape(entry)) in (1, 2) and entry.dtype.kind in "fiub"
-
-
-def _is_group(entry: Any) -> bool:
-    import h5py
-
-    return isinstance(entry, h5py.Group)
 
 
 def _control_frequency(text: Any) -> float | None:
