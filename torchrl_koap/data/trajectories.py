@@ -121,6 +121,12 @@ def trajectory_lengths(data: TensorDictBase) -> torch.Tensor:
     return torch.unique_consecutive(data.get(keys.EPISODE), return_counts=True)[1]
 
 
+def begins(data: TensorDictBase) -> torch.Tensor:
+    """Which steps of flat data begin a trajectory, bool ``[N]``."""
+    episode = data.get(keys.EPISODE)
+    return episode.diff(prepend=episode[:1] - 1) != 0
+
+
 def labelled_episodes(data: TensorDictBase) -> torch.Tensor:
     """Numbers of the trajectories of flat data that have a label, int64 ``[k]``, ascending."""
     return data.get(keys.EPISODE)[data.get(keys.HAS_ACTION).squeeze(-1)].unique()

@@ -33,6 +33,7 @@ from torchrl.data import (
 from torchrl.data.replay_buffers import SampleUnit
 
 from torchrl_koap import keys
+from torchrl_koap.data.trajectories import begins
 from torchrl_koap.files import some
 
 Rows = TypeVar("Rows", Tensor, TensorDictBase)
@@ -89,8 +90,7 @@ class WindowTable:
         if episode is None:
             raise KeyError(f"windows need the entry {keys.EPISODE!r}; the data have {sorted(map(str, data.keys()))}")
         device, steps = episode.device, len(episode)
-        new = torch.ones(steps, dtype=torch.bool, device=device)
-        new[1:] = episode[1:] != episode[:-1]
+        new = begins(data)
         count = data.get(keys.STEP_COUNT, None)
         if count is not None:  # where steps were left out, those of one trajectory are not consecutive
             new[1:] |= count[1:] != count[:-1] + 1

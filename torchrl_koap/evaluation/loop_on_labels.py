@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data.trajectories import labelled_episodes
+from torchrl_koap.data.trajectories import begins, labelled_episodes
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.findings import UNSTABLE, loop_faults
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
@@ -124,7 +124,7 @@ def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, flo
     """
     episode, observed = data[EPISODE], data[OBSERVATION].double()
     changes = data["next", OBSERVATION].double() - observed
-    rows = (data[HAS_ACTION].squeeze(-1) & ~_first(data)).nonzero().squeeze(-1)
+    rows = (data[HAS_ACTION].squeeze(-1) & ~begins(data)).nonzero().squeeze(-1)
     action = data[ACTION][rows].double()
     seen, size = observed[rows], changes[rows].std(0, correction=0)
     moving = size > 1e-9 * seen.abs().amax(0)  # goals move no robot
@@ -175,7 +175,7 @@ def _roll(
 
     The distance to recorded states, and the share of the way that the demonstrations take.
     """
-    observed, first = data[OBSERVATION].double(), _first(data)
+    observed, first = data[OBSERVATION].double(), begins(data)
     starts = (first.roll(1) & ~first & (observed + observed.roll(1, 0)).isfinite().all(-1)).nonzero().squeeze(-1)
     starts = spread_evenly(starts, ROBOTS)
     now, change = observed[starts], observed[starts] - observed[starts - 1]
@@ -203,11 +203,6 @@ def _roll(
 def _way(moved: Tensor, spread: Tensor) -> Tensor:
     """The farthest that rows ``[T, obs]`` of differences are from 0, in standard deviations."""
     return (moved / spread).nan_to_num().norm(dim=-1).max()
-
-
-def _first(data: TensorDictBase) -> Tensor:
-    """Which steps begin a trajectory, bool ``[N]``."""
-    return data[EPISODE].diff(prepend=data[EPISODE][:1] - 1) != 0
 
 
 def _spread(data: TensorDictBase) -> Tensor:

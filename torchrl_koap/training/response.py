@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_koap.data.trajectories import begins
 from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.policy_facts import commanded_columns
@@ -132,9 +133,8 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
     positions = data["state"][:, response.states].double()
     action = torch.where(labelled.unsqueeze(-1), data["action"][:, response.actions].double(), torch.nan)
     if response.absolute:
-        after, changes = action, torch.full_like(action, torch.nan)
-        same = (episode[1:] == episode[:-1]).unsqueeze(-1)
-        changes[1:] = torch.where(same, action.diff(dim=0), torch.nan)
+        after = action
+        changes = torch.where(begins(data).unsqueeze(-1), torch.nan, action.diff(dim=0, prepend=action[:1]))
     else:
         changes = action
         after = data["observation"][:, response.commands].double() + changes
