@@ -18,7 +18,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 from matplotlib.transforms import ScaledTranslation
 
 from torchrl_koap.reports.pictures import save_figure
-from torchrl_koap.reports.style import FAINT, INK, set_title, tidy
+from torchrl_koap.reports.style import INK, set_title, tidy
 from torchrl_koap.studies.table import Summary, percent
 
 AXES = {
@@ -107,7 +107,7 @@ def plot_measure(
                 axes.axhline(1, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
         else:
             _scale_shares(axes, 100 if measure == "success" else 1)
-        tidy(axes)
+        tidy(axes, grid=True)
     _name_lines(figure, [line for lines in panels.values() for line in lines])
     save_figure(figure, path)
 
@@ -136,7 +136,7 @@ def plot_average(
     _scale_shares(axes, 100)
     title = f"success, 95 % interval: {tasks[0]}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks, 95 % interval"
     hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
-    tidy(axes, title + hollow)
+    tidy(axes, title + hollow, grid=True)
     _name_lines(figure, lines)
     save_figure(figure, path)
 
@@ -190,7 +190,6 @@ def _lines(
 def _scale_shares(axes: Axes, top: int) -> None:
     axes.set_ylim(-0.03 * top, 1.03 * top)
     axes.set_yticks([top * part / 5 for part in range(6)])
-    axes.grid(axis="y", color=FAINT, linewidth=0.5)
 
 
 def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
@@ -203,7 +202,6 @@ def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=range(1, 10) if span < 5 else (1, 2, 5) if span < 100 else (1,)))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(axis="y", color=FAINT, linewidth=0.5)
 
 
 def _log_x(axes: Axes, lines: Sequence[_Line], *, ticks: bool) -> None:
