@@ -144,15 +144,12 @@ def _diagonalise(matrix, vectors):
                     t = -t
                 c = 1.0 / np.sqrt(t * t + 1.0)
                 s = t * c
-                for k in range(6):
-                    a, b = matrix[k, p], matrix[k, r]
-                    matrix[k, p], matrix[k, r] = c * a - s * b, s * a + c * b
-                for k in range(6):
-                    a, b = matrix[p, k], matrix[r, k]
-                    matrix[p, k], matrix[r, k] = c * a - s * b, s * a + c * b
-                for k in range(6):
-                    a, b = vectors[k, p], vectors[k, r]
-                    vectors[k, p], vectors[k, r] = c * a - s * b, s * a + c * b
+                a, b = matrix[:, p].copy(), matrix[:, r].copy()
+                matrix[:, p], matrix[:, r] = c * a - s * b, s * a + c * b
+                a, b = matrix[p].copy(), matrix[r].copy()
+                matrix[p], matrix[r] = c * a - s * b, s * a + c * b
+                a, b = vectors[:, p].copy(), vectors[:, r].copy()
+                vectors[:, p], vectors[:, r] = c * a - s * b, s * a + c * b
 
 
 @njit(cache=True)
