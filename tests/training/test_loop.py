@@ -333,7 +333,7 @@ def test_a_hundred_gradients_tell_the_usual_length():
 
 def test_a_training_whose_first_gradients_are_zero_begins_later():
     x = nn.Parameter(torch.zeros(1))
-    limit = OutlierLimit([x], decay=0.999)
+    limit = AdaptiveClipping([x], decay=0.999)
     for length in [0.0] * (SETTLED + 1) + [3.0]:
         x.grad = torch.full_like(x, length)
         factor = limit().item()
