@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from run_files import run_of, titles
 
-from torchrl_koap.reports.error_plots import draw_actions, draw_losses, running_mean
+from torchrl_koap.reports.error_plots import draw_action_errors, draw_actions, draw_losses, running_mean
 from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.style import BLUE, PALE_BLUE, RED
 from torchrl_koap.tasks import Action, Task
 
 NOTHING = run_of(None)
@@ -81,3 +83,21 @@ def test_actions_of_another_robot():
 def test_bad_actions(predicted, message):
     with pytest.raises(ValueError, match=message):
         draw_actions({"predicted": predicted, "true": np.zeros((4, 2))}, NOTHING)
+
+
+def test_errors_of_actions_are_shares_so_that_small_ones_can_be_read():
+    rows = [
+        {"name": "dx", "unit": "m", "controller": 0.0005, "ridge": 0.001, "mean_action": 0.002},
+        {"name": "gripper", "unit": "", "controller": 0.6, "mean_action": 0.5},
+        {"name": "still", "unit": "", "controller": 0.0, "ridge": 0.0, "mean_action": 0.0},
+    ]
+    figure = draw_action_errors(
+        {"action_errors": {"left_out": {"labels": 9, "trajectories": 2, "column": rows}}}, NOTHING
+    )
+    (axes,) = figure.axes
+    heights = [bar.get_height() for bar in axes.patches]
+    assert heights == pytest.approx([0.25, 1.2, math.nan, 0.5, math.nan, math.nan], nan_ok=True)
+    colors = [to_hex(bar.get_facecolor()) for bar in axes.patches]
+    assert [colors[0], colors[1], colors[3]] == [BLUE.lower(), RED.lower(), PALE_BLUE.lower()]
+    assert axes.lines[0].get_ydata() == [1, 1]  # always the mean action
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["dx\n0.5 mm", "gripper\n0.6", "still\n0"]

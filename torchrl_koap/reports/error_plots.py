@@ -46,7 +46,6 @@ _PLANS = {
 _ACTIONS = {
     "controller": ("controller", BLUE),
     "ridge": ("ridge on raw frames", PALE_BLUE),
-    "mean_action": ("always the mean action", MUTED),
 }
 _SPLITS = {
     "outside_budget": "labels outside the budget, for evaluation only",
@@ -223,44 +222,46 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     "action_errors.png",
     source="eval.json",
     title="Errors of the actions",
-    caption="Root mean square error of the actions that are predicted from recorded states, by action column. Lower is"
-    " better. A red bar, if there is one, is a column in which the controller is no better than always giving the mean"
-    " action. On the robot the controller reads planned states, and its errors are larger.",
+    caption="Root mean square error of the actions that are predicted from recorded states, as a share of that of"
+    " always giving the mean action (dashed). Lower is better. Below each action stands the controller's error in its"
+    " unit. A red bar, if there is one, is an action in which the controller is no better than the mean. On the robot"
+    " the controller reads planned states, and its errors are larger.",
     order=16,
     offline=True,
 )
 def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws errors of decoded actions by column and unit, beside a ridge's and those of always the mean action."""
+    """Draws errors of decoded actions by column, and those of a ridge, as shares of always the mean action's."""
     parts = [(name, part) for name, part in mapping(result.get("action_errors")).items() if "column" in part]
     if not parts:
         raise NothingToDraw("no action was evaluated on recorded data")
-    units = list(dict.fromkeys(row["unit"] for _, part in parts for row in part["column"]))
-    counts = [sum(row["unit"] == unit for row in parts[0][1]["column"]) for unit in units]
-    figure = Figure(figsize=(3.6 + 0.62 * sum(counts) + 1.2 * len(units), 0.8 + 2.9 * len(parts)), layout="constrained")
-    widths = [1 + count for count in counts]
-    panels = figure.subplots(len(parts), len(units), squeeze=False, width_ratios=widths)
-    for (name, part), line in zip(parts, panels, strict=True):
-        for unit, axes in zip(units, line, strict=True):
-            _draw_bars(axes, [row for row in part["column"] if row["unit"] == unit], unit)
+    count = len(parts[0][1]["column"])
+    figure = Figure(figsize=(4.8 + 0.8 * count, 0.8 + 2.9 * len(parts)), layout="constrained")
+    panels = figure.subplots(len(parts), squeeze=False)[:, 0]
+    for (name, part), axes in zip(parts, panels, strict=True):
+        _draw_shares(axes, part["column"])
         judged = f"{part['labels']:,} labels of {part['trajectories']} recordings"
-        set_title(line[0], f"{_SPLITS.get(name, name)}\n{judged}")
+        set_title(axes, f"{_SPLITS.get(name, name)}\n{judged}")
     handles = [Line2D([], [], color=color, linewidth=6, label=label) for label, color in _ACTIONS.values()]
     if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
         handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
-    put_legend(panels[0, -1], handles=handles)
+    handles.append(Line2D([], [], color=MUTED, linestyle="dashed", label="always the mean action"))
+    put_legend(panels[0], handles=handles)
     return figure
 
 
-def _draw_bars(axes: Axes, rows: Sequence[Mapping[str, Any]], unit: str) -> None:
-    shown, factor = thousandths(unit)
-    places = np.arange(len(rows))
-    for offset, (name, (_, color)) in zip((-0.27, 0.0, 0.27), _ACTIONS.items(), strict=True):
-        values = [factor * row.get(name, math.nan) for row in rows]
+def _draw_shares(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    places, names = np.arange(len(rows)), []
+    for offset, (name, (_, color)) in zip((-0.17, 0.17), _ACTIONS.items(), strict=True):
+        shares = [row.get(name, math.nan) / (row["mean_action"] or math.nan) for row in rows]
         worse = [name == "controller" and row[name] >= row["mean_action"] for row in rows]
-        axes.bar(places + offset, values, width=0.25, color=[RED if bad else color for bad in worse])
-    axes.set_xticks(places, [row["name"] for row in rows], rotation=45 if len(rows) > _MANY else 0)
+        axes.bar(places + offset, shares, width=0.3, color=[RED if bad else color for bad in worse])
+    axes.axhline(1, color=MUTED, linestyle="dashed")
+    for row in rows:
+        shown, factor = thousandths(row["unit"])
+        names.append(f"{row['name']}\n{factor * row['controller']:.2g} {shown}".rstrip())
+    axes.set_xticks(places, names, rotation=45 if len(rows) > _MANY else 0)
     axes.set_xlim(-0.6, len(rows) - 0.4)
-    axes.set_ylabel(f"RMSE ({shown or 'units of the data'})")
+    axes.set_ylabel("RMSE, share of the mean's")
     axes.set_axisbelow(True)
     tidy(axes, grid=True)
 
