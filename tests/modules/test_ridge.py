@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Ridge regression in closed form: against numpy, and its held-out errors against brute-force refits."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -82,6 +84,17 @@ def test_held_out_errors_against_refits(sizes, bias, m):
         assert result.errors[penalty] == pytest.approx(np.sqrt((residual**2).mean()), rel=1e-6)
     assert result.penalty == min(PENALTIES, key=lambda penalty: (residuals[penalty] ** 2).mean())
     assert result.error == result.errors[result.penalty]
+
+
+@pytest.mark.parametrize("sizes", [None, [5] * 80])
+def test_many_rows_are_taken_some_at_a_time(monkeypatch, sizes):
+    latent, action = make_data(400, 6)
+    groups = None if sizes is None else torch.arange(80).repeat_interleave(5)
+    at_once = fit(latent, action, groups=groups, prior=torch.ones(2, 6))
+    monkeypatch.setattr(sys.modules["torchrl_koap.modules.ridge"], "ROWS", 7)
+    in_parts = fit(latent, action, groups=groups, prior=torch.ones(2, 6))
+    torch.testing.assert_close(in_parts.weight, at_once.weight)
+    assert in_parts.errors == pytest.approx(at_once.errors)
 
 
 def test_few_groups():
@@ -183,22 +196,29 @@ def test_a_group_that_alone_knows_a_direction_still_has_an_error():
     left[:5, 0], left[5, 1] = 5**-0.5, 1.0
     groups, shrinks = torch.tensor([0, 0, 1, 1, 1, 2]), torch.tensor([[1.0, 1.0 - 1e-12]], dtype=torch.float64)
     target = torch.ones(6, 1, dtype=torch.float64)
-    found = held_out_errors(left, shrinks, target, groups, centred=False)
+    found = held_out_errors(left.__getitem__, shrinks, left.mT @ target, target, groups, centred=False)
     assert found.item() == pytest.approx(1 / 6, rel=1e-3)  # predicted as 0 without its own row; the others are exact
 
 
 def test_systems_that_rounding_makes_indefinite_are_solved_all_the_same():
     left = torch.eye(4, dtype=torch.float64) * (1 + 1e-9)
     shrinks = torch.ones(1, 4, dtype=torch.float64)
-    found = held_out_errors(left, shrinks, torch.ones(4, 1).double(), torch.tensor([0, 0, 1, 1]), centred=False)
+    target, groups = torch.ones(4, 1).double(), torch.tensor([0, 0, 1, 1])
+    found = held_out_errors(left.__getitem__, shrinks, left.mT @ target, target, groups, centred=False)
     assert found.isfinite().all()
+
+
+def decompose(matrix):
+    mean = torch.zeros(matrix.shape[1]).double()
+    left, singular, right = thin_svd(matrix, mean)
+    return left(torch.arange(len(matrix))), singular, right
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(90, 4), (9, 4), (4, 9), (3, 2100)])
 def test_decomposition_is_one(rows, columns):
     torch.manual_seed(0)
     matrix = torch.randn(rows, columns, dtype=torch.float64)
-    left, singular, right = thin_svd(matrix)
+    left, singular, right = decompose(matrix)
     torch.testing.assert_close((left * singular) @ right, matrix)
     torch.testing.assert_close(left.mT @ left, torch.eye(len(singular)).double())
     torch.testing.assert_close(singular, torch.linalg.svdvals(matrix)[: len(singular)])
@@ -207,7 +227,7 @@ def test_decomposition_is_one(rows, columns):
 def test_directions_that_are_lost_in_rounding_are_left_out():
     matrix = torch.randn(60, 3, dtype=torch.float64)
     matrix = torch.cat([matrix, torch.zeros(60, 2).double(), matrix[:, :1]], -1)  # nothing, and one column twice
-    left, singular, right = thin_svd(matrix)
+    left, singular, right = decompose(matrix)
     assert len(singular) == 3
     torch.testing.assert_close((left * singular) @ right, matrix)
-    assert thin_svd(torch.zeros(60, 2).double())[1].numel() == 0
+    assert decompose(torch.zeros(60, 2).double())[1].numel() == 0

@@ -121,3 +121,13 @@ def test_columns_are_guessed_for_robots_without_a_simulator_alone():
     robot = replace(stacking, env=None, expert=None)
     assert action_facts(robot, range(8)) == {"axes": [*range(8)], "guessed": True, "alike": True}
     assert action_facts(robot, range(7))["axes"] == []
+
+
+def test_of_very_many_labels_some_are_fitted_spread_over_all(fits, monkeypatch):
+    monkeypatch.setattr("torchrl_koap.training.closed_form.MOST", 10)
+    labelled, _ = LabelBudget().apply(numbered())
+    controller = controller_of("linear", labelled)
+    assert fit_closed_form(controller, labelled)["labels_used"] == 10
+    ((_, targets, groups, _),) = fits
+    assert groups.unique().tolist() == list(range(len(LENGTHS)))
+    assert controller.raw_action(targets)[:, 0].diff().min() > 5

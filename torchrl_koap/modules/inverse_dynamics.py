@@ -184,7 +184,8 @@ class InverseDynamics(TensorDictModuleBase):
         if not rows.any():
             raise ValueError(f"no labelled frame lies in frames {frames.start}..{frames.stop - 1} of any window")
         states, action, mask = states[rows], action[rows], mask[rows]
-        inputs = torch.cat([read(some, frames) for some in states.split(BATCH)])[mask]
+        parts = zip(states.split(BATCH), mask.split(BATCH), strict=True)
+        inputs = torch.cat([read(some, frames)[counts] for some, counts in parts])
         action = self.normalize_action(action[:, part][mask])
         return inputs, action, None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)[mask]
 

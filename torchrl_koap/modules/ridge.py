@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 # columns above which the products of the rows are decomposed, if there are few enough of these
 WIDE = 2048
+ROWS = 8192  # that are in float64 at once, at least: all of them may take more memory than there is
 PENALTIES = tuple(10.0 ** (p / 2) for p in range(-12, 3))
 # one or two labelled trajectories cannot be left out to choose the penalty
 DEFAULT_PENALTY = 0.15
@@ -112,12 +113,12 @@ def ridge(
         raise ValueError(f"penalties must be positive and finite, got {candidates}")
     if not len(inputs):
         raise ValueError("a ridge regression needs at least one labelled step, there is none")
-    x, y = inputs.double(), targets.double()
+    x, y = inputs, targets.double()
     for name, value in (("action", y), ("input", x)):
         if not value.isfinite().all():
             raise ValueError(f"a labelled {name} is not finite")
-    prior = x.new_zeros(y.shape[-1], x.shape[-1]) if prior is None else prior.to(x)
-    y = y - x @ prior.mT  # a ridge around the prior is a ridge around 0 on what the prior leaves over
+    if prior is not None:  # a ridge around the prior is a ridge around 0 on what the prior leaves over
+        y = y - torch.cat([part.double() @ prior.to(y).mT for part in x.split(ROWS)])
     rows = torch.arange(len(x), device=x.device)
     groups = rows if groups is None else groups.unique(return_inverse=True)[1]
     num_groups = int(groups.max()) + 1
@@ -126,24 +127,25 @@ def ridge(
     if num_groups == 1:  # its rows are all there is to leave out
         groups = rows
 
-    mean_x, mean_y = (x.mean(0), y.mean(0)) if bias else (torch.zeros_like(x[0]), torch.zeros_like(y[0]))
-    centred, target = (x - mean_x, y - mean_y) if bias else (x, y)  # a copy may take gigabytes
-    left, singular, right = thin_svd(centred)
-    unit = centred.square().sum(-1).mean()
+    mean_x, mean_y = (part.mean(0, dtype=torch.float64) * bias for part in (x, y))
+    target = y - mean_y
+    left, singular, right = thin_svd(x, mean_x)
+    unit = singular.square().sum() / len(x)
     unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant inputs: any scale will do
-    projected = left.mT @ target
 
     smallest = input_noise * len(x)
     tried = sorted({max(float(penalty), smallest) for penalty in penalties})
     shrinks = torch.stack([singular.square() / (singular.square() + penalty * unit) for penalty in tried])
-    squares = held_out_errors(left, shrinks, target, groups, centred=bias)
+    projected = torch.stack([left(some).mT @ target[some] for some in rows.split(ROWS)]).sum(0)
+    squares = held_out_errors(left, shrinks, projected, target, groups, centred=bias)
     errors = dict(zip(tried, squares.mean(-1).sqrt().tolist(), strict=True))
     best = squares.mean(-1).argmin()
     each = best.expand(y.shape[-1]) if alike else squares.argmin(0)
     own = singular.new_tensor(tried)[each]
     weight = right.mT @ (singular[:, None] / (singular.square()[:, None] + own * unit) * projected)  # [m, act]
     error = float(squares.gather(0, each[None]).mean().sqrt())
-    return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
+    beside = 0.0 if prior is None else prior.to(y)
+    return RidgeFit(weight.mT + beside, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
 
 
 def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
@@ -161,35 +163,51 @@ def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
     return torch.linalg.solve(gram, rows.mT @ target)
 
 
-def thin_svd(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Decomposes ``[N, m]`` into left vectors ``[N, r]``, singular values ``[r]``, descending, and right ``[r, m]``.
+def thin_svd(inputs: Tensor, mean: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor, Tensor]:
+    """Decomposes inputs ``[N, m]`` without their mean ``[m]``, in float64.
 
-    Where one side is much longer than the other, the small product is decomposed. Directions that are lost in rounding
-    are left out: below a millionth of the largest singular value by products of rows, below a billionth where there are
-    many rows.
+    Returned are a function that gives the left vectors ``[n, r]`` of rows int64 ``[n]``, singular values ``[r]``,
+    descending, and right vectors ``[r, m]``. Of many rows, some at a time become a triangle. Where there are far more
+    columns, the products of the rows are decomposed. Directions that are lost in rounding are left out: below a
+    millionth of the largest singular value by products of rows, below a billionth where there are many rows.
     """
-    rows, columns = matrix.shape
+    rows, columns = inputs.shape
+    if rows > 4 * columns:
+        triangle = mean.new_zeros(0, columns)
+        for part in inputs.split(max(ROWS, columns)):
+            triangle = torch.linalg.qr(torch.cat([triangle, part.double() - mean]), mode="r").R
+        _, singular, right = torch.linalg.svd(triangle)
+        kept = singular > 1e-9 * singular[0].clamp_min(1e-300)
+        singular, right = singular[kept], right[kept]
+        scaled = right.mT / singular
+        return lambda some: (inputs[some].double() - mean) @ scaled, singular, right
+    matrix = inputs.double() - mean
     if columns > max(WIDE, 2 * rows):
         values, left = torch.linalg.eigh(matrix @ matrix.mT)
         kept = values > 1e-12 * values[-1].clamp_min(1e-300)
         singular, left = values[kept].flip(0).sqrt(), left[:, kept].flip(-1)
-        return left, singular, (left.mT @ matrix) / singular[:, None]
-    if rows <= 4 * columns:
-        return torch.linalg.svd(matrix, full_matrices=False)
-    triangle = torch.linalg.qr(matrix, mode="r").R
-    _, singular, right = torch.linalg.svd(triangle)
-    kept = singular > 1e-9 * singular[0].clamp_min(1e-300)
-    singular, right = singular[kept], right[kept]
-    return matrix @ (right.mT / singular), singular, right
+        right = (left.mT @ matrix) / singular[:, None]
+    else:
+        left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
+    return left.__getitem__, singular, right
 
 
-def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tensor, *, centred: bool) -> Tensor:
+def held_out_errors(
+    left: Callable[[Tensor], Tensor],
+    shrinks: Tensor,
+    projected: Tensor,
+    target: Tensor,
+    groups: Tensor,
+    *,
+    centred: bool,
+) -> Tensor:
     r"""Computes mean squared errors ``[P, act]`` of ridge regressions on every group of rows, predicted without it.
 
-    With the left singular vectors ``U`` ``[N, r]`` and the shrinkages ``s`` of the directions, a row for every
-    regression ``[P, r]``, a ridge predicts :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` left
-    out have the errors :math:`(I - H_{GG})^{-1} (Y - \hat Y)_G`, exactly. For a group of more rows than there are
-    directions the smaller system is solved (Woodbury's identity, with :math:`V = U_G \mathrm{diag}(s)^{1/2}`):
+    With the left singular vectors ``U`` ``[N, r]``, which ``left`` gives by rows, the target's parts along them
+    (``projected [r, act]``) and the shrinkages ``s`` of the directions, a row for every regression ``[P, r]``, a ridge
+    predicts :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` left out have the errors :math:`(I -
+    H_{GG})^{-1} (Y - \hat Y)_G`, exactly. For a group of more rows than there are directions the smaller system is
+    solved (Woodbury's identity, with :math:`V = U_G \mathrm{diag}(s)^{1/2}`):
 
     .. math::
         (I - V V^T)^{-1} E = E + V (I - V^T V)^{-1} V^T E
@@ -198,23 +216,24 @@ def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tenso
     act]`` is then without it. ``groups`` are int64 ``[N]``. Errors are infinite where nothing is left to take a mean
     of.
     """
-    coefficients = shrinks.unsqueeze(-1) * (left.mT @ target)  # [P, r, act]
-    if centred and len(left) == 1:
+    coefficients = shrinks.unsqueeze(-1) * projected  # [P, r, act]
+    if centred and len(target) == 1:
         return target.new_full((len(shrinks), target.shape[1]), torch.inf)
-    constant = len(left) ** -0.5 if centred else 0.0  # the mean's direction, in every row
+    constant = len(target) ** -0.5 if centred else 0.0  # the mean's direction, in every row
+    total = target.new_zeros(len(shrinks), target.shape[1])
     sizes = groups.bincount()
     if int(sizes.max()) == 1:  # single rows: the leverages are all that is needed
-        leverage = left.square() @ shrinks.mT + constant**2
-        errors = [
-            (target - left @ c) / (1 - h[:, None]) for c, h in zip(coefficients, leverage.unbind(-1), strict=True)
-        ]
-        return torch.stack([error.square().mean(0) for error in errors])
+        for rows in torch.arange(len(target), device=target.device).split(ROWS):
+            part = left(rows)
+            leverage = part.square() @ shrinks.mT + constant**2
+            for fit, (c, h) in enumerate(zip(coefficients, leverage.unbind(-1), strict=True)):
+                total[fit] += ((target[rows] - part @ c) / (1 - h[:, None])).square().sum(0)
+        return total / len(target)
     if centred:
         shrinks = torch.cat([shrinks, shrinks.new_ones(len(shrinks), 1)], -1)
     roots = shrinks.sqrt().unsqueeze(-1)  # [P, r, 1]
-    total = target.new_zeros(len(shrinks), target.shape[1])
     for rows in groups.argsort(stable=True).split(sizes.tolist()):
-        part = left[rows]
+        part = left(rows)
         error = target[rows] - part @ coefficients  # [P, |G|, act]
         if centred:
             part = torch.cat([part, part.new_full((len(part), 1), constant)], -1)
@@ -224,7 +243,7 @@ def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tenso
         else:
             error = _solve((part * shrinks.unsqueeze(1)) @ part.mT, error)
         total += error.square().sum(1)
-    return total / len(left)
+    return total / len(target)
 
 
 def _solve(hat: Tensor, right: Tensor) -> Tensor:

@@ -9,24 +9,28 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import cut_windows
 from torchrl_koap.data.trajectories import labelled_episodes
+from torchrl_koap.data.windows import WindowTable, spread_evenly
 from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.tasks import Task
+
+MOST = 50_000  # labelled steps: random features of them take a gigabyte
 
 
 def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: Any) -> dict[str, Any]:
     """Fits a controller's decoder on every labelled step that sees its whole look-ahead, each used once.
 
-    The data are flat ``[N]``, after the label budget was applied; what is ``known`` of the actions is that of
-    :func:`action_facts`. Returns what :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
+    Of more than 50,000 such steps, so many are used, spread evenly. The data are flat ``[N]``, after the label budget
+    was applied; what is ``known`` of the actions is that of :func:`action_facts`. Returns what
+    :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
     """
-    keys = ["state", "action", "has_action", "episode"]
-    labelled = torch.isin(data["episode"], labelled_episodes(data))
-    windows = cut_windows(data[labelled], controller.num_window_frames, select=keys, pad_before=controller.num_past)
-    mask = windows["has_action"].squeeze(-1).clone()
-    # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again
-    mask[:, : controller.num_past], mask[:, controller.num_past + 1 :] = False, False
+    data = data[torch.isin(data["episode"], labelled_episodes(data))]
+    table = WindowTable.build(data, controller.num_window_frames, pad_before=controller.num_past)
+    frames, _ = table.frames()
+    frames = spread_evenly(frames[data["has_action"].squeeze(-1)[frames[:, controller.num_past]]], MOST)
+    windows = data.select("state", "action", "episode")[frames]
+    mask = torch.zeros_like(frames, dtype=torch.bool)
+    mask[:, controller.num_past] = True  # at other frames a clamped look-ahead would count a step again
     for name, own in (("state", controller.in_key), ("action", controller.out_key)):
         if own != name:
             windows.rename_key_(name, own)
