@@ -58,6 +58,13 @@ def test_a_rotation_vector_turns_over_at_pi(axis):
     assert warnings and all("a rotation vector, which turns over at pi" in warning for warning in warnings)
 
 
+def test_many_columns_that_leap_are_counted():
+    scan = np.hstack([TIME + 9 * (TIME > 0.3 + 0.035 * ray) for ray in range(36)])
+    (warning,) = seen(scan)
+    assert "'q4' from" in warning and "'q5'" not in warning
+    assert " and 31 more: a switch" in warning and "range scans may leap" in warning
+
+
 def test_switches_and_smooth_columns_do_not_leap():
     assert seen(np.hstack([TIME > 1, np.exp(-3 * TIME), np.repeat([[0.0], [0.04], [0.08]], 20, 0)])) == []
 
@@ -122,4 +129,6 @@ def test_a_trajectory_in_another_unit():
     assert not [*scale_warnings(joints, called, ["q", "still"], "column")]
     joints[1] = np.radians(joints[1])
     (warning,) = scale_warnings(joints, called, ["q", "still"], "column")
-    assert warning.startswith("most columns move less than a twentieth as far as usual in b: another unit")
+    assert warning.startswith(
+        "most columns move less than a twentieth as far as usual in b: another unit, or sensors that saw nothing?"
+    )

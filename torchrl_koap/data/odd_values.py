@@ -49,7 +49,7 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
             f"{name!r} from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of"
             f" {called[trajectory]}{more})"
         )
-    return [f"columns leap: {', '.join(which)}: {why}" for why, which in found.items()]
+    return [f"columns leap: {some(which)}: {why}" for why, which in found.items()]
 
 
 def _turns_over(before: np.ndarray, after: np.ndarray, column: int) -> bool:
@@ -80,7 +80,7 @@ def _cause(values: np.ndarray, near: float, flipped: bool, most: bool, wraps: bo
         )
     if wraps:
         return f"a count or an angle that was wrapped by {leap:.3g}? np.unwrap it with that period"
-    return "a switch, or a measurement that failed? leave it out, or fill it from its neighbours"
+    return "a switch, or a measurement that failed? fill it from its neighbours, or leave it out; range scans may leap"
 
 
 def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
@@ -159,7 +159,10 @@ def scale_warnings(
     little = np.flatnonzero(2 * few.sum(1) > (usual > 0).sum())
     if len(little):
         where = some([known[index][0] for index in little])
-        yield f"most {kind}s move less than a twentieth as far as usual in {where}: another unit?"
+        yield (
+            f"most {kind}s move less than a twentieth as far as usual in {where}: another unit, or sensors that saw"
+            " nothing?"
+        )
 
 
 def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> Iterator[str]:
