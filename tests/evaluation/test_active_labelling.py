@@ -112,7 +112,8 @@ def test_recordings_without_actions_are_to_get_them_first(tmp_path):
     train(TrainConfig(dataset=str(data), out=tmp_path / "run", labels=LabelConfig(episodes=(0,)), **few))
     said = suggest(tmp_path / "run", SuggestConfig(count=3))["next"]
     first, _, then = said.partition(", then ")
-    assert re.match(r"add actions to recordings (1, 2|2, 1) and convert them again \(--name arm --out DATA\)", first)
+    assert re.match(r"add actions to recordings (1, 2|2, 1) \(counted from 0; files in the order of their names", first)
+    assert first.endswith(" and convert them again (--name arm --out DATA)")
     more = [np.diff(frames, axis=0) for frames in states]
     again = save_demonstrations(tmp_path / "more", states, more, control_hz=30, name="arm")
     words = [str(again) if word == "DATA" else word for word in then.removesuffix(" NEW").split()]
