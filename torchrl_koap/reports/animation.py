@@ -194,7 +194,7 @@ def _gymnasium_frames(made: Mapping[str, Any], index: int, actions: np.ndarray, 
                 episode.step(action)
             frames.append(np.asarray(env.render(), np.uint8))
     except Exception as error:  # of an environment of somebody else
-        raise NotFilmed(f"environment {made['env']!r} was not filmed: {error}") from error
+        raise NotFilmed(f"environment {made['env']!r} was not filmed: {error!r}") from error
     if any(frame.ndim != 3 or frame.shape != frames[0].shape for frame in frames):
         raise NotFilmed(f"environment {made['env']!r} draws no picture [height, width, 3]")
     return frames
