@@ -135,9 +135,9 @@ class Convert(Command):
         robot: state columns of the robot itself, which the controller reads (default: all that change within a
             recording, without the command).
         command: neighbouring columns that repeat the last command; they are hidden from planner and controller.
-        action_kind: kind of each action column, or one for all: "delta" (velocities, efforts, changes), "absolute"
-            (targets of state columns) or "raw" (neither, such as normalised targets); with --resample "change" (over
-            one frame, summed) or "velocity" (or effort, held) instead of "delta" (default: delta).
+        action_kind: kind of each action column, or one for all: "delta" (velocities, changes), "absolute"
+            (targets of state columns) or "raw" (neither, such as torques or normalised targets); with --resample
+            "change" (over one frame, summed) or "velocity" (held) instead of "delta" (default: delta).
         targets: for each absolute action the state column that it is the target of (default: the robot's).
         action_units: unit of each action column, or one for all.
         state_units: unit of each state column, or one for all.

@@ -110,11 +110,11 @@ def make_demonstrations(
             reads these. Default: all that are no command and change within a recording.
         command (sequence of str or int): neighbouring columns that repeat the last command. Their differences are the
             actions, so nothing that learns ever sees them.
-        action_kind (str, or sequence of str): ``"delta"``, velocities, efforts or changes: small where the robot stands
+        action_kind (str, or sequence of str): ``"delta"``, velocities or changes: small where the robot stands
             still; ``"absolute"``, targets of the columns ``targets``; or ``"raw"``, what no state column is moved by or
             near to, such as torques or normalised targets. One for all actions or one for each, such as of a gripper
             that is commanded by its width beside joints that are commanded by changes. ``"change"`` (over one frame)
-            and ``"velocity"`` (or effort) say which ``"delta"`` is meant, as ``resample`` needs to know.
+            and ``"velocity"`` say which ``"delta"`` is meant, as ``resample`` needs to know.
         targets (sequence of str or int, optional): for every absolute action the state column that it is the
             target of. Default: the robot's columns, if there are as many.
         resample (float, optional): frames per second that are wanted, where ``control_hz`` is that of the arrays; see

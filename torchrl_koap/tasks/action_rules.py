@@ -30,9 +30,9 @@ class Action:
 
     Args:
         unit (str): such as ``"m"``, ``"rad"``, ``"N"`` or ``""``; errors are averaged over columns of one unit.
-        kind (str): ``"delta"``: a change of a command, a velocity or an effort, small where the robot stands still;
-            ``"absolute"``: a command itself; ``"raw"``: anything else, such as a normalised target, of which nothing is
-            assumed; ``"gripper"``: an absolute one that is read off planned widths.
+        kind (str): ``"delta"``: a change of a command or a velocity, small where the robot stands still;
+            ``"absolute"``: a command itself; ``"raw"``: anything else, such as a torque or a normalised
+            target, of which nothing is assumed; ``"gripper"``: an absolute one that is read off planned widths.
         column (int, optional): state column that a ``"delta"`` moves, that an ``"absolute"`` action is the target of
             (controllers then decode the distance to it), or in which a ``"gripper"`` tells its width.
         constant (float, optional): what it always is, whatever is decoded. Default: it differs.

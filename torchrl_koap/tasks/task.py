@@ -151,7 +151,7 @@ class Task(Columns):
 
     @cached_property
     def delta_actions(self) -> tuple[int, ...]:
-        """Action columns that are changes of a command, velocities or efforts."""
+        """Action columns that are changes of a command or velocities."""
         return tuple(index for index, action in enumerate(self.actions.values()) if action.kind == "delta")
 
     @cached_property

@@ -124,7 +124,7 @@ def test_gaps_end_trajectories_and_are_told():
         (41, "change", r"41 Hz is more than twice the rate of 0 \(20 Hz\): resample .* may be at most 40"),
         (0.4, "change", "no trajectory has two frames at 0.4 Hz"),
         (-1, "change", "must be a positive number of frames per second, got -1"),
-        (10, "delta", "may be changes over one frame, .* pass action_kind .* 'change' or 'velocity'"),
+        (10, "delta", "changes over one frame, .* pass action_kind .* 'change' or 'velocity', or 'raw' for torques"),
         (10, ["change"] * 2, "action_kind .* names 2 columns, there are 1"),
     ],
 )

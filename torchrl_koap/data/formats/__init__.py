@@ -144,7 +144,7 @@ def read_recordings(
         resample (float, optional): frames per second that are wanted, also of irregular time stamps. States between
             frames are interpolated, switches and leaps take the nearest frame, actions hold on or are summed.
         action_kind (str, or sequence of str): what actions are, needed to resample them: ``"change"`` over one frame,
-            which is summed, or ``"velocity"`` (or effort) or ``"absolute"``, which hold on.
+            which is summed, or ``"velocity"``, ``"absolute"`` or ``"raw"`` (torques), which hold on.
         observations (sequence of str): features of a LeRobot data set, or entries of an HDF5 file, that make up the
             state. Default: all that are no images.
         episodes (sequence of int): which episodes of a LeRobot data set to read. Default: all.

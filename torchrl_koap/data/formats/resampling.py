@@ -69,8 +69,8 @@ def resampled(
         problems.append(f"{option('action_kind')} names {len(kinds)} columns, there are {wide}")
     elif recordings.num_labels and None in summing:
         problems.append(
-            "actions of kind 'delta' may be changes over one frame, which add up over a longer step, or velocities or"
-            f" efforts, which hold on: pass {option('action_kind')} 'change' or 'velocity'"
+            "actions of kind 'delta' may be changes over one frame, which add up over a longer step, or velocities,"
+            f" which hold on: pass {option('action_kind')} 'change' or 'velocity', or 'raw' for torques"
         )
     refuse("these recordings", problems)
     adding = np.array(summing, dtype=bool)
