@@ -83,11 +83,15 @@ def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> floa
 
 
 def told_rate(clock: Clock, control_hz: float) -> str:
-    """Returns a note if ignored time stamps give no rate or another one; else an empty text."""
+    """Returns a note if ignored time stamps give no rate, another one or uneven steps; else an empty text."""
     rate = usual_rate(clock, [])
     if rate is None:
         return " (its time stamps are not looked at)"
-    return "" if abs(control_hz / rate - 1) <= UNEVEN else f" (it says {rate:.4g} frames per second)"
+    if abs(control_hz / rate - 1) > UNEVEN:
+        return f" (it says {rate:.4g} frames per second)"
+    steps = np.concatenate(clock.steps)
+    uneven = np.abs(steps * rate - 1).max(initial=0) > UNEVEN
+    return f" (its frames are {steps.min():.4g} to {steps.max():.4g} s apart)" if uneven else ""
 
 
 def rises_evenly(trajectories: Sequence[np.ndarray], *, room: float = ROUNDED) -> bool:
