@@ -184,3 +184,9 @@ def test_tables_that_cannot_be_understood(content, message, tmp_path):
     (tmp_path / "a.CSV").write_bytes(content)
     with pytest.raises(DataError, match=message):
         read_recordings(tmp_path, control_hz=20)
+
+
+def test_trajectories_without_success_are_counted():
+    found = read(success=[0, 0, 0, 0, 0, 1], episode=[0, 0, 0, 1, 1, 1])
+    assert found.skipped == ("success (0 throughout 1 trajectories, which are kept)", "episode")
+    assert read(success=[0, 0, 1, 0, 0, 1], episode=[0, 0, 0, 1, 1, 1]).skipped == ("success", "episode")

@@ -119,3 +119,13 @@ def test_truth_values_are_numbers_and_the_rest_is_listed(file):
     recordings = read_robomimic(file)
     assert recordings.state_names[-2:] == ("touch", "width") and recordings.skipped == ("rewards",)
     assert recordings.states[0][:, 3].tolist() == [0, 0, 1, 1]
+
+
+def test_a_mask_that_chooses_nothing_is_told(file):
+    with h5py.File(file, "a") as stream:
+        stream["mask/success"] = np.array([b"demo_2"])
+    recordings = read_robomimic(file)
+    assert len(recordings.states) == 2 and recordings.skipped == ("mask (every demonstration is read)",)
+    with h5py.File(file, "a") as stream:
+        del stream["data/demo_10"]
+    assert read_robomimic(file).sources == ("demo_2",)

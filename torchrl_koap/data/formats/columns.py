@@ -104,6 +104,9 @@ def assemble(
         rate = declared_hz
         problems += [f"{no_rate}: pass {option('control_hz')}"] if rate is None else []
     about |= {other.name: told_rate(other, rate) for other in others if other is not None and rate is not None}
+    for name in (name for name in seen if "success" in name.lower() and kind_of(name)[0] == "other"):
+        failed = sum(not piece.states[name].any() for piece in pieces if name in piece.states)
+        about |= {name: f" (0 throughout {failed} trajectories, which are kept)"} if failed else {}
     left_out = [*skipped, *short, *(name + about.get(name, "") for name in seen if name not in observed)]
     left_out += [name for name in drop_columns if name not in left_out]
     if not observed:

@@ -88,7 +88,8 @@ def _read(
     skipped += [name for name in sorted(first) if name not in ("obs", NEXT, "actions", *seen)]
     skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - followed) else []
     skipped += [f"data/{name} (no group)" for name in data if name not in demos]
-    skipped += [name for name in stream if name != "data"]
+    said = {"mask": "mask (every demonstration is read)"}
+    skipped += [said.get(name, name) for name in stream if name != "data"]
     return pieces, _control_frequency(data.attrs.get("env_args")), skipped
 
 
