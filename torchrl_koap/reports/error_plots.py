@@ -223,9 +223,10 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     source="eval.json",
     title="Errors of the actions",
     caption="Root mean square error of the actions that are predicted from recorded states, as a share of that of"
-    " always giving the mean action (dashed). Lower is better. Below each action stands the controller's error in its"
-    " unit. A red bar, if there is one, is an action in which the controller is no better than the mean. On the robot"
-    " the controller reads planned states, and its errors are larger.",
+    " always giving the mean action (dashed; of absolute actions the mean distance to their target columns). Lower is"
+    " better. Below each action stands the controller's error in its unit. A red bar, if there is one, is an action in"
+    " which the controller is no better than the mean. On the robot the controller reads planned states, and its errors"
+    " are larger.",
     order=16,
     offline=True,
 )
