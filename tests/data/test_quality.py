@@ -114,6 +114,11 @@ def test_odd_values_of_states_and_actions_are_warned_of():
     assert "action 'v' is -5" in said and "action 'u' is -999" in said
 
 
+def test_the_same_angle_a_turn_apart_is_warned_of():
+    paths = [np.hstack([3 + np.sin(TIME) / 9 + turn, TIME]) for turn in (0, 2 * np.pi)]
+    assert any("column 'roll' lies within" in said for said in warnings(paths, columns=("roll", "x"), units=()))
+
+
 def test_columns_that_differ_between_trajectories_alone_are_goals():
     frames = [np.hstack([TIME, 0 * TIME + goal, 0 * TIME]) for goal in (1, 2)]
     assert goal_columns(make_recordings(frames, action_dim=1, state_names=["x", "goal", "shelf"])) == ["goal"]

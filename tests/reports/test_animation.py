@@ -126,5 +126,5 @@ def test_a_rollout_in_gymnasium_is_played_again_from_its_seed():
 def test_an_environment_that_cannot_be_drawn_is_told():
     evaluation = {"env": "toy_gym:ToyReach-v0", "episode": [{"seed": 5}]}
     rollouts = {"outcome": np.array([0]), "action": np.zeros((1, 5, 2), np.float32)}
-    with pytest.raises(NotFilmed, match=r"environment 'toy_gym:ToyReach-v0' was not filmed: \w+"):
+    with pytest.raises(NotFilmed, match=r"environment 'toy_gym:ToyReach-v0' was not filmed: \w+\("):
         animation.film_rollout(rollouts, RunFacts(Path("run"), None, evaluation=evaluation))
