@@ -119,8 +119,8 @@ def test_success_rule(shift, turn, wanted):
     tray = np.append(np.add([x, y, 0.0], shift), yaw_quaternions(np.array(yaw + math.radians(turn))))
     for sign in (1, -1):  # q and -q are the same rotation
         put(env, np.append(tray[:3], sign * tray[3:]))
-        assert env._solved(np.array([0])).tolist() == [wanted]
-        assert env._collided(np.array([0])).tolist() == [False]
+        success, failure = env._check(np.array([0]))
+        assert success.tolist() == [wanted] and failure.tolist() == [False]
 
 
 def test_mode_is_that_of_the_last_instant():

@@ -143,11 +143,9 @@ def test_crossing_while_touching_is_a_success(monkeypatch):
     env = AvoidingEnv(2, dtype=torch.float64)
     env.reset()
     both, touching = np.array([True, False]), np.array([True, True])
-    monkeypatch.setattr(env, "_solved", lambda rows: both[rows])
-    monkeypatch.setattr(env, "_collided", lambda rows: touching[rows])
+    monkeypatch.setattr(env, "_check", lambda rows: (both[rows], touching[rows]))
     act(env, torch.zeros(2))
-    monkeypatch.setattr(env, "_solved", lambda rows: np.ones(2, bool)[rows])
-    monkeypatch.setattr(env, "_collided", lambda rows: np.zeros(2, bool)[rows])
+    monkeypatch.setattr(env, "_check", lambda rows: (np.ones(2, bool)[rows], np.zeros(2, bool)[rows]))
     for _ in range(2):  # the outcome of the second environment is not changed by crossing afterwards
         out = act(env, torch.zeros(2))
         assert out["success"][:, 0].tolist() == [True, False]

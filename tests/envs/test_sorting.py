@@ -89,7 +89,7 @@ def put(env, places):
     for index, place in enumerate(places):
         env.sims.data[0].qpos[7 * index : 7 * index + 2] = place
     env._update_mode(np.array([0]))
-    return env._solved(np.array([0])).item(), env._mode[0].tolist()
+    return env._check(np.array([0]))[0].item(), env._mode[0].tolist()
 
 
 def test_success_needs_every_box_in_its_own_bin_and_ignores_height():

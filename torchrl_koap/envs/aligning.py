@@ -83,8 +83,8 @@ class AligningEnv(ManipulationEnv):
         """Target poses [n, 7]: position (m) and quaternion."""
         return poses_of(self._contexts[:, 1], height=0.0)
 
-    def _solved(self, rows: np.ndarray) -> np.ndarray:
-        return aligned(self.sims.object_poses[rows, 0], self.targets[rows])
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return aligned(self.sims.object_poses[rows, 0], self.targets[rows]), np.zeros(len(rows), dtype=bool)
 
     def _update_mode(self, rows: np.ndarray) -> None:
         gap = self.sims.tcp_position[rows, :2] - self.sims.object_poses[rows, 0, :2]

@@ -65,11 +65,10 @@ class AvoidingEnv(ManipulationEnv):
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         return np.concatenate([self._commands[rows, :2], self.sims.tcp_position[rows, :2]], axis=1)
 
-    def _solved(self, rows: np.ndarray) -> np.ndarray:
-        return self.sims.tcp_position[rows, 1] > FINISH_Y
-
-    def _collided(self, rows: np.ndarray) -> np.ndarray:
-        return np.array([self.sims.contacts(row, self._rod, self._obstacles).any() for row in rows], dtype=bool)
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        crossed = self.sims.tcp_position[rows, 1] > FINISH_Y
+        touching = np.array([self.sims.contacts(row, self._rod, self._obstacles).any() for row in rows], dtype=bool)
+        return crossed, touching
 
     def obstacle_contacts(self) -> np.ndarray:
         """Returns which cylinders the rod touches in the present state, bool [n, 6] in the order of ``OBSTACLES``."""

@@ -35,7 +35,7 @@ class ManipulationEnv(EnvBase):
     """Simulates a batch of episodes of a D3IL task, with partial resets and partial steps.
 
     A task declares the class attributes and implements the hooks :meth:`_scene`, :meth:`_command`, :meth:`_observe`,
-    :meth:`_solved`, :meth:`_collided` and :meth:`_update_mode`; ``rows`` are indices of environments.
+    :meth:`_check` and :meth:`_update_mode`; ``rows`` are indices of environments.
 
     A task with objects has *contexts*, where they are when an episode starts (:mod:`torchrl_koap.envs.contexts`): drawn
     at random at every reset, or handed over by ``reset(contexts=...)``.
@@ -171,12 +171,8 @@ class ManipulationEnv(EnvBase):
         """Observation [len(rows), obs] of the present state and command."""
 
     @abc.abstractmethod
-    def _solved(self, rows: np.ndarray) -> np.ndarray:
-        """Whether the present state is a success, bool [len(rows)]."""
-
-    def _collided(self, rows: np.ndarray) -> np.ndarray:
-        """Whether the present state is a failure, bool [len(rows)]; by default none is."""
-        return np.zeros(len(rows), dtype=bool)
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whether the present state is a success, and whether it is a failure, each bool [len(rows)]."""
 
     @abc.abstractmethod
     def _update_mode(self, rows: np.ndarray) -> None:
@@ -226,7 +222,7 @@ class ManipulationEnv(EnvBase):
         self._ready[rows] = True
         self._begin(rows)
         self._observation[rows] = self._observe(rows)
-        self._seen[rows] = np.stack([self._solved(rows), self._collided(rows)], axis=1)
+        self._seen[rows] = np.stack(self._check(rows), axis=1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         rows = self._rows(tensordict, "_step")
@@ -240,7 +236,7 @@ class ManipulationEnv(EnvBase):
         self._advance(rows)
         self._steps[rows] += 1
         self._update_mode(rows)
-        self._seen[rows] = np.stack([self._solved(rows), self._collided(rows)], axis=1)
+        self._seen[rows] = np.stack(self._check(rows), axis=1)
         return self._stepped(rows)
 
     def _stepped(self, rows: np.ndarray) -> TensorDictBase:

@@ -94,8 +94,8 @@ class SortingEnv(ManipulationEnv):
         """Which boxes are in their bins, height not considered, bool [len(rows), num_boxes]."""
         return in_bins(torch.from_numpy(self.sims.object_poses[rows, :, :2])).numpy()
 
-    def _solved(self, rows: np.ndarray) -> np.ndarray:
-        return self._inside(rows).all(-1)
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._inside(rows).all(-1), np.zeros(len(rows), dtype=bool)
 
     def _update_mode(self, rows: np.ndarray) -> None:
         xy = self.sims.object_poses[rows, :, :2]

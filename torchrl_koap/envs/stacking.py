@@ -95,10 +95,12 @@ class StackingEnv(ManipulationEnv):
         parts = (self.sims.joint_positions, self.sims.gripper_width[:, None], self.sims.tcp_position)
         return np.concatenate([self._commands[rows], boxes, *(part[rows] for part in parts)], axis=1)
 
-    def _solved(self, rows: np.ndarray) -> np.ndarray:
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self.num_boxes < 3:
-            return self._mode[rows, self.num_boxes - 1] >= 0
-        return piled(torch.from_numpy(self.sims.object_poses[rows, :, :3])).numpy()
+            success = self._mode[rows, self.num_boxes - 1] >= 0
+        else:
+            success = piled(torch.from_numpy(self.sims.object_poses[rows, :, :3])).numpy()
+        return success, np.zeros(len(rows), dtype=bool)
 
     def _update_mode(self, rows: np.ndarray) -> None:
         distance = np.linalg.norm(self.sims.object_poses[rows, :, :2] - TARGET, axis=-1)

@@ -127,8 +127,8 @@ class ScoopingEnv(ManipulationEnv):
             seen.append(self.sims.bowl_positions[rows])
         return np.concatenate(seen, axis=1)
 
-    def _solved(self, rows: np.ndarray) -> np.ndarray:
-        return self.sims.success[rows]
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.sims.success[rows], np.zeros(len(rows), dtype=bool)
 
     def _update_mode(self, rows: np.ndarray) -> None:
         self._mode[rows, 0] = self.sims.rim[rows]
@@ -140,7 +140,7 @@ class ScoopingEnv(ManipulationEnv):
         self._advance(rows)
         self._steps[rows] += 1
         self._update_mode(rows)
-        self._success[rows] = self._solved(rows)
+        self._success[rows] = self._check(rows)[0]
         self._observation[rows] = self._observe(rows)
         return self._stepped(rows)
 
