@@ -99,14 +99,16 @@ def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]
 
 def turn_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
     """Finds columns near one angle in some trajectories and near the same one, a turn farther, in all others."""
+    if len(trajectories) < 2:
+        return
     low, high = (np.stack([end(frames, axis=0) for frames in trajectories]) for end in (np.min, np.max))
     for column, name in enumerate(names):
         order = np.argsort(low[:, column])
         bottom, top = low[order, column], np.maximum.accumulate(high[order, column])
         gap = bottom[1:] - top[:-1]
-        for turn in (2 * np.pi, 360.0) if len(gap) else ():
-            at = int(gap.argmax())
-            apart = (bottom[at + 1] + top[-1] - bottom[0] - top[at]) / 2
+        at = int(gap.argmax())
+        apart = (bottom[at + 1] + top[-1] - bottom[0] - top[at]) / 2
+        for turn in (2 * np.pi, 360.0):
             if gap[at] > turn / 2 and abs(apart - turn) < turn / 8:
                 yield (
                     f"column {name!r} lies within {bottom[0]:.3g} to {top[at]:.3g} in {at + 1} trajectories and about"

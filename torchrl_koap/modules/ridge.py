@@ -117,8 +117,9 @@ def ridge(
     for name, value in (("action", y), ("input", x)):
         if not value.isfinite().all():
             raise ValueError(f"a labelled {name} is not finite")
-    if prior is not None:  # a ridge around the prior is a ridge around 0 on what the prior leaves over
-        y = y - torch.cat([part.double() @ prior.to(y).mT for part in x.split(ROWS)])
+    prior = y.new_zeros(y.shape[-1], x.shape[-1]) if prior is None else prior.to(y)
+    # a ridge around the prior is a ridge around 0 on what the prior leaves over
+    y = y - torch.cat([part.double() @ prior.mT for part in x.split(ROWS)])
     rows = torch.arange(len(x), device=x.device)
     groups = rows if groups is None else groups.unique(return_inverse=True)[1]
     num_groups = int(groups.max()) + 1
@@ -144,8 +145,7 @@ def ridge(
     own = singular.new_tensor(tried)[each]
     weight = right.mT @ (singular[:, None] / (singular.square()[:, None] + own * unit) * projected)  # [m, act]
     error = float(squares.gather(0, each[None]).mean().sqrt())
-    beside = 0.0 if prior is None else prior.to(y)
-    return RidgeFit(weight.mT + beside, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
+    return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
 
 
 def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
