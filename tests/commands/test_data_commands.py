@@ -89,6 +89,16 @@ def test_validation_says_how_many_labels_there_are(arm, tmp_path, capsys):
     assert re.search(r"warning 1 +no recording has actions: a planner can be trained, a policy cannot", said)
 
 
+@pytest.mark.filterwarnings("ignore:action 'action_1'")
+def test_quiet_conversion_still_warns(tmp_path, capsys):
+    frames = np.random.default_rng(0).normal(size=(30, 2)).cumsum(0)
+    frames[15:, 1] += 1000
+    np.savez(tmp_path / "a.npz", states=frames, actions=np.diff(frames, axis=0))
+    with pytest.warns(UserWarning, match=r"columns leap: 'state_1'"):
+        assert koap("convert", tmp_path, "--out", tmp_path / "arm", "--control-hz", "30", "--quiet") == 0
+    assert capsys.readouterr().out == ""
+
+
 def test_validate_names_the_files(tmp_path, capsys):
     folder = write_demonstrations(tmp_path / "data")
     assert koap("validate", folder) == 0

@@ -179,7 +179,7 @@ class Convert(Command):
             raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
         check_new(self.out)
         recordings = self._read()
-        with warnings.catch_warnings(record=True) as unlikely:
+        with warnings.catch_warnings(record=not self.quiet) as unlikely:  # shown at once where no table follows
             warnings.simplefilter("always")
             folder = save_demonstrations(self.out, recordings, **self._given(_DESCRIBING))
         data, task = open_dataset(folder)
@@ -195,7 +195,7 @@ class Convert(Command):
             "constant in each trajectory": ", ".join(goal_columns(recordings)) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],
-            **_numbered([str(warning.message) for warning in unlikely], data),
+            **_numbered([str(warning.message) for warning in unlikely or ()], data),
             "next": _next(folder, task, recordings),
         }
 
