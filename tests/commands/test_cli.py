@@ -46,7 +46,11 @@ def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
         ("validate x --foo", "unknown option of koap validate: '--foo'; known: --help, --quiet, --task, --plugin"),
         (
             "curve --out x --blend 0.5",
-            "unknown option of koap curve: '--blend'; did you mean '--execution.blend' or '--evaluation.blend'?",
+            "unknown option of koap curve: '--blend'; did you mean '--execution.blend'?",
+        ),
+        (
+            "bench --table 1 --out x --preset table2",
+            "unknown option of koap bench: '--preset'; did you mean '--controller.preset'?",
         ),
         ("trian --steps 5", "unknown command 'trian'; did you mean 'train'?"),
         ("train --out x --steps many", "--steps must be a whole number, got 'many'"),

@@ -102,13 +102,13 @@ def test_presets_name_methods_tasks_and_levels_that_exist(name, tmp_path):
     assert set(PRESETS[name]["methods"]) <= set(METHODS) and set(PRESETS[name]["tasks"]) <= set(TASKS)
 
 
-@pytest.mark.parametrize(("asked", "at_three"), [({}, [0]), ({"first_seed_only": ()}, [0, 1, 2])])
-def test_the_levels_in_the_middle_of_a_table_have_one_seed_unless_told_otherwise(asked, at_three, tmp_path):
+@pytest.mark.parametrize(("asked", "even"), [({}, [0]), ({"first_seed_only": ()}, [0, 1, 2])])
+def test_levels_two_and_four_of_a_table_have_one_seed_unless_told_otherwise(asked, even, tmp_path):
     study = complete(Study(out=tmp_path, preset="table1", tasks=("avoiding",), methods=("koap",), **asked))
     seeds = {level: [] for level in get_task("avoiding").label_levels}
     for cell in study.cells():
         seeds[cell.labels].append(cell.seed)
-    assert list(seeds.values()) == [[0, 1, 2], [0, 1, 2], at_three, at_three, [0, 1, 2]]
+    assert list(seeds.values()) == [[0, 1, 2], even, [0, 1, 2], even, [0, 1, 2]]
 
 
 def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
@@ -121,10 +121,27 @@ def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
 
 def test_what_is_asked_for_wins_over_the_preset(tmp_path):
     own = {"planner": PlannerConfig(width=99), "evaluation": EvalConfig(episodes=7), "labels": (0.3,)}
-    study = complete(Study(out=tmp_path, preset="quick", tasks=("avoiding",), run=RunConfig(threads=2), **own))
+    study = complete(Study(out=tmp_path, preset="quick", tasks=("avoiding",), run=RunConfig(logger="wandb"), **own))
     assert (study.planner.width, study.planner.steps, study.evaluation.episodes) == (99, 2000, 7)
     assert (study.labels, study.levels, study.seeds, study.record) == ((0.3,), (), 1, 48)
-    assert (study.run.threads, study.preset) == (2, None)
+    assert (study.run.logger, study.preset) == ("wandb", None)
+
+
+@pytest.mark.parametrize(
+    ("section", "option"),
+    [
+        ("run", {"seed": 3}),
+        ("run", {"threads": 2}),
+        ("planner", {"source": "x"}),
+        ("evaluation", {"threads": 2}),
+        ("evaluation", {"plugins": ("mine",)}),
+        ("evaluation", {"execution": ExecutionConfig(blend=0.5)}),
+    ],
+)
+def test_what_a_study_decides_is_refused(section, option, asked):
+    config = {"run": RunConfig, "planner": PlannerConfig, "evaluation": EvalConfig}[section](**option)
+    with pytest.raises(ValueError, match=f"{section}.{next(iter(option))} is not for a study: "):
+        asked(methods=("koap",), **{section: config})
 
 
 def test_a_data_set_alone_brings_its_task(tmp_path):

@@ -8,7 +8,7 @@ import io
 import math
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
+from torchrl_koap.studies.study import DECIDED, Study
 
 LARGEST = 2**53  # beyond it a number is not even counted exactly
 _MAY_BE_INFINITE = ("limits",)
@@ -162,7 +163,7 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
     ``--help`` among them prints its options and leaves with 0, a wrong call leaves with 2. ``how`` is what else
     :func:`tyro.cli` takes.
     """
-    arguments, short = list(arguments), dict[Any, str]()
+    arguments, short, left_out = list(arguments), dict[Any, str](), set[Any]()
     if arguments[:1] == ["train"] and {"-h", "--help"} & set(arguments):
         about = "Train planner and controller. `koap train --help-all` shows every option."
         kind, arguments, how = _first_page(), ["--help"], how | {"prog": "koap train", "description": about}
@@ -173,8 +174,11 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
     elif arguments[:1] in (["curve"], ["bench"]):
         names = ("env", "env_kwargs", "num_envs", "success_key", "episodes")
         short = {(EvalConfig, name): f"--{name.replace('_', '-')}" for name in names}
+        sections = get_type_hints(Study)
+        left_out = {(sections[section], name) for section, name in (path.split(".") for path in DECIDED)}
+        left_out |= {(Study, "preset")} if arguments[0] == "bench" else set()  # --table chooses it
     registry = ConstructorRegistry()
-    registry.struct_rule(partial(_described, short, []))
+    registry.struct_rule(partial(_described, short, left_out, []))
     return tyro.cli(kind, args=arguments, registry=registry, **({"prog": "koap"} | how))
 
 
@@ -228,14 +232,17 @@ def _first_page() -> type:
     return make_dataclass("Train", options, kw_only=True)
 
 
-def _described(short: Mapping[Any, str], inside: list[Any], info: StructTypeInfo) -> StructConstructorSpec | None:
-    """What tyro makes of a dataclass, but plain placeholders, short names, and only defaults that say something."""
+def _described(
+    short: Mapping[Any, str], left_out: Container[Any], inside: list[Any], info: StructTypeInfo
+) -> StructConstructorSpec | None:
+    """What tyro makes of a dataclass, with plain placeholders and short names, and without some of its fields."""
     if inside or not is_dataclass(info.type):
         return None
     inside.append(info)  # the question goes to tyro's own rules
     spec: Any = ConstructorRegistry.get_struct_spec(info)
     inside.clear()
-    return replace(spec, fields=tuple(_option(each, short.get((info.type, each.name))) for each in spec.fields))
+    shown = [each for each in spec.fields if (info.type, each.name) not in left_out]
+    return replace(spec, fields=tuple(_option(each, short.get((info.type, each.name))) for each in shown))
 
 
 def _option(spec: StructFieldSpec, short: str | None) -> StructFieldSpec:

@@ -261,6 +261,4 @@ class Bench(Curve):
         """Does what is missing of the table and writes its report."""
         if self.table not in (1, 2):
             raise ValueError(f"table must be 1 or 2, got {self.table}")
-        if self.config.preset is not None:
-            raise ValueError(f"preset {self.config.preset!r} is for `koap curve`; a table is chosen with --table")
         return Curve(config=replace(self.config, preset=f"table{self.table}"), machines=self.machines)()

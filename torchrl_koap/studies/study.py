@@ -46,7 +46,7 @@ _TABLE_1: dict[str, Any] = {
     "methods": ("koap", "koap_paper", "koap_untrained", "linear_steps", "pca", "dd", "vae", "lapo", "dp"),
     "labels": (),
     "levels": (1, 2, 3, 4, 5),
-    "first_seed_only": (3, 4),
+    "first_seed_only": (2, 4),
     "label_unit": "window",
     "planner": {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3},
 }
@@ -76,6 +76,19 @@ PRESETS: dict[str, dict[str, Any]] = {
         "controller": {"steps": 200},
         "evaluation": {"episodes": 10},
     },
+}
+# options of the configurations below that a study decides itself, and how
+_ONE_THREAD = "a cell has one thread; --workers says how many run at a time"
+DECIDED = {
+    "run.seed": "cells have the seeds 0, 1, ..., as many as --seeds says",
+    "run.resume": "it goes on by itself",
+    "run.threads": _ONE_THREAD,
+    "planner.source": "name runs with --planners",
+    "evaluation.out": "a cell is evaluated in its own folder",
+    "evaluation.dataset": "a cell is evaluated on what it was trained on",
+    "evaluation.threads": _ONE_THREAD,
+    "evaluation.plugins": "name them with --run.plugin",
+    "evaluation.execution": "name its options with --execution",
 }
 
 
@@ -281,14 +294,10 @@ def check_study(study: Study) -> list[Cell]:
             raise ValueError(f"{name} must be >= 1, got {number}")
     if any(level < 1 for level in study.first_seed_only or ()):
         raise ValueError(f"first_seed_only must be label levels >= 1, got {list(study.first_seed_only or ())}")
-    for given, name, why in (
-        (study.run.seed != RunConfig.seed, "run.seed", "cells have the seeds 0, 1, ..., as many as --seeds says"),
-        (study.run.resume, "run.resume", "it goes on by itself"),
-        (study.planner.source is not None, "planner.source", "name runs with --planners"),
-        (study.evaluation.out is not None, "evaluation.out", "a cell is evaluated in its own folder"),
-        (study.evaluation.dataset is not None, "evaluation.dataset", "a cell is evaluated on what it was trained on"),
-    ):
-        if given:
+    for name, why in DECIDED.items():
+        section, field = name.split(".")
+        config = getattr(study, section)
+        if getattr(config, field) != getattr(type(config)(), field):
             raise ValueError(f"{name} is not for a study: {why}")
     contexts = study.evaluation.contexts_file
     if contexts is not None and not Path(contexts).is_file():
