@@ -60,6 +60,14 @@ def test_columns_without_a_unit_are_not_looked_at():
     assert len(warnings([PATH * 1e6, PATH], units=["", "rad"])) == 1
 
 
+@pytest.mark.parametrize(("units", "number"), [(("", ""), 1), (("px", ""), 0), (("px", "px"), 0)])
+def test_columns_that_errors_hardly_show_need_units(units, number):
+    said = warnings([MOVED * torch.tensor([1.0, 3000]), MOVED * torch.tensor([2.0, 2000])], units=units)
+    assert len(said) == number
+    for words in ("'y' moves ", "'x' at most ", "give state_units (--state-units)"):
+        assert all(words in warning for warning in said)
+
+
 def test_columns_that_say_nothing_are_named():
     states = [torch.cat([path, path[:, :1], torch.full((20, 1), 3.0)], -1) for path in (PATH, PATH + 1)]
     assert warnings(states, columns=["x", "y", "again", "shelf"], units=()) == [

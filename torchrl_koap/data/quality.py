@@ -29,6 +29,8 @@ from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
 STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
+APART = 50.0  # times as far as a fifth of the columns: errors that are measured together hardly show those
+ROUNDING = 1e-5  # share of the farthest column's way below which a column rests
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
@@ -38,9 +40,10 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, are in another
     unit, or reach a place beyond 100 m or rad; state columns that never change, equal another one, leap, hold marks of
-    what is missing, are clocks, quaternions that change their sign or angles a turn apart; frames at both ends in which
-    nothing moves; actions of another kind than declared, that never change, leap for one frame or hold marks; labels
-    that stand alone; an unlikely rate; plans that are short against the motion.
+    what is missing, are clocks, quaternions that change their sign or angles a turn apart, or have no unit and move
+    much farther than others; frames at both ends in which nothing moves; actions of another kind than declared, that
+    never change, leap for one frame or hold marks; labels that stand alone; an unlikely rate; plans that are short
+    against the motion.
 
     ``names`` are what to call each trajectory, such as its file. Default: their numbers.
     """
@@ -63,6 +66,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *turn_warnings(frames, task.state_names),
         *mark_warnings(np.concatenate(frames), task.state_names, "column"),
         *scale_warnings(frames, called, task.state_names, "column"),
+        *_without_units(frames, task),
         *_stillness(frames, called),
         *_clocks(frames, task),
         *spike_warnings(labels, called, task.action_names),
@@ -118,6 +122,21 @@ def _column_warnings(state: Tensor, names: Sequence[str]) -> Iterator[str]:
             yield f"column {name!r} is {values[0]:g} in all {len(values)} steps: it says nothing"
         elif (same := first.setdefault(_digest(values), name)) is not name:
             yield f"columns {same!r} and {name!r} are the same in every step"
+
+
+def _without_units(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
+    moved = np.median([np.ptp(frames, axis=0) for frames in trajectories], axis=0)
+    alike = sorted((column for column, unit in enumerate(task.state_units) if not unit), key=moved.__getitem__)
+    rising = [column for column in alike if moved[column] > ROUNDING * moved[alike[-1]]]
+    if not rising:
+        return
+    most, little = rising[-1], rising[: max(len(rising) // 5, 1)]
+    if moved[most] > APART * moved[little[-1]]:
+        yield (
+            f"columns without a unit: {task.state_names[most]!r} moves {moved[most]:.3g} in a trajectory,"
+            f" {some([repr(task.state_names[column]) for column in little])} at most {moved[little[-1]]:.3g}:"
+            f" errors of plans hardly show those; if their units differ, give {option('state_units')}"
+        )
 
 
 def _clocks(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
