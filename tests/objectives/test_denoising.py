@@ -64,6 +64,12 @@ def test_value_in_closed_form(dtype):
     assert value.dtype == dtype
 
 
+def test_statistics_fitted_after_the_loss_was_built_are_those_it_trains_with():
+    loss, data = make_loss(), batch_of(5)
+    loss.network.fit_normalizers(100 * windows(64))
+    assert torch.equal(loss(data)["loss_planner"], PlannerLoss(loss.network)(data)["loss_planner"])
+
+
 @pytest.mark.parametrize(("entry", "shape"), [("planner_noise", (5, 6, 1)), ("planner_time", (5, 1))])
 def test_given_noise_and_times_of_another_shape_are_refused(entry, shape):
     with pytest.raises(ValueError, match=rf"'{entry}' must be \[5.*\], got \{list(shape)}"):

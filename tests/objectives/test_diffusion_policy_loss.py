@@ -60,6 +60,12 @@ class TestDiffusionPolicyLoss(DenoisingLossTestBase):
         return int(batch["has_action"][..., 1:-1, :].sum()) * ACT
 
 
+def test_statistics_fitted_after_the_loss_was_built_are_those_it_trains_with():
+    loss, data = make_loss(), batch_of(64)
+    loss.network.fit_normalizers(100 * data["state"], 100 * data["action"][data["has_action"].squeeze(-1)])
+    assert torch.equal(loss(data)["loss_policy"], DiffusionPolicyLoss(loss.network)(data)["loss_policy"])
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("history", [1, 3])
 def test_value_in_closed_form(dtype, history):

@@ -62,7 +62,7 @@ class DiffusionPolicy(ConditionalSampler):
         self.action_normalizer = Normalizer(action_dim)
 
     def fit_normalizers(self, windows: Tensor, actions: Tensor) -> None:
-        """Takes the statistics of condition and actions from data; call it before a loss is built on the policy.
+        """Takes the statistics of condition and actions from data, in place, as a planner does.
 
         Raw states are windows ``[*N, history + horizon, d]``; no label is needed for them. Labelled raw actions ``[*M,
         act]`` must be finite and those of the label budget; all steps of a chunk share their statistics.
@@ -70,9 +70,9 @@ class DiffusionPolicy(ConditionalSampler):
         if actions.ndim < 2 or actions.shape[-1] != self.action_dim:
             raise ValueError(f"actions must be [*M, {self.action_dim}] (action_dim), got {list(actions.shape)}")
         history, _ = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
-        example, condition = self.action_normalizer.scale, Normalizer.fit(self.condition(history))
-        self.action_normalizer = Normalizer.fit(actions).to(example)
-        self.condition_normalizer = condition.to(example)
+        condition = Normalizer.fit(self.condition(history))
+        self.action_normalizer.load_state_dict(Normalizer.fit(actions).state_dict())
+        self.condition_normalizer.load_state_dict(condition.state_dict())
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Maps raw actions ``[*B, H, act]`` to normalised ones, wherever the state is."""

@@ -62,15 +62,15 @@ class StatePlanner(ConditionalSampler):
         self.plan_normalizer = Normalizer(self.horizon * state_dim)
 
     def fit_normalizers(self, windows: Tensor) -> None:
-        """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
+        """Takes the statistics of condition and plan from data, in place.
 
+        A loss built before sees them; its averaged weights only move towards them unless ``SoftUpdate`` is built after.
         Raw states are windows ``[*N, history + horizon, d]``, padded as those that are trained on: where ends stand
         still in training alone, their plans are far out of the range of the network.
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
-        example = self.plan_normalizer.scale
-        self.condition_normalizer = Normalizer.fit(self.condition(history)).to(example)
-        self.plan_normalizer = Normalizer.fit(self._displaced(history, plan), mode="moving").to(example)
+        self.condition_normalizer.load_state_dict(Normalizer.fit(self.condition(history)).state_dict())
+        self.plan_normalizer.load_state_dict(Normalizer.fit(self._displaced(history, plan), mode="moving").state_dict())
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Maps raw plans ``[*B, H, d]`` to normalised sequences (:meth:`ConditionalSampler.encode`)."""
