@@ -70,6 +70,21 @@ def test_statistics_fitted_after_the_loss_was_built_are_those_it_trains_with():
     assert torch.equal(loss(data)["loss_planner"], PlannerLoss(loss.network)(data)["loss_planner"])
 
 
+class LearnedFeatures(torch.nn.Linear):
+    num_features = 3
+
+    def forward(self, history):
+        return super().forward(history.flatten(-2))
+
+
+def test_features_and_an_encoder_before_the_planner_are_trained():
+    planner = StatePlanner(TemporalUnet(2, 7, channels=(8,)), state_dim=2, horizon=6, features=LearnedFeatures(4, 3))
+    encoder = torch.nn.Linear(2, 2)
+    data = batch_of(5).update({"state": encoder(windows(5))})
+    PlannerLoss(planner)(data)["loss_planner"].backward()
+    assert planner.features.weight.grad.abs().max() > 0 and encoder.weight.grad.abs().max() > 0
+
+
 @pytest.mark.parametrize(("entry", "shape"), [("planner_noise", (5, 6, 1)), ("planner_time", (5, 1))])
 def test_given_noise_and_times_of_another_shape_are_refused(entry, shape):
     with pytest.raises(ValueError, match=rf"'{entry}' must be \[5.*\], got \{list(shape)}"):

@@ -78,8 +78,9 @@ class DenoisingLoss(NetworkLoss):
         names, network = self.tensor_keys, self.network
         history, sequence, counts = self.read(tensordict)
         with self.network_params.to_module(network, preserve_module_state=False):
+            condition = network.encode_history(history)  # with a gradient: features may be trained too
             with torch.no_grad():
-                condition, clean = network.encode_history(history), network.encode(history, sequence)
+                clean = network.encode(history, sequence)
                 if counts is not None:  # before the network: masking afterwards would leave NaN in the gradient
                     clean = torch.where(counts, clean, 0.0)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
