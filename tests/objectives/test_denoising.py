@@ -85,6 +85,16 @@ def test_features_and_an_encoder_before_the_planner_are_trained():
     assert planner.features.weight.grad.abs().max() > 0 and encoder.weight.grad.abs().max() > 0
 
 
+class Narrow(torch.nn.Linear):
+    def forward(self, sequence, time, condition):
+        return super().forward(sequence)
+
+
+def test_what_a_denoiser_returns_is_not_broadcast():
+    with pytest.raises(ValueError, match=r"the denoiser must return \[5, 6, 2\], got \[5, 6, 1\]"):
+        PlannerLoss(StatePlanner(Narrow(2, 1), state_dim=2, horizon=6))(batch_of(5))
+
+
 @pytest.mark.parametrize(("entry", "shape"), [("planner_noise", (5, 6, 1)), ("planner_time", (5, 1))])
 def test_given_noise_and_times_of_another_shape_are_refused(entry, shape):
     with pytest.raises(ValueError, match=rf"'{entry}' must be \[5.*\], got \{list(shape)}"):

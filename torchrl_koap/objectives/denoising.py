@@ -93,6 +93,8 @@ class DenoisingLoss(NetworkLoss):
                 noisy = network.schedule.add_noise(clean, noise, time)
             with torch.autocast(clean.device.type, self.dtype, enabled=self.dtype is not None):
                 predicted = network.denoiser(noisy, time, condition)
+            if predicted.shape != clean.shape:  # it would be broadcast
+                raise ValueError(f"the denoiser must return {list(clean.shape)}, got {list(predicted.shape)}")
             error = (predicted - clean).square()  # [*B, H, width]
             if self.weights is not None:
                 error = error * self.weights
