@@ -49,7 +49,9 @@ class PartialObservation(ObservationTransform):
 
 
 class EndEffectorNoise(ObservationTransform):
-    """Adds Gaussian noise to the measured end effector; after :meth:`seed_episodes` every environment has its own.
+    """Adds Gaussian noise to the measured end effector, random unless :meth:`seed_episodes` gives seeds.
+
+    A seed of the environment does not reach it.
 
     Args:
         task (Task or str): the task; its part ``Task.position`` is disturbed.
@@ -75,7 +77,8 @@ class EndEffectorNoise(ObservationTransform):
         super().__init__(in_keys=[OBSERVATION], out_keys=[OBSERVATION])
         task = get_task(task)
         self.sigma, self.part = sigma, task.observation[task.position]
-        self._generators = [torch.Generator().manual_seed(0)]
+        self._generators = [torch.Generator()]
+        self._generators[0].seed()  # at random
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
         """Gives every environment its own noise, so that an episode does not depend on the batch it runs in."""

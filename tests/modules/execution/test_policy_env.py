@@ -58,6 +58,11 @@ def test_the_seed_fixes_everything(make_policy, layout):
     env.close()
 
 
+def test_without_a_seed_every_environment_has_noise_of_its_own():
+    first, second = (make_env(feedback).reset()["noise"] for _ in range(2))
+    assert not torch.equal(first, second)
+
+
 @pytest.mark.parametrize(("make_policy", "collected"), [(feedback, False), (feedback, True), (chunks, True)])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout, collected):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Sequence
 
 import torch
@@ -49,13 +50,14 @@ class NoiseTransform(Transform):
     """Writes start noise at every reset and step of an environment; number ``i`` of a batch draws with ``seed + i``.
 
     TorchRL hands a seed to the innermost environment alone; :class:`~torchrl_koap.modules.PolicyEnv` hands it to this
-    transform too. Arguments are those of :class:`NoiseStreams`, and the entry that is written, ``planner.noise_key``.
+    transform too; before, it has a random one. Arguments are those of :class:`NoiseStreams`, and the entry that is
+    written, ``planner.noise_key``.
     """
 
     def __init__(self, shape: Sequence[int], *, block: int, noise_key: NestedKey = NOISE):
         super().__init__(in_keys=[], out_keys=[noise_key])
         self.shape, self.block = tuple(shape), block
-        self.set_seed(0)
+        self.set_seed(secrets.randbits(62))  # torch's own generator is the same in every new process
 
     def set_seed(self, seed: int) -> None:
         """Begins all streams anew."""
@@ -109,9 +111,10 @@ def policy_transforms(
 class PolicyEnv(TransformedEnv):
     """An environment that also returns what a policy reads: the last observations, and start noise.
 
-    ``set_seed`` fixes the whole rollout. With the same seed an :class:`~torchrl_koap.modules.Agent` gives the same
-    actions in the first episode. It may stand inside of :class:`torchrl.envs.SerialEnv`,
-    :class:`torchrl.envs.ParallelEnv` and collectors, or around a :class:`torchrl.envs.SerialEnv`.
+    ``set_seed`` fixes the whole rollout; without it the noise is another in every environment. With the same seed
+    an :class:`~torchrl_koap.modules.Agent` gives the same actions in the first episode. It may stand inside of
+    :class:`torchrl.envs.SerialEnv`, :class:`torchrl.envs.ParallelEnv` and collectors, or around a
+    :class:`torchrl.envs.SerialEnv`.
 
     Args:
         env (EnvBase): the environment.
