@@ -5,7 +5,9 @@ A subclass says how to build its loss and a batch, and what the defaults are. Ba
 (noise, times), so that a loss is a function of its input.
 """
 
+import copy
 import inspect
+import pickle
 
 import pytest
 import torch
@@ -192,6 +194,14 @@ class LossTestBase:
         for key, value in double.items():
             assert value.dtype == torch.float64
             torch.testing.assert_close(value.float(), single[key], rtol=1e-3, atol=1e-5)
+
+    def test_the_network_moves_with_its_loss_and_a_copy_has_one_of_its_own(self):
+        loss = self.make_loss()
+        for moved in (loss.double(), copy.deepcopy(loss), pickle.loads(pickle.dumps(loss))):
+            assert (moved.network is loss.network) == (moved is loss)
+            for name, value in (*moved.network.named_parameters(), *moved.network.named_buffers()):
+                assert value.dtype == torch.float64 or not value.is_floating_point(), name
+                assert value.data_ptr() == moved.network_params.flatten_keys(".")[name].data_ptr(), name
 
     # training
 

@@ -47,6 +47,17 @@ class NetworkLoss(LossModule):
         self.network.train(mode)
         return self
 
+    def _apply(self, fn):
+        """Moves the network too: its parameters are those of the loss, its buffers would stay behind."""
+        super()._apply(fn)
+        self.network_params.to_module(self.network)
+        return self
+
+    def __setstate__(self, state):
+        """Gives the network of a copy the weights of the copy."""
+        super().__setstate__(state)
+        self.network_params.to_module(self.network)
+
     @property
     def in_keys(self) -> list[NestedKey]:
         """Entries that must be there, as renamed by ``set_keys``."""
