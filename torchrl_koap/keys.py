@@ -122,6 +122,16 @@ def check_actions(action: Tensor, key: NestedKey, state: Tensor) -> Tensor:
     return action
 
 
+def check_window(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> None:
+    """Refuses states ``[T, d]`` of several trajectories: a flat batch of steps would be read as one window."""
+    if state.ndim != 2 or torch.compiler.is_compiling():
+        return
+    episode = tensordict.get(EPISODE, None)
+    if episode is not None and len(episode.unique()) > 1:
+        flat = f"{key!r} {list(state.shape)} is one window, but its steps are of several trajectories ({EPISODE!r})"
+        raise ValueError(f"{flat}; reshape a flat batch, such as SliceSampler's, to [B, T]")
+
+
 def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDictBase:
     """Checks a flat tensordict against the storage layout and returns it unchanged.
 

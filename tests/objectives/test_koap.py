@@ -175,6 +175,18 @@ def test_a_labelled_action_that_is_nan_is_loud():
 # the network
 
 
+def test_a_flat_batch_of_several_trajectories_is_not_taken_for_one_window():
+    network, batch = make_network(), make_batch(2)
+    batch["episode"] = torch.tensor([[0] * T, [1] * T])
+    flat = TensorDict({key: value.flatten(0, 1) for key, value in batch.items()})
+    for loss in (KOAPLoss(network), LatentActionLoss(network)):
+        with pytest.raises(ValueError, match=r"several trajectories \('episode'\); reshape a flat batch"):
+            loss(flat)
+        loss(batch), loss(batch[0])
+    with pytest.raises(ValueError, match=r"several trajectories"):
+        network.fit_labels(flat, flat["has_action"])
+
+
 def test_coefficients_may_be_given_as_whole_numbers_and_changed():
     loss = KOAPLoss(make_network(), action_coeff=1)
     loss.action_coeff = 0.5

@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from torchrl_koap.keys import ACTION, EPISODE, LATENT_ACTION, STATE, check_actions, frame_mask, read_entry
+from torchrl_koap.keys import ACTION, EPISODE, LATENT_ACTION, STATE, check_actions, check_window, frame_mask, read_entry
 from torchrl_koap.modules.windows import WindowReader
 
 BATCH = 4096  # windows that are read at once
@@ -173,6 +173,7 @@ class InverseDynamics(TensorDictModuleBase):
         known.
         """
         states = read_entry(self, windows, self.in_key, "set_keys(state=...)")
+        check_window(windows, self.in_key, states)
         action = check_actions(read_entry(self, windows, self.out_key, "set_keys(action=...)"), self.out_key, states)
         mask, groups = frame_mask(mask, "mask", states), windows.get(EPISODE, None)
         if groups is not None:

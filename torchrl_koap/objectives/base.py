@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from torchrl_koap.keys import ACTION, HAS_ACTION, PADDED, STATE, check_actions, frame_mask, read_entry
+from torchrl_koap.keys import ACTION, HAS_ACTION, PADDED, STATE, check_actions, check_window, frame_mask, read_entry
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 
@@ -112,7 +112,8 @@ class WindowLoss(NetworkLoss):
             padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T]``. A transition
                 into or out of one counts in no loss, labelled or not.
 
-        The two masks may have a trailing 1 or not.
+        The two masks may have a trailing 1 or not. A flat batch ``[B * T]``, as of TorchRL's ``SliceSampler``, must be
+        reshaped to ``[B, T]``: it would be one window, and is refused where ``episode`` tells.
         """
 
         state: NestedKey = STATE
@@ -142,6 +143,7 @@ class WindowLoss(NetworkLoss):
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
         state = self._read(tensordict, "state")
+        check_window(tensordict, self.tensor_keys.state, state)
         return state, self._recorded(tensordict, state)
 
     def _targets(
