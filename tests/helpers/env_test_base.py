@@ -206,6 +206,8 @@ class ContextTestBase(EnvTestBase):
         env, contexts = self.make(2), evaluation_contexts(self.make().task)[:2]
         with pytest.raises(ValueError, match="wanted 2, got 1"):
             env.reset(contexts=contexts[:1])
+        with pytest.raises(TypeError, match="'context'"):  # a misspelt keyword would leave them random
+            env.reset(context=contexts)
         contexts[1, -1, 0] = 9.0
         with pytest.raises(ValueError, match=f"context 1 puts '{env.task.objects[-1]}' at .*outside its region"):
             env.reset(contexts=contexts)

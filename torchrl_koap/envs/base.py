@@ -191,7 +191,7 @@ class ManipulationEnv(EnvBase):
             return np.arange(self.batch_size[0])
         return mask.reshape(self.batch_size[0], -1).any(-1).cpu().numpy().nonzero()[0]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None) -> TensorDictBase:
         rows = self._rows(tensordict, "_reset")
         self._draw_contexts(rows, contexts)
         self._start(rows)
