@@ -4,6 +4,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Composite
 
 from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.evaluation.rollouts import roll_out
@@ -26,6 +27,16 @@ def test_a_stream_is_that_of_its_seed_whatever_else_is_drawn():
 def test_any_batch_is_written():
     td = NoiseTransform((5, 2), block=1, noise_key="z")._call(TensorDict(batch_size=[2, 3]))
     assert td["z"].shape == (2, 3, 5, 2)
+
+
+def test_the_specification_is_that_of_the_noise_whatever_the_default_type_of_torch():
+    transform = NoiseTransform((5, 2), block=1)
+    torch.set_default_dtype(torch.float64)
+    try:
+        spec = transform.transform_observation_spec(Composite(shape=[3]))["noise"]
+        assert spec.is_in(transform._call(TensorDict(batch_size=[3]))["noise"])
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 class Still(StatePlanner):

@@ -77,7 +77,7 @@ class NoiseTransform(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """The specification with the noise."""
         shape = (*observation_spec.shape, *self.shape)
-        observation_spec[self.out_keys[0]] = Unbounded(shape, device=observation_spec.device)
+        observation_spec[self.out_keys[0]] = Unbounded(shape, device=observation_spec.device, dtype=torch.float32)
         return observation_spec
 
 
