@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 import torch
-from small_networks import small_planner
+from small_networks import chunk_policy, small_planner
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
@@ -130,6 +130,14 @@ def test_a_missing_transform_is_named():
         policy_of()(TensorDict({"observation_history": torch.zeros(2, 2, 3)}, [2]))
     with pytest.raises(ValueError, match=r"must hold 2 frames on axis -2, got \[2, 4, 3\]"):
         policy_of()(step_input(torch.zeros(2, 4, 3)))
+
+
+def test_planned_states_are_not_executed_nor_sampled_actions_decoded():
+    with pytest.raises(ValueError, match="StatePlanner samples states: a controller must decode them"):
+        make_policy(small_planner(), state_of=(2, 3))
+    actions = chunk_policy().planner
+    with pytest.raises(ValueError, match="DiffusionPolicy samples actions: no controller may decode them"):
+        make_policy(actions, make_koopman_inverse_dynamics(2, 2), state_of=(2, 3))
 
 
 def test_decoded_commands_become_changes_of_the_last_one():

@@ -20,7 +20,8 @@ from torchrl_koap.keys import ACTION, PLAN
 from torchrl_koap.modules.execution.command_limits import CommandLimits
 from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import Follower, remaining_plan
-from torchrl_koap.modules.planning.diffusion_policy import ACTION_CHUNK
+from torchrl_koap.modules.planning.diffusion_policy import ACTION_CHUNK, DiffusionPolicy
+from torchrl_koap.modules.planning.planner import StatePlanner
 
 OBSERVATION_HISTORY = "observation_history"
 IS_INIT = "is_init"
@@ -62,8 +63,8 @@ class PlanningPolicy(TensorDictModuleBase):
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
     Raises:
-        ValueError: for an interval longer than the horizon, or a follower that cannot be executed so. At the first call
-            for a history of another length.
+        ValueError: for an interval longer than the horizon, a follower that cannot be executed so, a StatePlanner
+            without one or a DiffusionPolicy with one. At the first call for a history of another length.
         KeyError: at the first call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
 
     Examples:
@@ -96,6 +97,9 @@ class PlanningPolicy(TensorDictModuleBase):
     ):
         super().__init__()
         execution = Execution() if execution is None else execution
+        if isinstance(planner, StatePlanner if follower is None else DiffusionPolicy):
+            samples = "states: a controller must" if follower is None else "actions: no controller may"
+            raise ValueError(f"{type(planner).__name__} samples {samples} decode them")
         if follower is None:  # what is sampled is executed
             execution = execution.replaced(strategy="open_loop")
         knows_command = follower is not None and follower.knows_command
