@@ -10,7 +10,7 @@ from torchrl_koap.data.sources import open_dataset
 from torchrl_koap.data.symmetries import ObjectPermutation, RandomPlanarTransform
 from torchrl_koap.data.ted import load_ted, save_ted
 from torchrl_koap.data.trajectories import controller_view, extrapolate_ends, flatten_trajectories, select_state
-from torchrl_koap.data.windows import WindowSampler, WindowTable, cut_windows, make_window_buffer
+from torchrl_koap.data.windows import WindowSampler, WindowTable, WindowUnit, cut_windows, make_window_buffer
 from torchrl_koap.files import DataError
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "RecoveryAugmentation",
     "WindowSampler",
     "WindowTable",
+    "WindowUnit",
     "controller_view",
     "cut_windows",
     "extrapolate_ends",

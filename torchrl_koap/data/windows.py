@@ -138,6 +138,18 @@ class WindowUnit(SampleUnit):
     """Turns numbers of windows ``[B]`` into storage indices ``[B, T]``, by :meth:`WindowTable.frames`.
 
     With ``padded`` bool ``[B, T]``, which of them are padded, is the entry ``padded`` of the sample's info.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from torchrl_koap.data import WindowSampler, WindowTable, WindowUnit, flatten_trajectories
+        >>> data = flatten_trajectories([torch.rand(9, 2)] * 3, [torch.rand(8, 1)] * 3)
+        >>> table = WindowTable.build(data, 4)
+        >>> options = {"sampler": WindowSampler(table.labelled), "sample_unit": WindowUnit(table.frames)}
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(data)), batch_size=5, **options)
+        >>> _ = buffer.extend(data)
+        >>> buffer.sample().shape
+        torch.Size([5, 4])
     """
 
     def __init__(self, frames: Callable[[Tensor], tuple[Tensor, Tensor]], *, padded: bool = False):
