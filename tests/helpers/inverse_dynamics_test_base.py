@@ -49,6 +49,7 @@ class InverseDynamicsTestBase:
     reads: tuple = (-2, -1, 0, 2, 3)  # offsets of the frames that an action may read
     frames = range(2, 6)  # that count
     latent = True  # whether it writes latents
+    vectorized = True  # torch.vmap has a rule for all it does
 
     def make_network(self, seed: int = 0, **options):
         """The network with the normalisers above, the same for the same seed."""
@@ -71,6 +72,19 @@ class InverseDynamicsTestBase:
         assert network.num_window_frames == shortest
         with pytest.raises(ValueError, match=f"at least {shortest} frames are needed"):
             network.valid_frames(shortest - 1)
+
+    def test_an_ensemble_under_vmap_acts_as_its_members(self):
+        if not self.vectorized:
+            return
+        first, _ = members = [self.fitted(self.make_network(seed)) for seed in (0, 1)]
+        windows = partly_labelled(3).select("state")
+
+        def act(weights):
+            with weights.to_module(first):
+                return first(windows.copy())["action"]
+
+        actions = torch.vmap(act)(TensorDict.from_modules(*members))
+        torch.testing.assert_close(actions, torch.stack([member(windows.copy())["action"] for member in members]))
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_batch_dimensions_types_keys_units_and_state_dict(self, dtype):

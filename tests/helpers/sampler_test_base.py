@@ -59,6 +59,17 @@ class SamplerTestBase:
         with set_exploration_type(exploration):
             assert not torch.equal(sampler.sample(history), sampler.sample(history))
 
+    def test_an_ensemble_under_vmap_samples_as_its_members(self):
+        first, _ = members = [self.fit(self.make(num_steps=3)), self.make(num_steps=3)]
+        history, noise = walks(3)[:, :2], torch.randn(3, *first.noise_shape)
+
+        def sample(weights):
+            with weights.to_module(first):
+                return first.sample(history, noise)
+
+        samples = torch.vmap(sample)(TensorDict.from_modules(*members))
+        torch.testing.assert_close(samples, torch.stack([member.sample(history, noise) for member in members]))
+
     def test_a_prefix_is_kept_and_the_rest_fits_it(self):
         sampler = self.fit(self.make())
         history, prefix, noise = walks(3)[:, :2], 0.01 * torch.randn(3, 4, self.width), torch.randn(3, 14, self.width)

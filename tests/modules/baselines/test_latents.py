@@ -132,6 +132,7 @@ def noisy_windows(*batch):
 
 
 class TestVariationalInverseDynamics(InverseDynamicsTestBase):
+    vectorized = False  # its LSTM is torch's
     make_network = staticmethod(make_autoencoder)
 
     def test_an_action_depends_on_the_frames_it_may_read_and_no_others(self):
