@@ -190,3 +190,18 @@ def test_trajectories_without_success_are_counted():
     found = read(success=[0, 0, 0, 0, 0, 1], episode=[0, 0, 0, 1, 1, 1])
     assert found.skipped == ("success (0 throughout 1 trajectories, which are kept)", "episode")
     assert read(success=[0, 0, 1, 0, 0, 1], episode=[0, 0, 0, 1, 1, 1]).skipped == ("success", "episode")
+
+
+def test_resampling_leaves_out_lost_frames_of_recordings_without_actions():
+    time = np.arange(40) / 30
+    x = np.where(np.isin(np.arange(40), (7, 8, 20, 21, 22, 23)), np.nan, 2 * time)
+    lost, whole = Piece("video", {"time": time, "x": x}), Piece("robot", {"time": time, "x": time}, {"v": time})
+    options = {"resample": 20.0, "action_kind": "velocity"}
+    found = assemble([whole, lost], "data", **options)
+    assert found.sources == ("robot", "video[0]", "video[1]")  # two lost frames are filled, four split
+    np.testing.assert_allclose(found.states[1][:, 0], 2 * np.arange(13) / 20)
+    assert "6 frames with states that are NaN" in found.skipped
+    for pieces, more in (([lost] * 7, {}), ([Piece("robot", lost.states, {"v": time})], options)):
+        with pytest.raises(DataError, match="states are not finite, first at frame 7 in column 'x': fill") as error:
+            assemble(pieces, "data", action_dim=1, **more)
+        assert len(str(error.value)) < 300

@@ -112,6 +112,12 @@ def assemble(
     if not observed:
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
     refuse(source, problems)
+    if resample is not None and times is not None:
+        seen_in = [np.isfinite(_stack(piece.states, observed)).all(1) | bool(piece.actions) for piece in pieces]
+        times = [at[rows] for at, rows in zip(times, seen_in, strict=True)]
+        pieces = [_taken(piece, np.flatnonzero(rows)) for piece, rows in zip(pieces, seen_in, strict=True)]
+        lost = sum(int((~rows).sum()) for rows in seen_in)
+        left_out += [f"{lost} frames with states that are NaN"] if lost else []
     recordings = make_recordings(
         [_stack(piece.states, observed) for piece in pieces],
         [_stack(piece.actions, acting) if piece.actions else None for piece in pieces],
@@ -198,15 +204,15 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
     names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
     return [
-        replace(
-            piece,
-            name=name,
-            states=_cut(piece.states, span),
-            actions=piece.actions and _cut(piece.actions, span),
-            cameras={camera: clip.take(span) for camera, clip in piece.cameras.items()},
-        )
+        replace(_taken(piece, span), name=name, actions=piece.actions and _cut(piece.actions, span))
         for name, span in zip(names, spans, strict=True)
     ]
+
+
+def _taken(piece: Piece, rows: np.ndarray) -> Piece:
+    """Some frames of a piece, with all of its actions."""
+    cameras = {name: clip.take(rows) for name, clip in piece.cameras.items()}
+    return replace(piece, states=_cut(piece.states, rows), cameras=cameras)
 
 
 def _cut(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.ndarray]:

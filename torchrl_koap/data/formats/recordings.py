@@ -141,6 +141,7 @@ def make_recordings(
         problems.append(f"actions have {wide} columns, {option('action_dim')} says {action_dim}")
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
+    lost: list[tuple[str, str]] = []
     for name, seen, done in zip(what, frames, known, strict=True):
         if seen is not None and seen.shape[1] != width:
             faults.append((name, f"states have {seen.shape[1]} columns, those before have {width}"))
@@ -149,7 +150,7 @@ def make_recordings(
         elif seen is not None and not np.isfinite(seen).all():
             frame, column = np.argwhere(~np.isfinite(seen))[0]
             called = repr(given_states[column]) if len(given_states) == width else column
-            faults.append((name, f"states are not finite, first at frame {frame} in column {called}"))
+            lost.append((name, f"frame {frame} in column {called}"))
         if done is None:
             continue
         infinite = np.isinf(done).any(-1)
@@ -160,6 +161,9 @@ def make_recordings(
             faults.append((name, f"{len(done)} actions for {len(seen)} frames; {wanted}"))
         elif infinite.any():
             faults.append((name, f"the action of step {infinite.argmax()} is infinite; NaN means that it is unknown"))
+    if lost:
+        said = f"{some([name for name, _ in lost])}: states are not finite, first at {lost[0][1]}"
+        problems.append(f"{said}: fill them, or {option('resample')} recordings without actions, which leaves them out")
     problems += _sparse([array for array in known if array is not None and array.shape[1] == wide], given_actions)
     if control_hz is not None:
         problems += wrong_rate(control_hz, "control_hz")
