@@ -168,3 +168,19 @@ def test_decimal_numbers_are_states(tmp_path):
     parquet.write_table(pyarrow.table(columns_of(action=[0.0] * 6) | {"x": exact}), tmp_path / "run.parquet")
     found = read_tables(tmp_path)
     assert found.state_names == ("x", "y") and found.states[0][:, 0].tolist() == [0, 0.5, 1, 1.5, 2, 2.5]
+
+
+def test_archives_with_a_rate_beside_tables_with_time_stamps(tmp_path):
+    states = {"states": FRAMES, "state_names": ["x", "y"]}
+    np.savez(tmp_path / "robot.npz", actions=np.ones((6, 1)), control_hz=25, **states)
+    video = columns_of(frame=[*range(6)], time_ms=[20 * row for row in range(6)])
+    del video["timestamp"]
+    write_csv(tmp_path / "video.csv", video)
+    found = read_tables(tmp_path, resample=12.5, action_kind="velocity")
+    assert [len(frames) for frames in found.states] == [3, 2] and found.num_labels == 2
+    np.testing.assert_allclose(found.states[1], [FRAMES[0], FRAMES[4]])
+    with pytest.raises(DataError, match="no file has time stamps"):  # the rate of the robot is not that of the video
+        read_tables(tmp_path, drop_columns=["time_ms", "frame"])
+    write_csv(tmp_path / "video.csv", video | {"confidence": [1.0] * 6})
+    with pytest.raises(DataError, match=r"has confidence besides; drop_columns \(--drop-columns\)"):
+        read_tables(tmp_path, resample=12.5)

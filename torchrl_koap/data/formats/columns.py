@@ -310,7 +310,8 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
             )
             if missing or more:
                 said = [f"lacks {missing}"] * bool(missing) + [f"has {more} besides"] * bool(more)
-                yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}{hint}"
+                cure = f"{hint}; {option('drop_columns')} leaves columns out"
+                yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}{cure}"
 
 
 def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:

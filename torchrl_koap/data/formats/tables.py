@@ -74,13 +74,18 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
         except (ValueError, OSError) as error:
             faults.append((str(file), str(error)))
     refuse(folder, gathered(faults) or _lacking([piece for piece, *_ in tables], action_columns or ()))
+    counted = {name: kind_of(name) for piece, rate, _ in tables if not rate for name in piece.states}
+    counted = {name: kind for name, kind in counted.items() if kind[0] in ("clock", "frame")}
+    if "clock" in [kind for kind, _ in counted.values()]:  # files that say their rate beside files with time stamps
+        tables = [(_stamped(piece, rate, counted), None, names) for piece, rate, names in tables]
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
         if "resample" not in options or len(rates) < len(tables):
             said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
             cure = f"pass {option('resample')} to bring them to one rate, or {option('control_hz')}"
             raise DataError(folder, f"{said}: {cure}")
-        tables = [(_stamped(piece, rate), None, names) for (piece, _, names), rate in zip(tables, rates, strict=True)]
+        counted = {"timestamp": ("clock", 1.0)}
+        tables = [(_stamped(piece, rate, counted), None, names) for piece, rate, names in tables]
     beside = {file.with_suffix("") for file in files}
     others = [path for path in sorted(files[0].parent.iterdir()) if path not in files and path not in beside]
     unread = [f"{path.name} (no table)" for path in others if folder.is_dir()]
@@ -111,9 +116,13 @@ def _with_cameras(piece: Piece, file: Path) -> Piece:
     return replace(piece, cameras=clips_beside(file, clock))
 
 
-def _stamped(piece: Piece, rate: float) -> Piece:
-    """A piece with time stamps by its rate, unless it has some."""
-    return replace(piece, states={"timestamp": np.arange(piece.frames) / rate} | piece.states)
+def _stamped(piece: Piece, rate: float | None, counted: Mapping[str, tuple[str | None, float]]) -> Piece:
+    """A piece of known rate with the time stamps and counts of frames that others have, unless it has some."""
+    if not rate:
+        return piece
+    rows, stamps = np.arange(piece.frames), np.arange(piece.frames) / rate
+    found = {name: stamps / unit if kind == "clock" else rows for name, (kind, unit) in counted.items()}
+    return replace(piece, states=found | piece.states)
 
 
 def _entries(file: Path) -> dict[str, np.ndarray]:
