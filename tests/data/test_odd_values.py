@@ -13,6 +13,7 @@ from torchrl_koap.data.odd_values import (
     scale_warnings,
     spike_warnings,
     turn_warnings,
+    unlabelled_warnings,
 )
 
 TIME = np.linspace(0, 2, 60)[:, None]
@@ -132,3 +133,14 @@ def test_a_trajectory_in_another_unit():
     assert warning.startswith(
         "most columns move less than a twentieth as far as usual in b: another unit, or sensors that saw nothing?"
     )
+
+
+@pytest.mark.parametrize(
+    ("shift", "labelled", "told"), [(0.9, 4, False), (4.0, 4, True), (4.0, 10, False), (4.0, 1, False)]
+)
+def test_recordings_without_labels_that_lie_elsewhere(shift, labelled, told):
+    frames = [np.hstack([np.sin(TIME + index) + shift * (index > 7), TIME]) for index in range(10)]
+    called, known = [f"take {index}" for index in range(10)], [index < labelled for index in range(10)]
+    found = list(unlabelled_warnings(frames, known, called, ["x", "y"]))
+    where = "'x' lie far from all labelled trajectories in 2 of 6 without labels (take 8, take 9)"
+    assert [where in said for said in found] == [True] * told

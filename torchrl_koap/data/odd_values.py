@@ -12,6 +12,7 @@ from torchrl_koap.files import some
 
 AWAY, OFTEN = 10.0, 3  # a mark lies that many ranges of the others away from them, and stands so often
 OTHER = 20.0  # times as far as in most trajectories
+AFAR = 0.1  # share of trajectories without labels that lie far from those with some
 
 
 def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -186,3 +187,29 @@ def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: 
                 f"action {name!r} is {found[0]}{more} and far from that before and behind: the difference of wrapped"
                 " angles, or a command that was not logged? mend it, or make it NaN"
             )
+
+
+def unlabelled_warnings(
+    trajectories: Sequence[np.ndarray], known: Sequence[bool], called: Sequence[str], names: Sequence[str]
+) -> Iterator[str]:
+    """Finds columns of ``[T_i, d]`` where one in ten of those without labels is mostly where no labelled one is.
+
+    The range of the labelled ones is widened by half of it on both sides. ``known`` says which ones have labels.
+    """
+    labelled, others = (
+        [frames for frames, one in zip(trajectories, known, strict=True) if one == has] for has in (True, False)
+    )
+    if len(labelled) < 3 or not others:
+        return
+    low, high = (end(np.concatenate(labelled), axis=0) for end in (np.min, np.max))
+    room = (high - low) / 2
+    out = np.stack([((frames < low - room) | (frames > high + room)).mean(0) > 0.5 for frames in others])
+    far = np.flatnonzero((out.mean(0) > AFAR) & (room > 0))
+    if len(far):
+        unknown = [name for name, one in zip(called, known, strict=True) if not one]
+        where = np.flatnonzero(out[:, far].any(1))
+        yield (
+            f"columns {some([repr(names[column]) for column in far])} lie far from all labelled trajectories in"
+            f" {len(where)} of {len(others)} without labels ({some([unknown[index] for index in where])}): another"
+            " origin or unit, or places that no label shows? use one origin, or label some"
+        )

@@ -22,6 +22,7 @@ from torchrl_koap.data.odd_values import (
     scale_warnings,
     spike_warnings,
     turn_warnings,
+    unlabelled_warnings,
 )
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import DataError, option, some
@@ -39,11 +40,11 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     """Finds what is unlikely in demonstrations, flat data ``[N]`` with ``state``, a sentence each.
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, are in another
-    unit, or reach a place beyond 100 m or rad; state columns that never change, equal another one, leap, hold marks of
-    what is missing, are clocks, quaternions that change their sign or angles a turn apart, or have no unit and move
-    much farther than others; frames at both ends in which nothing moves; actions of another kind than declared, that
-    never change, leap for one frame or hold marks; labels that stand alone; an unlikely rate; plans that are short
-    against the motion.
+    unit, reach a place beyond 100 m or rad, or lie far from all labelled ones; state columns that never change, equal
+    another one, leap, hold marks of what is missing, are clocks, quaternions that change their sign or angles a turn
+    apart, or have no unit and move much farther than others; frames at both ends in which nothing moves; actions of
+    another kind than declared, that never change, leap for one frame or hold marks; labels that stand alone; an
+    unlikely rate; plans that are short against the motion.
 
     ``names`` are what to call each trajectory, such as its file. Default: their numbers.
     """
@@ -67,6 +68,12 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *mark_warnings(np.concatenate(frames), task.state_names, "column"),
         *scale_warnings(frames, called, task.state_names, "column"),
         *_without_units(frames, task),
+        *unlabelled_warnings(
+            [part[:, task.robot] for part in frames],  # few recordings show few goals
+            [bool(part.any()) for part in known],
+            called,
+            [task.state_names[column] for column in task.robot],
+        ),
         *_stillness(frames, called),
         *_clocks(frames, task),
         *spike_warnings(labels, called, task.action_names),
