@@ -203,12 +203,13 @@ def test_errors_and_clipped_actions_are_recorded_and_the_others_go_on():
     env.seed_episodes([10, 11, 12])  # one with an odd seed cannot be reset
     env.reset()
     for push in (5.0, 0.1):
-        out = env.step(TensorDict({"action": torch.full((3, 2), push)}, [3]))["next"]
+        action = torch.tensor([push, 0.1]).expand(3, 2)
+        out = env.step(TensorDict({"action": action}, [3]))["next"]
     assert out["done"].flatten().tolist() == [False, True, False]
     assert record.errors == [{"seed": 11, "step": 1, "error": "reset: RuntimeError: no place"}]
     assert (record.actions, record.clipped) == (5, 3)
     assert record.faults() == [
-        "3 of 5 actions left the environment's box and were clipped to it",
+        f"3 of 5 actions left the environment's box and were clipped to it (by column: {TASK.action_names[0]} 3)",
         "1 episodes failed by an error of the environment: seed 11, step 1: reset: RuntimeError: no place",
     ]
 
@@ -263,7 +264,7 @@ def test_rounding_of_float32_is_no_clipping():
     env.action_space = gymnasium.spaces.Box(-0.1, 0.1, (2,), np.float64)
     env = GymnasiumEpisode(env, 0, max_steps=9)
     env.reset(seed=0)
-    assert float(ACTION[0]) > 0.1 and not env.step(ACTION)[-1]["clipped"]
+    assert float(ACTION[0]) > 0.1 and not env.step(ACTION)[-1]["clipped"].any()
 
 
 def test_an_error_in_a_step_ends_the_episode():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,6 +32,7 @@ class EpisodeRecord:
 
     actions: int = 0  # steps that were played
     clipped: int = 0  # those whose action lay outside the environment's box and was clipped to it
+    clipped_columns: Counter[str] = field(default_factory=Counter)  # how often each column was
     # ``seed``, ``step`` and ``error`` of every episode in which the environment raised one
     errors: list[dict[str, Any]] = field(default_factory=list)
 
@@ -38,7 +40,9 @@ class EpisodeRecord:
         """Returns a sentence about clipped actions, and one about errors, where there are any."""
         found = []
         if self.clipped:
-            found.append(f"{self.clipped} of {self.actions} actions left the environment's box and were clipped to it")
+            which = some([f"{name} {count}" for name, count in self.clipped_columns.most_common()])
+            said = f"{self.clipped} of {self.actions} actions left the environment's box and were clipped to it"
+            found.append(f"{said} (by column: {which})")
         if self.errors:
             said = some([f"seed {each['seed']}, step {each['step']}: {each['error']}" for each in self.errors])
             found.append(f"{len(self.errors)} episodes failed by an error of the environment: {said}")
@@ -146,7 +150,9 @@ class GymnasiumBatch(EnvBase):
         seen, reward, _, _, told = self._env.step(tensordict.get(ACTION).cpu().numpy() + self._added)
         self._steps += told["played"]
         self.record.actions += int(told["played"].sum())
-        self.record.clipped += int(told["clipped"].sum())
+        self.record.clipped += int(told["clipped"].any(-1).sum())
+        columns = zip(self.task.action_names, told["clipped"].sum(0).tolist(), strict=True)
+        self.record.clipped_columns.update({name: count for name, count in columns if count})
         failed = told["error"].astype(bool)
         self.record.errors += [
             {"seed": self._begun_with[index], "step": int(self._steps[index]), "error": told["error"][index]}

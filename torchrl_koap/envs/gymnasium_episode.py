@@ -23,9 +23,9 @@ class GymnasiumEpisode(gymnasium.Wrapper):
     """Plays one episode of an environment after each reset, then repeats its last observation.
 
     A vector environment therefore never resets it; ``index`` is its place there. ``info`` holds ``terminated``,
-    ``truncated`` and ``over``; whether the step was ``played`` and its action ``clipped`` to the box; ``success``; and
-    as ``error`` what the environment raised in this step or at the reset, which truncates the episode. A wrong
-    observation (:class:`ObservationError`), whose columns have ``names``, is such an error.
+    ``truncated`` and ``over``; whether the step was ``played`` and which columns of its action were ``clipped`` to the
+    box; ``success``; and as ``error`` what the environment raised in this step or at the reset, which truncates the
+    episode. A wrong observation (:class:`ObservationError`), whose columns have ``names``, is such an error.
 
     Success is what the entry ``success_key`` of the environment's ``info`` says, by default ``is_success`` or
     ``success`` where there is one, else an episode that terminates with a positive reward.
@@ -57,8 +57,8 @@ class GymnasiumEpisode(gymnasium.Wrapper):
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Plays a step, if the episode is not over; its ends are told in ``info`` alone."""
-        told = {"played": not self._over, "clipped": False, "terminated": False, "truncated": self._over, "error": ""}
-        reward = 0.0
+        told = {"played": not self._over, "terminated": False, "truncated": self._over, "error": ""}
+        told["clipped"], reward = np.zeros(self.env.action_space.shape, bool), 0.0
         if not self._over:
             reward, ends = self._play(action)
             told |= ends
@@ -79,7 +79,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         self._steps += 1
         self._over = bool(terminated or truncated or self._steps >= self.max_steps)
         return reward, {
-            "clipped": not np.allclose(inside, action, rtol=_ROUNDING, atol=_ROUNDING),
+            "clipped": ~np.isclose(inside, action, rtol=_ROUNDING, atol=_ROUNDING),
             "terminated": bool(terminated),
             "truncated": self._over and not terminated,
             "error": self._error,
