@@ -209,6 +209,19 @@ def test_a_share_of_the_trajectories_is_used_those_with_labels_first(demonstrati
     assert found["trajectories_used"] == 4 and found["labels"]["trajectories_touched"] == 2
 
 
+def test_a_planner_for_a_curve_knows_the_labelled_trajectories_and_holds_few_out(tmp_path, monkeypatch):
+    states = [np.random.default_rng(index).normal(size=(40, 2)).cumsum(0) for index in range(40)]
+    actions = [np.diff(frames, axis=0) if index > 36 else None for index, frames in enumerate(states)]
+    data = save_demonstrations(tmp_path / "arm", states, actions, control_hz=30)
+    seen, split = [], on_disk.split_held_out
+    monkeypatch.setattr(on_disk, "split_held_out", lambda *given: seen.append(split(*given)) or seen[0])
+    options = {"planner": replace(PLANNER, held_out=0.25), "labels": LabelConfig(trajectories=0.2)}
+    found = train(TrainConfig(dataset=str(data), out=tmp_path / "run", **options), planner_only=True)
+    known, unseen, _ = (part["episode"].unique().tolist() for part in seen[0])
+    assert len(known) == 6 and {37, 38, 39} < set(known) and not seen[0][0]["has_action"].any()
+    assert len(unseen) == 2 and tuple(unseen) == found.held_out
+
+
 def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):
     states = [np.random.default_rng(index).normal(size=(40, 3)).cumsum(0) for index in range(4)]
     actions = [np.diff(states[0][:, :2], axis=0), None, None, None]

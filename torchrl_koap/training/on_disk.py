@@ -16,6 +16,7 @@ from torchrl_koap.data import open_dataset
 from torchrl_koap.data.label_budget import LabelReport, subsample_trajectories
 from torchrl_koap.data.quality import plan_coverage
 from torchrl_koap.data.sources import find_task_of
+from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import to_json, versions
@@ -177,10 +178,13 @@ def _read_data(
     planner, share, seed = config.planner, config.labels.trajectories, config.run.seed
     if planner_only:
         # all cells of a curve share it, whichever labels they draw: only labels that there are count as such here
-        held_out = choose_held_out(data, planner.held_out, seed=seed)
-        data["action"] = torch.full_like(data["action"], torch.nan)
-        data["has_action"] = torch.zeros_like(data["has_action"])
-        return subsample_trajectories(data, share).to(config.run.device), held_out, None
+        hidden = data.copy().set("action", torch.full_like(data["action"], torch.nan))
+        hidden.set("has_action", torch.zeros_like(data["has_action"]))
+        few = len(labelled_episodes(data)) <= share * len(data["episode"].unique())
+        kept = subsample_trajectories(data if few else hidden, share)["episode"]
+        known = torch.isin(data["episode"], kept)
+        held_out = choose_held_out(data[known], planner.held_out, seed=seed)
+        return hidden[known].to(config.run.device), held_out, None
     labelled, report = within_budget(task, config, data)
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
