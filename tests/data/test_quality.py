@@ -156,7 +156,17 @@ def test_frames_and_actions_are_cut_together():
     np.testing.assert_array_equal(found.states, [LINE, LINE])
     np.testing.assert_array_equal(found.actions[0][:, 0], np.arange(9.0, 28))
     assert found.skipped == ("13 still frames of 1 trajectories",) and found.control_hz == 20
-    assert trim_still(make_recordings([LINE], [LINE[1:]], control_hz=20)).skipped == ()
+    uncut = trim_still(make_recordings([LINE], [LINE[1:]], control_hz=20))
+    assert uncut.skipped == ("0 still frames of 0 trajectories",)
+
+
+def test_noise_of_sensors_is_no_movement():
+    generator, ramp = np.random.default_rng(0), np.repeat(np.linspace(0, 1, 20)[:, None], 3, 1)
+    frames = [np.concatenate([np.zeros((40, 3)), ramp]) + generator.normal(size=(60, 3)) / 100 for _ in range(6)]
+    starts, ends = still_ends(frames).T
+    assert (38 <= starts).all() and (starts <= 41).all() and (ends <= 2).all()
+    walks = [generator.normal(size=(60, 3)).cumsum(0) for _ in range(6)]
+    assert not still_ends(walks).any()
 
 
 def test_short_trajectories_are_left_out_and_named():

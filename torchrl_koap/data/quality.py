@@ -32,6 +32,7 @@ FARTHEST = 100.0  # m, or rad: no robot on a table gets there
 STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
 APART = 50.0  # times as far as a fifth of the columns: errors that are measured together hardly show those
 ROUNDING = 1e-5  # share of the farthest column's way below which a column rests
+NOISE = 8.0  # standard deviations of the noise at an end of the recordings, within which a robot stands still too
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
@@ -174,16 +175,24 @@ def _single_labels(known: Sequence[Tensor], called: Sequence[str]) -> Iterator[s
 def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
     """Frames at both ends of trajectories ``[T_i, d]`` in which no column moves, int ``[n, 2]``.
 
-    The last still frame before the movement and the first one behind it are not counted. A trajectory in which nothing
-    ever moves has none.
+    Sensor noise is no movement. The last still frame before the movement and the first one behind it are not counted.
+    A trajectory in which nothing ever moves has none.
     """
-    room = STILL * np.ptp(np.concatenate(trajectories), axis=0)
+    least = STILL * np.ptp(np.concatenate(trajectories), axis=0)
     found = np.zeros((len(trajectories), 2), dtype=int)
-    for number, frames in enumerate(trajectories):
-        for end, ordered in enumerate((frames, frames[::-1])):
-            moves = (np.abs(ordered - ordered[0]) > room).any(-1)
+    for end, order in enumerate((1, -1)):
+        room = np.maximum(least, NOISE * _noise([frames[::order][:WINDOW] for frames in trajectories]))
+        for number, frames in enumerate(trajectories):
+            moves = (np.abs(frames[::order] - frames[::order][0]) > room).any(-1)
             found[number, end] = max(int(moves.argmax()) - 1, 0)
     return found
+
+
+def _noise(parts: Sequence[np.ndarray]) -> np.ndarray | float:
+    """Standard deviation ``[d]`` of independent noise, whose neighbouring steps cancel; 0 where most parts move."""
+    steps = [np.diff(part, axis=0) for part in parts if len(part) == WINDOW]
+    products = [-(step[1:] * step[:-1]).mean(0) for step in steps]
+    return np.sqrt(np.median(products, axis=0).clip(0)) if products else 0.0
 
 
 def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> Iterator[str]:
@@ -203,8 +212,7 @@ def trim_still(recordings: Recordings) -> Recordings:
     spans = [
         (number, ends[number, 0], len(frames) - ends[number, 1]) for number, frames in enumerate(recordings.states)
     ]
-    cut = [f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"] if ends.any() else []
-    return recordings.cut(spans, cut)
+    return recordings.cut(spans, [f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"])
 
 
 def drop_short(recordings: Recordings) -> Recordings:
