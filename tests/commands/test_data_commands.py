@@ -49,6 +49,15 @@ def test_without_labels_no_training_is_proposed(tmp_path, capsys):
     assert re.search("next +add actions to a few recordings", capsys.readouterr().out)
 
 
+def test_a_rate_against_the_stamps_is_a_warning_of_the_table(tmp_path, capsys):
+    rows = "".join(f"{frame / 100},{frame % 7}\n" for frame in range(30))
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "a.csv").write_text(f"time,x\n{rows}")
+    given = ("--action-dim", "1", "--control-hz", "20", "--out", tmp_path / "arm")
+    assert koap("convert", tmp_path / "raw", *given) == 0
+    assert re.search(r"warning \d +column 'time' \(it says 100 frames", capsys.readouterr().out)
+
+
 def test_frames_that_another_format_does_not_hold_are_named(tmp_path, capsys):
     raw = write_filmed(tmp_path / "raw", trajectories=1)
     assert koap("convert", raw, "--to", "npz", "--out", tmp_path / "plain") == 0

@@ -178,9 +178,9 @@ class Convert(Command):
             again = " (and convert that with the roles of its columns)" if self.resample is not None else ""
             raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
         check_new(self.out)
-        recordings = self._read()
         with warnings.catch_warnings(record=not self.quiet) as unlikely:  # shown at once where no table follows
             warnings.simplefilter("always")
+            recordings = self._read()
             folder = save_demonstrations(self.out, recordings, **self._given(_DESCRIBING))
         data, task = open_dataset(folder)
         origin = zip(task.observation_names, task.observation_origin, strict=False)

@@ -41,7 +41,9 @@ def test_stamps_that_cannot_be_are_told(times, declared, message):
 def test_what_is_not_looked_at():
     assert told_rate(clock(TIME), 20) == " (it says 30 frames per second)"
     assert told_rate(clock(TIME), 31) == ""
-    assert told_rate(clock(TIME, 2 * TIME[:9]), 30) == " (its frames are 0.03333 to 0.06667 s apart)"
+    assert told_rate(clock(TIME, 2 * TIME[:9]), 30) == " (its frames are 1 to 2 usual steps apart)"
+    microseconds = 1e6 * np.delete(TIME, 5)
+    assert told_rate(clock(microseconds), 30) == " (its frames are 1 to 2 usual steps apart)"
     assert told_rate(clock(0 * TIME), 20) == " (its time stamps are not looked at)"
 
 

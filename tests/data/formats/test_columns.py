@@ -205,3 +205,11 @@ def test_resampling_leaves_out_lost_frames_of_recordings_without_actions():
         with pytest.raises(DataError, match="states are not finite, first at frame 7 in column 'x': fill") as error:
             assemble(pieces, "data", action_dim=1, **more)
         assert len(str(error.value)) < 300
+
+
+def test_a_rate_against_the_stamps_is_warned_of():
+    with pytest.warns(UserWarning, match=r"'time' \(it says 100 frames .* 20: if its stamps are right"):
+        assert read(control_hz=20.0, time=np.arange(6) / 100).control_hz == 20
+    gap = 1e4 * np.array([0, 1, 2, 3, 60, 61])
+    with pytest.warns(UserWarning, match=r"'timestamp' \(its frames are 1 to 57 usual steps apart\) does not count"):
+        read(control_hz=100.0, timestamp=gap)

@@ -14,6 +14,7 @@ from torchrl_koap.files import option, some
 UNEVEN = 0.2  # share of the usual step by which a step in time may differ
 SLOWEST, FASTEST = 1.0, 2000.0  # Hz; beyond, stamps are in another unit
 ROUNDED = 0.03  # share of its mean step by which a rounded clock's steps may differ
+NOT_READ = " (its time stamps are not looked at)"
 _LONG = 20  # frames after which a column that rises evenly is taken for a clock
 
 
@@ -83,15 +84,15 @@ def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> floa
 
 
 def told_rate(clock: Clock, control_hz: float) -> str:
-    """Returns a note if ignored time stamps give no rate, another one or uneven steps; else an empty text."""
+    """Returns a note if ignored time stamps, of any unit, give no rate, another one or uneven steps; else ""."""
     rate = usual_rate(clock, [])
-    if rate is None:
-        return " (its time stamps are not looked at)"
-    if abs(control_hz / rate - 1) > UNEVEN:
+    if rate is not None and abs(control_hz / rate - 1) > UNEVEN:
         return f" (it says {rate:.4g} frames per second)"
     steps = np.concatenate(clock.steps)
-    uneven = np.abs(steps * rate - 1).max(initial=0) > UNEVEN
-    return f" (its frames are {steps.min():.4g} to {steps.max():.4g} s apart)" if uneven else ""
+    if (steps > 0).all() and np.abs(steps / clock.usual - 1).max(initial=0) > UNEVEN:
+        low, high = steps.min() / clock.usual, steps.max() / clock.usual
+        return f" (its frames are {low:.3g} to {high:.3g} usual steps apart)"
+    return NOT_READ if rate is None else ""
 
 
 def rises_evenly(trajectories: Sequence[np.ndarray], *, room: float = ROUNDED) -> bool:

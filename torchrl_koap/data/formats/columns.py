@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.clocks import UNEVEN, Clock, find_rate, rises_evenly, told_rate, usual_rate
+from torchrl_koap.data.formats.clocks import NOT_READ, UNEVEN, Clock, find_rate, rises_evenly, told_rate, usual_rate
 from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
@@ -104,6 +105,13 @@ def assemble(
         rate = declared_hz
         problems += [f"{no_rate}: pass {option('control_hz')}"] if rate is None else []
     about |= {other.name: told_rate(other, rate) for other in others if other is not None and rate is not None}
+    against = about.get(clock.name, "") if clock is not None and control_hz is not None else ""
+    if against not in ("", NOT_READ):
+        warnings.warn(
+            f"column {clock.name!r}{against} does not count beside {option('control_hz')} {control_hz:g}: if its stamps"
+            f" are right, pass {option('resample')} {resample or control_hz:g} alone",
+            stacklevel=2,
+        )
     for name in (name for name in seen if "success" in name.lower() and kind_of(name)[0] == "other"):
         failed = sum(not piece.states[name].any() for piece in pieces if name in piece.states)
         about |= {name: f" (0 throughout {failed} trajectories, which are kept)"} if failed else {}
