@@ -11,6 +11,8 @@ from command_calls import fails
 from tiny_runs import TINY, koap
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, TrainConfig, save_demonstrations, train
+from torchrl_koap.data import make_recordings
+from torchrl_koap.data.ted import source_names
 from torchrl_koap.evaluation import active_labelling
 from torchrl_koap.evaluation.active_labelling import SuggestConfig, rank_trajectories, suggest
 from torchrl_koap.training import trained
@@ -118,6 +120,20 @@ def test_recordings_without_actions_are_to_get_them_first(tmp_path):
     again = save_demonstrations(tmp_path / "more", states, more, control_hz=30, name="arm")
     words = [str(again) if word == "DATA" else word for word in then.removesuffix(" NEW").split()]
     assert koap(*words[1:], tmp_path / "new", "--quiet") == 0
+
+
+def test_recordings_are_suggested_by_their_files(tmp_path):
+    """Gaps and dropped recordings shift numbers of trajectories against those of files."""
+    states = [np.random.default_rng(index).normal(size=(30, 2)).cumsum(0) for index in range(3)]
+    names = ["a.csv[0]", "a.csv[1]", "c.csv"]
+    recordings = make_recordings(states, [np.diff(states[0], axis=0), None, None], control_hz=30, sources=names)
+    data = save_demonstrations(tmp_path / "arm", recordings)
+    assert source_names(data) == names
+    few = {"planner": PlannerConfig(steps=2, width=8), "controller": ControllerConfig(steps=2)}
+    train(TrainConfig(dataset=str(data), out=tmp_path / "run", **few))
+    found = suggest(tmp_path / "run", SuggestConfig(count=2))
+    assert {row["episode"]: row["source"] for row in found["suggestions"]} == {1: "a.csv[1]", 2: "c.csv"}
+    assert re.match(r"add actions to recordings (a.csv\[1\], c.csv|c.csv, a.csv\[1\]) and convert", found["next"])
 
 
 def test_the_next_training_is_as_the_first_one(copied_run, tmp_path):

@@ -20,7 +20,7 @@ from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings, write_recordings
 from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
 from torchrl_koap.data.sources import check_new, find_task_of
-from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.data.ted import source_names, stored_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport, record_to_folder
 from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.scooping.recording import VideoReport, record_videos
@@ -249,8 +249,9 @@ class Validate(Command):
         task = find_task_of(self.dataset, self.task)
         with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
             data = validate(open_dataset(self.dataset, task=task, progress=count_up_to(bar))[0])
-        files = [] if stored_folder(self.dataset) else find_raw_files(CONVERTERS[task.source], self.dataset)
-        found = _numbered(find_warnings(data, task, list(map(str, files))), data)
+        stored = stored_folder(self.dataset)
+        names = source_names(self.dataset) if stored else find_raw_files(CONVERTERS[task.source], self.dataset)
+        found = _numbered(find_warnings(data, task, list(map(str, names))), data)
         lengths = data["episode"].unique(return_counts=True)[1]
         labels = int(data["has_action"].sum())
         return {

@@ -147,8 +147,11 @@ class Suggest(Command):
         """Ranks the unlabelled demonstrations and writes ``suggestions.json``."""
         found = suggest(self.run, self.config)
         RunDirectory(self.run).write_json("suggestions.json", found)
-        shown = ("steps", "score")
-        rows = {f"episode {row['episode']}": {name: row[name] for name in shown} for row in found["suggestions"]}
+        shown = ("source", "steps", "score")
+        rows = {
+            f"episode {row['episode']}": {name: row[name] for name in shown if name in row}
+            for row in found["suggestions"]
+        }
         return rows | {"next": found["next"]}
 
 

@@ -71,9 +71,11 @@ def save_demonstrations(
     folder = Path(folder)
     name = description.pop("name", None) or re.sub(r"\W+", "_", folder.resolve().name).strip("_") or "robot"
     data, task = make_demonstrations(states, actions, name=name, **description)
-    cameras = states.cameras if isinstance(states, Recordings) else {}
-    notes = {"cameras": {name: [asdict(clip) for clip in clips] for name, clips in cameras.items()}}
-    return save_ted(data, folder / "ted", task, notes if cameras else None).parent
+    notes: dict[str, Any] = {}
+    if isinstance(states, Recordings):
+        cameras = {name: [asdict(clip) for clip in clips] for name, clips in states.cameras.items()}
+        notes = {"sources": [] if "resample" in description else states.sources, "cameras": cameras}
+    return save_ted(data, folder / "ted", task, notes).parent
 
 
 def make_demonstrations(

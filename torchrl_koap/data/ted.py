@@ -125,6 +125,12 @@ def read_about(folder: str | Path) -> dict[str, Any]:
     return about
 
 
+def source_names(folder: str | Path) -> list[str]:
+    """What each trajectory of a data set is from, such as its file; an empty list where it does not say."""
+    stored = stored_folder(folder)
+    return [] if stored is None else read_about(stored)["notes"].get("sources", [])
+
+
 def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
     """Reads a data set that :func:`save_ted` wrote.
 

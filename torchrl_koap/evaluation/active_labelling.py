@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_koap.data.ted import source_names
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.files import some
@@ -173,8 +174,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
 
     Returns:
         dict: what ``suggestions.json`` holds: ``penalty`` of the run's decoder, ``labelled_steps`` and
-        ``labelled_episodes`` that the choice builds on, ``suggestions`` with ``rank``, ``episode``, ``steps`` to label
-        and ``score``, best first, and ``next``, a command line that trains with them.
+        ``labelled_episodes`` that the choice builds on, ``suggestions`` with ``rank``, ``episode``, ``steps`` to label,
+        ``score`` and, where known, ``source``, best first, and ``next``, a command line that trains with them.
 
     Raises:
         ValueError: for a count out of range, or a run without latent actions or a decoder in closed form.
@@ -213,8 +214,10 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     )
     choices = [replace(choice, score=choice.score / each) for choice in ranked]
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
+    names = source_names(config.dataset or trained.config.dataset or "")
     rows = [
         {"rank": rank, "steps": int((unlabelled == choice.episode).sum()), **asdict(choice)}
+        | ({"source": names[choice.episode]} if names else {})
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = labelled_episodes(data).tolist()
@@ -222,8 +225,9 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     known = labelled_episodes(recorded).tolist()
     without = [episode for episode in every if episode not in known]
     converted = f"convert them again (--name {shlex.quote(trained.task.name)} --out DATA)"
-    counted = "counted from 0; files in the order of their names, run_10 before run_2"
-    first = f"add actions to recordings {some(without)} ({counted}) and {converted}, then " if without else ""
+    which = some([names[episode] for episode in without] if names else without)
+    counted = "" if names else " (counted from 0; files in the order of their names, run_10 before run_2)"
+    first = f"add actions to recordings {which}{counted} and {converted}, then " if without else ""
     again = ["koap", "train", "--config", str(trained.folder / "config.json")]
     dataset = "DATA" if without else config.dataset
     again += [] if dataset is None else ["--dataset", str(dataset)]
