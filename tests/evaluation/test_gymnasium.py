@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from offline_runs import record
 from tiny_runs import koap
-from toy_gym import NAMES
+from toy_gym import NAMES, Reach
 
 from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, save_demonstrations, train
 from torchrl_koap.evaluation import InspectConfig, closed_loop, inspect
@@ -66,6 +66,15 @@ def test_step_limit_success_and_arguments_are_said(arm_run, capsys):
     assert found["step_limit"] == "46 steps (that of task 'data': the environment has none)"
     assert found["success"] == "success: an end with a positive reward, or what info says where it comes later"
     assert "mean return 0" in printed and "no episode ended with a positive reward, and info does not say" in printed
+
+
+def test_rollouts_that_do_not_leave_their_start_are_told(arm_run, monkeypatch):
+    own = Reach.step
+    monkeypatch.setattr(Reach, "step", lambda env, action: own(env, 0 * action))
+    asked = EvalConfig(episodes=2, env="toy_gym:ToyReach-v0", env_kwargs=("length=40", "count=99"), threads=1)
+    found = evaluate(arm_run, asked)
+    said = "2 of 2 failed rollouts get less than 0.2 times as far from their start as demonstrations; cut pauses"
+    assert found["faults"][-1].startswith(said)
 
 
 def test_the_mean_return_stands_beside_success(arm_run):

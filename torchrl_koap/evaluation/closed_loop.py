@@ -16,7 +16,7 @@ import torch
 
 from torchrl_koap.evaluation.config import EvalConfig, environment_arguments
 from torchrl_koap.evaluation.latency import measure_latency
-from torchrl_koap.evaluation.loop_on_labels import limited_commands
+from torchrl_koap.evaluation.loop_on_labels import limited_commands, standing_faults
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
@@ -25,7 +25,7 @@ from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
-from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, writable_folder
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Modes, Task
 from torchrl_koap.training.trained import Trained
@@ -109,6 +109,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         result["mean_return"] = statistics.fmean(returns) if returns else None
         result["left_out_of_return"] = len(episodes) - len(returns)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
+        with suppress(RunDirectoryError):  # the data set may have moved
+            pairs = zip(episodes, rows, strict=True)
+            failed = [episode for episode, row in pairs if row["outcome"] not in ("success", "error")]
+            result["faults"] += standing_faults(failed, trained.data(config.dataset))
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
                 "no episode ended with a positive reward, and info does not say at the first step what success is:"

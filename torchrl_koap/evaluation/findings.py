@@ -20,7 +20,8 @@ KIND = f"{DATA}, check --action-kind and --robot, or label a recording that move
 _NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, leave it"
 UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of a loop on labels
 _FAR = 3.0  # standard deviations of the recorded states from the nearest of them
-_STAYS = 0.2  # of the way of the demonstrations
+STAYS = 0.2  # of the way of the demonstrations
+LEAVES = "cut pauses at their ends (`koap convert --trim-still`), or train longer (--steps)"  # what to do about it
 _LEFT = 0.1  # share of recorded paths that a controller may leave
 _WORSE = 2.0  # times the error of a comparable model from which a latent model counts as worse
 
@@ -131,11 +132,10 @@ def loop_faults(loop: Mapping[str, Any]) -> list[str]:
             f"this policy leaves its demonstrations: on a linear model of the robot it ends {distance:.3g} standard"
             f" deviations from the nearest recorded state; {MORE}"
         )
-    if loop["share_of_way"] < _STAYS:
+    if loop["share_of_way"] < STAYS:
         faults.append(
             f"this policy does not leave the start: on a linear model of the robot it gets {loop['share_of_way']:.2g}"
-            f" times as far as the demonstrations in {loop['steps']} steps; cut pauses at their ends (`koap convert"
-            " --trim-still`), or train longer (--steps)"
+            f" times as far as the demonstrations in {loop['steps']} steps; {LEAVES}"
         )
     return faults
 

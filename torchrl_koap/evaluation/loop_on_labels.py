@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,9 +13,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data.trajectories import begins, labelled_episodes
+from torchrl_koap.data.trajectories import begins, labelled_episodes, trajectory_lengths
 from torchrl_koap.data.windows import spread_evenly
-from torchrl_koap.evaluation.findings import UNSTABLE, loop_faults
+from torchrl_koap.evaluation.findings import LEAVES, STAYS, UNSTABLE, loop_faults
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
 from torchrl_koap.modules.execution.command_limits import ends_of
@@ -26,6 +26,7 @@ from torchrl_koap.training.trained import Trained
 STEPS, ROBOTS = 300, 16
 AWAY = 1e12  # where states have run away: far from what a network's type can square
 _EXPLAINED = 0.5  # of the variance of changes, below which labels do not say how states follow actions
+_SMOOTH = 8  # frames that are averaged before the way of a rollout is measured
 _DRIFT = 1.0  # standard deviations that recorded actions may end beside their recording
 _ROWS = 4000  # recorded states that distances are measured to
 _PREFERRED = 100.0  # weight of actions: in smooth motions the state alone tells how it goes on
@@ -115,6 +116,21 @@ def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
         " limited there; --limits inf sends them as they are"
     )
     return {"limited_commands": limited, "faults": [fault]}
+
+
+def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> list[str]:
+    """Says how many failed rollouts ``[T]`` hardly leave their start, in most columns, against demonstrations."""
+
+    def way(rows: Tensor) -> Tensor:
+        smooth = rows.double().unfold(0, _SMOOTH, 1).mean(-1)  # sensor noise is no way
+        return (smooth - smooth[:1]).abs().amax(0)
+
+    recorded = data[OBSERVATION].split(trajectory_lengths(data).tolist())
+    usual = torch.stack([way(rows) for rows in recorded if len(rows) >= _SMOOTH]).median(0).values
+    ways = [way(episode[OBSERVATION]) / usual for episode in failed if len(episode) >= _SMOOTH]
+    stay = sum(bool(each[usual > 0].median() < STAYS) for each in ways)
+    said = f"{stay} of {len(failed)} failed rollouts get less than {STAYS:g} times as far from their start as"
+    return [f"{said} demonstrations; {LEAVES}"] if stay else []
 
 
 def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, float]:
