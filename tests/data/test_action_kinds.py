@@ -124,6 +124,15 @@ def test_an_action_that_never_changes_is_of_no_kind():
     assert list(likely_kinds(*demonstrations(PATHS, steps))) == ["a"]
 
 
+def test_beside_targets_what_is_near_nothing_is_raw():
+    """Such as a thrust beside body rates: advice that leaves it a change is followed."""
+    random = np.random.default_rng(0)
+    steps = [np.column_stack([step[:, 0], random.normal(size=len(step))]) for step in TARGETS]
+    (said,) = warnings(PATHS, steps)
+    assert said.endswith("convert again with --action-kind absolute raw --targets shoulder.pos")
+    assert not warnings(PATHS, steps, action_kind=["absolute", "raw"], targets=JOINTS[:1])
+
+
 def test_normalised_targets_are_raw():
     (said,) = warnings(PATHS, NORMALISED)
     assert said.startswith("2 of 2 actions follow columns of the state and not their changes (mean correlation 0.")

@@ -81,6 +81,8 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
     switches = [name for name, kind in kinds.items() if kind == "delta" and levels[name] == 2]
     found = {name: likely[name] for name in wrong} | {name: replace(likely[name], kind="raw") for name in switches}
+    if wrong:  # of the others "delta" was the default, which is worse where they are none
+        found |= {name: each for name, each in likely.items() if kinds[name] == "delta" and each.kind == "raw"}
     cure = _cure(task, labels, found)
     if wrong:
         reached = [labels.names[likely[name].column] for name in kinds if name in wrong]
@@ -90,7 +92,7 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
         )
     if switches:
         yield f"{some(switches)}: an action of two values, such as a gripper's that opens and closes: {cure}"
-    wrong.update(switches)
+    wrong.update(found)
     changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
     still = [each for each in changes if each.kind == "raw" and _clear(each.follows_column, each.follows_change)]
     if 2 * len(still) > len(changes):
