@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Named columns as recordings: what is no state, where episodes end, and the rate by the time stamps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -112,6 +114,9 @@ def test_the_order_of_columns_does_not_count_but_their_names_do():
     pieces += [Piece(name, {"x": X, "Y": X}) for name in "cd"]
     with pytest.raises(DataError, match="c, d: its state columns are not those of a: it lacks y and has Y besides"):
         assemble(pieces, "data", control_hz=20, action_dim=1)
+    told = [replace(piece, actions={"v": X}) for piece in pieces]
+    with pytest.raises(DataError, match=r"Y besides; leave out what some files lack by drop_columns \(--drop-columns"):
+        assemble(told, "data", control_hz=20)
     chosen = {"drop_columns": ["y", "Y"]}, {"state_columns": ["x"]}
     assert all(assemble(pieces, "data", control_hz=20, action_dim=1, **only).state_names == ("x",) for only in chosen)
 

@@ -307,7 +307,8 @@ def _even(pieces: Sequence[Piece]) -> set[str]:
 
 def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
     acting = any(piece.actions for piece in pieces)
-    hint = "" if acting else f"; say in {option('action_columns')} which columns of a table are actions"
+    hint = f"; leave out what some files lack by {option('drop_columns')}"
+    hint = hint if acting else f"; say in {option('action_columns')} which columns of a table are actions"
     for kind in ("state", "action"):
         named = [(piece.name, piece.states if kind == "state" else piece.actions) for piece in pieces]
         found = [(name, columns) for name, columns in named if columns is not None]
