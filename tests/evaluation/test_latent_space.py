@@ -197,6 +197,9 @@ def test_findings_without_experiments_says_whose_labels_were_read():
     assert text.startswith("10 steps ahead the latent dynamics miss the measured xy by")
     assert "Outside the budget, for evaluation only" in text and "100.0%" in text
     assert "have labels in the budget" not in text
+    hard = latent | {OUTSIDE_THE_BUDGET: {"probe_r2": [0.3, 0.7], "decoder_r2": [0.9, 0.5]}}
+    text = describe_inspection({"latent": hard}, get_task("avoiding"))
+    assert "explains 70.0% of the hardest action, 'y', on" in text and "own decoder 50.0%" in text
     latent = analyse_latent(controller, data, data["episode"] >= 1, {"measured_xy": [0, 1]})
     assert describe_inspection({"latent": latent}, get_task("avoiding")).endswith(
         "(1 of these 2 have labels in the budget)"

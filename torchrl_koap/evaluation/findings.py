@@ -150,22 +150,22 @@ def _describe_latent(latent: Mapping[str, Any], task: Task) -> str:
     return said + (
         f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
         f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
-        f" standing still by {ahead['copy_last']}. {_describe_probe(latent[OUTSIDE_THE_BUDGET])}"
+        f" standing still by {ahead['copy_last']}. {_describe_probe(latent[OUTSIDE_THE_BUDGET], task)}"
     )
 
 
-def _describe_probe(outside: Mapping[str, Any]) -> str:
+def _describe_probe(outside: Mapping[str, Any], task: Task) -> str:
     if "note" in outside:
         return outside["note"].capitalize()
     shared, held_out = (outside.get(name, 0) for name in ("held_out_in_budget", "held_out_trajectories"))
-    probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
+    own, probe, hardest = min(zip(outside["decoder_r2"], outside["probe_r2"], task.action_names, strict=True))
     head, reservation = "Outside the budget, for evaluation only", ""
     if shared and shared == held_out:
         head = "On labels of the budget, which the run's decoder was fitted on"
     elif shared:
         reservation = f" ({shared} of these {held_out} have labels in the budget)"
     return (
-        f"{head}: a linear probe on all labels explains {probe:.1%} of the hardest action dimension on"
+        f"{head}: a linear probe on all labels explains {probe:.1%} of the hardest action, {hardest!r}, on"
         f" held-out trajectories, the run's own decoder {own:.1%}{reservation}"
     )
 
