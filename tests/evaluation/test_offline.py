@@ -166,3 +166,6 @@ def test_a_controller_worse_than_the_mean_is_a_fault():
         "action b is worse than always giving its mean (each labelled recording left out in turn): 2000 against 1000"
         " mrad; mend what `koap validate` warns of, check --action-kind and --robot, or label a recording that moves it"
     ]
+    models["controller"] = true * torch.tensor([0.2, 0.05])  # well in the other column, which outweighs it
+    (fault,) = offline_faults({}, {"left_out": summarise_errors(models, true, torch.tensor([4, 5]), task)})
+    assert fault.startswith("action b is hardly better than always giving its mean") and "950 against 1000" in fault
