@@ -35,6 +35,17 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
     raise ValueError(f"unknown {what} {name!r}; {hint}")
 
 
+def unknown(asked: Iterable[str], known: Collection[str], what: str) -> list[str]:
+    """Returns the message of :func:`lookup` for every unknown name."""
+    said = []
+    for name in asked:
+        try:
+            lookup(known, name, what)
+        except ValueError as error:
+            said.append(str(error))
+    return said
+
+
 def nearest(known: Iterable[str], name: str) -> str | None:
     """Finds the known name that is most like another one; None where none is."""
     lowered = {each.lower(): each for each in known}

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
-from torchrl_koap.data.formats.columns import unknown
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings, wrong_rate
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
@@ -23,7 +22,7 @@ from torchrl_koap.data.quality import constant_columns, find_warnings
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state
 from torchrl_koap.files import option, refuse
-from torchrl_koap.lookup import lookup
+from torchrl_koap.lookup import lookup, unknown
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
 

@@ -17,7 +17,7 @@ from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.files import DataError, gathered, option, refuse, some
-from torchrl_koap.lookup import lookup
+from torchrl_koap.lookup import unknown
 
 
 @dataclass(frozen=True)
@@ -143,17 +143,6 @@ def assemble(
 
 def _without(columns: Mapping[str, Any], dropped: Sequence[str]) -> dict[str, Any]:
     return {name: values for name, values in columns.items() if name not in dropped}
-
-
-def unknown(asked: Sequence[str], known: Sequence[str], what: str) -> list[str]:
-    """Returns a message for every unknown name."""
-    said = []
-    for name in asked:
-        try:
-            lookup(known, name, what)
-        except ValueError as error:
-            said.append(str(error))
-    return said
 
 
 def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
@@ -307,8 +296,8 @@ def _even(pieces: Sequence[Piece]) -> set[str]:
 
 def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
     acting = any(piece.actions for piece in pieces)
-    hint = f"; leave out what some files lack by {option('drop_columns')}"
-    hint = hint if acting else f"; say in {option('action_columns')} which columns of a table are actions"
+    cure = f"; leave out what some files lack by {option('drop_columns')}"
+    cure = cure if acting else f"; say in {option('action_columns')} which columns of a table are actions"
     for kind in ("state", "action"):
         named = [(piece.name, piece.states if kind == "state" else piece.actions) for piece in pieces]
         found = [(name, columns) for name, columns in named if columns is not None]
@@ -319,7 +308,6 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
             )
             if missing or more:
                 said = [f"lacks {missing}"] * bool(missing) + [f"has {more} besides"] * bool(more)
-                cure = f"{hint}; {option('drop_columns')} leaves columns out"
                 yield name, f"its {kind} columns are not those of {first}: it {' and '.join(said)}{cure}"
 
 

@@ -29,12 +29,13 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN
-from torchrl_koap.data.formats.columns import Piece, assemble, unknown
+from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import clips_beside
 from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, number_of
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
+from torchrl_koap.lookup import unknown
 
 # what readers of damaged files raise
 _DAMAGED = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
