@@ -81,6 +81,7 @@ def test_origins_are_added_before_a_policy_reads_and_subtracted_from_what_it_com
     assert far == pytest.approx(near, rel=1e-5) and far["commands"] > 0
 
 
+@pytest.mark.filterwarnings("error:in episode")  # the report tells how far it gets
 def test_a_policy_that_overshoots_ever_more_is_unstable(trained):
     model, data = trained
     grown = replace(model, planner=copy.deepcopy(model.planner))

@@ -79,17 +79,20 @@ def test_reset_forgets_the_episode_before():
     assert agent.latency()["steps"] == 12 and agent.latency()["p50"] <= agent.latency()["p99"] <= agent.latency()["max"]
 
 
-def test_a_start_far_from_the_demonstrations_is_told():
+def test_a_state_far_from_the_demonstrations_is_told_once_per_column_and_episode():
+    """Also in the middle of an episode, and in every episode under the default filter, which drops repeated texts."""
     policy = policy_of()
     policy.planner.fit_normalizers(torch.rand(50, 16, 2))
     agent = ready(policy)
-    with pytest.warns(UserWarning, match=r"columns \[1\] of the state lie beyond .*a quaternion of the other sign"):
-        agent.act(np.array([1.9, 57.3]))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        agent.act(np.array([1.9, 57.3]))  # told once in an episode
-        agent.reset()
-        agent.act(np.array([-0.9, 1.9]))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        for _ in range(2):
+            for row in ([-0.9, 1.9], [1.9, 57.3], [1.9, 57.3], [300.0, 57.3]):
+                agent.act(np.array(row))
+            agent.reset()
+    texts = [str(each.message).partition(" of the state")[0] for each in told]
+    assert texts == [f"in episode {episode} columns [{column}]" for episode in (1, 2) for column in (1, 0)]
+    assert {each.filename for each in told} == {__file__}
 
 
 def test_refusals():

@@ -42,7 +42,7 @@ class Agent:
         seed (int): seed of the plans' start noise; robot ``i`` of a batch draws with ``seed + i``.
 
     Warns:
-        UserWarning: if an episode starts far outside of the demonstrated range of a state column.
+        UserWarning: if a state column goes far outside of its demonstrated range, once per column and episode.
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
@@ -74,13 +74,14 @@ class Agent:
         self.device, self.dtype = example.device, example.dtype
         self.latencies: deque[float] = deque(maxlen=KEPT)
         self._streams: NoiseStreams | None = None
-        self._ready = False
+        self._ready, self._episode = False, 0
         self._forget()
 
     def reset(self) -> None:
         """Begins an episode with the next observation; random numbers continue."""
         self._forget()
         self._ready = True
+        self._episode += 1
 
     @torch.no_grad()
     def act(self, observation: np.ndarray | Tensor | Sequence[float] | Mapping[str, Any]) -> np.ndarray | Tensor:
@@ -114,6 +115,7 @@ class Agent:
         self._carried: TensorDict | None = None  # what the policy wrote in the last step
         self._frames = None
         self._shape: tuple[int, ...] | None = None  # of the observations
+        self._far: set[int] = set()  # columns that were warned of
 
     def _decide(self) -> Tensor:
         """The action for the frames observed by now ``[n, act]``."""
@@ -159,16 +161,17 @@ class Agent:
         if bad.any():
             columns = bad.any(0).nonzero().flatten().tolist()
             raise ValueError(f"columns {columns} of the observation are NaN or infinite as {self.dtype}")
-        if self._shape is None:
-            state = self.policy.state_of(read)  # refuses another width before anything is kept
-            planner = self.policy.planner
-            far = planner.far(state).any(0) if isinstance(planner, ConditionalSampler) else state.new_zeros(0)
-            if far.any():
-                columns = far.nonzero().flatten().tolist()
-                warnings.warn(
-                    f"at the start of this episode columns {columns} of the state lie beyond the demonstrated range by"
-                    " more than that range: another unit or robot, or a quaternion of the other sign?",
-                    stacklevel=4,
-                )
+        state = self.policy.state_of(read)  # refuses another width before anything is kept
+        planner = self.policy.planner
+        far = set()
+        if isinstance(planner, ConditionalSampler):
+            far = {*planner.far(state).any(0).nonzero().flatten().tolist()} - self._far
+        if far:
+            self._far |= far
+            warnings.warn(  # with the episode's number, as Python shows a repeated text once only
+                f"in episode {self._episode} columns {sorted(far)} of the state lie beyond the demonstrated range by"
+                " more than that range: another unit or robot, a faulty sensor, or a quaternion of the other sign?",
+                stacklevel=4,
+            )
         self._shape = shape
         return read
