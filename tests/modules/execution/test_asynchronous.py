@@ -2,6 +2,7 @@
 """Plans made while the one before is executed."""
 
 import threading
+import warnings
 from concurrent.futures import wait
 
 import numpy as np
@@ -89,6 +90,25 @@ def test_a_plan_that_takes_long_is_bound_by_whole_steps_and_never_throughout():
         agent.act(np.array([step, 0.0]))
     agent._pending.result(10)
     assert agent.policy.planner.known[1].shape == (1, 5, 2)  # of six states
+    agent.close()
+
+
+def test_a_plan_that_ends_before_the_next_is_there_is_told_in_every_episode():
+    agent = make_agent()
+    planner, steps = agent.policy.planner, agent.policy.planner.horizon
+    for _ in range(2):
+        agent.reset(np.zeros(2))
+        planner.let_go.clear()
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("default")
+            ages = [plan_behind(agent.act(np.zeros(2)))[1] for _ in range(steps)]
+            assert not told
+            agent.act(np.zeros(2))
+            agent.act(np.zeros(2))
+        planner.let_go.set()
+        assert [each.filename for each in told] == [__file__]
+        assert f"a plan may take {1e3 * (steps - 2) / 30:.0f} ms" in str(told[0].message)
+        assert ages == list(range(steps))
     agent.close()
 
 

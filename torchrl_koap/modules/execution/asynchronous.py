@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
@@ -40,6 +41,9 @@ class AsynchronousAgent(Agent):
         control_hz (float): control steps per second, by which a plan's time becomes a number of steps. One that differs
             from that of the policy by more than a fifth is warned of.
         seed (int): as for :class:`Agent`.
+
+    Warns:
+        UserWarning: as :class:`Agent`, and if a plan ends before the next one is there, once per episode.
 
     Raises:
         RuntimeError: if it is asked to act or :meth:`reset` after :meth:`close`.
@@ -109,6 +113,7 @@ class AsynchronousAgent(Agent):
             wait([self._pending])  # of another episode, as is an error in it
         self._pending = None
         self._plan = None
+        self._told = False  # that a plan ended
         self._age = 0  # steps since the plan was begun
         self._begun = 0  # steps since the pending one was begun
 
@@ -125,6 +130,15 @@ class AsynchronousAgent(Agent):
             bound = remaining_plan(self._plan, self._age)[..., : min(self._delay, policy.planner.horizon - 1), :]
             self._pending = self._thread.submit(self._make, frames, self._noise(len(frames)), bound)
             self._begun = 0
+        if self._age >= policy.planner.horizon and not self._told:
+            self._told = True
+            seconds = (policy.planner.horizon - policy.execution.replan_interval) / self.control_hz
+            warnings.warn(
+                f"in episode {self._episode} a plan ended before the next one was there: until then its last state is"
+                f" followed. At {self.control_hz:g} Hz a plan may take {1e3 * seconds:.0f} ms; torch.set_num_threads(1)"
+                " may help. In a process forked after the agent was made no plan ever comes",
+                stacklevel=5,
+            )
         action = policy.act(frames, self._plan, self._age)
         self._age += 1
         self._begun += 1
