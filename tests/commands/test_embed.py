@@ -97,6 +97,13 @@ def test_a_run_that_was_copied_takes_frames(run, tmp_path):
     assert list(Trained.load(copy_run(run, tmp_path / "copy")).cameras) == ["top"]
 
 
+def test_an_exported_file_says_that_it_takes_embeddings(run, tmp_path, capsys):
+    assert koap("export", run, "--out", tmp_path / "exported") == 0
+    note = "Columns of top are embeddings: the file takes no frames."
+    assert note in capsys.readouterr().out
+    assert json.loads((tmp_path / "exported" / "policy.json").read_text())["note"].endswith(note)
+
+
 def test_latency_is_that_with_the_cameras(run, capsys):
     assert koap("latency", run, "--steps", "3") == 0
     printed = capsys.readouterr().out

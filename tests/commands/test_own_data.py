@@ -72,6 +72,7 @@ def test_export_and_latency(run, tmp_path, capsys):
     observed, acted = facts["inputs"]["observations"], facts["outputs"]["actions"]
     assert (observed["columns"], acted["columns"]) == (["q1", "q2", "goal1", "goal2"], ["dq1", "dq2"])
     assert acted["units"] == ["rad", "rad"] and facts["control_hz"] == 20
+    assert acted["kinds"] == ["delta", "delta"]  # without it a target cannot be told from a change
     assert koap("latency", run, "--steps", 10) == 0
     late, times = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"late steps +\d+ of 10; a step may take 50 ms", late)

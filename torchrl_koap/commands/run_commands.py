@@ -215,6 +215,9 @@ class Export(Command):
             "actions": dict(zip(trained.task.action_names, trained.task.action_units, strict=True)),
         }
         what, file = exportable(load_policy(trained), columns=columns), out / f"policy{suffix}"
+        what.facts["outputs"]["actions"]["kinds"] = [meaning.kind for meaning in trained.task.actions.values()]
+        if trained.cameras:
+            what.facts["note"] += f" Columns of {', '.join(trained.cameras)} are embeddings: the file takes no frames."
         export_policy(what, file, kind=self.format)
         result: dict[str, Any] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
         result |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}
