@@ -97,7 +97,7 @@ def observed_numbers(given: Any) -> Tensor:
         return given
     try:
         array = np.ma.array(given, copy=True)
-        if array.dtype.kind in "fiubO":
+        if array.ndim and array.dtype.kind in "fiubO":
             return torch.from_numpy(np.ascontiguousarray(array.astype(np.float64).filled(np.nan)))
     except (TypeError, ValueError):  # ragged lists, other objects
         pass

@@ -133,7 +133,8 @@ def test_arrays_of_any_kind_are_observations():
         (np.zeros(2, "datetime64[s]"), "must be numbers .*, got ndarray"),
         (["left", "right"], "must be numbers .*, got list"),
         ([[1.0, 2.0], [3.0]], "must be numbers .*, got list"),
-        (None, r"columns \[0\]|must be"),
+        (None, "must be numbers .*, got NoneType"),  # a reading that never came
+        (0.5, "must be numbers .*, got float"),
         (np.zeros((1, 1, 2)), r"must be \[obs\] or \[n, obs\], got \[1, 1, 2\]"),
     ],
 )
