@@ -143,6 +143,13 @@ def test_what_is_no_observation(given, says):
         ready().act(given)
 
 
+def test_an_observation_without_a_finite_action_does_not_spoil_the_next_ones():
+    agent = ready()
+    with pytest.raises(ValueError, match="no finite action"):
+        agent.act(np.array([1e38, 0]))
+    assert all(np.isfinite(agent.act(np.zeros(2))).all() for _ in range(6))
+
+
 @pytest.mark.parametrize("seed", ["1", None, 1.5, True, -1])
 def test_what_is_no_seed(seed):
     with pytest.raises(ValueError, match=f"seed must be a whole number >= 0, got {seed!r}"):

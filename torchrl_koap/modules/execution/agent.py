@@ -99,6 +99,7 @@ class Agent:
             self._frames = torch.cat([self._frames[:, 1:], newest], -2)
         action = self.policy.to_robot(self._decide())
         if not action.isfinite().all():
+            self._forget()  # frames and plan hold this observation
             raise ValueError("this observation is so far from the demonstrations that no finite action follows from it")
         action = action[0] if len(self._shape) == 1 else action
         result = action if isinstance(observation, Tensor) else action.cpu().numpy()
