@@ -104,6 +104,13 @@ def test_an_exported_file_says_that_it_takes_embeddings(run, tmp_path, capsys):
     assert json.loads((tmp_path / "exported" / "policy.json").read_text())["note"].endswith(note)
 
 
+def test_a_policy_with_a_network_of_one_s_own_is_exported_where_the_plugin_is_named(run, tmp_path, capsys):
+    file = Trained.load(run).save(tmp_path / "policy.safetensors")
+    assert koap("export", file, "--out", tmp_path / "exported") == 1
+    assert "embeds frames by code of tiny_network: name it in plugins" in capsys.readouterr().err
+    assert koap("export", file, "--out", tmp_path / "exported", "--plugin", "tiny_network") == 0
+
+
 def test_latency_is_that_with_the_cameras(run, capsys):
     assert koap("latency", run, "--steps", "3") == 0
     printed = capsys.readouterr().out

@@ -22,6 +22,7 @@ from torchrl_koap.reports.rows import as_text, evaluation_rows, training_rows
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.studies import Machines, Study, run_study
@@ -193,18 +194,20 @@ class Export(Command):
         format: "torch" (torch.export), "onnx" (ONNX Runtime), "aoti" (AOTInductor, needs a C++ compiler) or "lerobot"
             (a folder for lerobot-eval and lerobot-record).
         threads: torch threads.
+        plugins: modules that register task or method, or hold a camera's network, where they are now.
     """
 
     run: tyro.conf.Positional[str]
     out: Path | None = None
     format: str = "torch"
     threads: int = 1
+    plugins: Plugins = ()
 
     def __call__(self) -> dict[str, Any]:
         """Exports and compares."""
         suffix = lookup(SUFFIXES | {"lerobot": None}, self.format, "export format")
         set_up_torch(self.threads, "cpu")
-        trained = Trained.load(self.run)
+        trained = Trained.load(self.run, plugins=self.plugins)
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
         RunDirectory(out).refuse_data()
         if suffix is None:
