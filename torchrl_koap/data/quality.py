@@ -33,6 +33,7 @@ STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still;
 APART = 50.0  # times as far as a fifth of the columns: errors that are measured together hardly show those
 ROUNDING = 1e-5  # share of the farthest column's way below which a column rests
 NOISE = 8.0  # standard deviations of the noise at an end of the recordings, within which a robot stands still too
+CANCELS = 0.25  # of the mean square step, that much is the product of neighbours: 0.5 of noise, 0 of a random walk
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
@@ -191,8 +192,12 @@ def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
 def _noise(parts: Sequence[np.ndarray]) -> np.ndarray | float:
     """Standard deviation ``[d]`` of independent noise, whose neighbouring steps cancel; 0 where most parts move."""
     steps = [np.diff(part, axis=0) for part in parts if len(part) == WINDOW]
-    products = [-(step[1:] * step[:-1]).mean(0) for step in steps]
-    return np.sqrt(np.median(products, axis=0).clip(0)) if products else 0.0
+    if not steps:
+        return 0.0
+    products = np.array([-(step[1:] * step[:-1]).mean(0) for step in steps])
+    squares = np.array([np.square(step).mean(0) for step in steps])
+    alone = np.median(products / np.maximum(squares, 1e-300), axis=0) > CANCELS
+    return np.sqrt(np.median(products, axis=0).clip(0) * alone)
 
 
 def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> Iterator[str]:
