@@ -168,3 +168,15 @@ def test_several_data_sets_must_name_their_tasks(tmp_path):
     with pytest.raises(ValueError, match="must be TASK=FOLDER where there are several"):
         complete(Study(out=tmp_path / "s", datasets=tuple(map(str, places))))
     assert complete(Study(out=tmp_path / "s", datasets=(str(places[0]),))).tasks == ("arm",)
+
+
+def test_what_evaluation_would_refuse_is_refused_before_any_training(tmp_path):
+    for task, options, message in (
+        ("aligning", {"episodes": 61}, "there are 60"),
+        ("avoiding", {"rollouts_per_context": 2}, "has no contexts"),
+        ("arm", {"episodes": 10}, "no environment to roll out in"),
+    ):
+        datasets = (str(save_arm(tmp_path / "arm", joints=2)),) if task == "arm" else ()
+        study = Study(out=tmp_path / "s", tasks=(task,), datasets=datasets, evaluation=EvalConfig(**options))
+        with pytest.raises(ValueError, match=message):
+            check_study(complete(study))

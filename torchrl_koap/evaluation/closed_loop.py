@@ -69,10 +69,6 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task
     if task.env is None and config.env is None:
-        usual = EvalConfig()
-        for name in ("episodes", "rollouts_per_context", "batch_size", "contexts_file"):
-            if getattr(config, name) != getattr(usual, name):
-                raise ValueError(f"{name}: task {task.name!r} has no environment to roll out in: name one with --env")
         return _judge_offline(run, trained, config)
     if config.execution.strategy == "oracle" and config.env is not None:
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
@@ -149,8 +145,13 @@ def _judge_offline(run: str | Path, trained: Trained, config: EvalConfig) -> dic
 def choose_contexts(task: Task, config: EvalConfig) -> tuple[list[int] | None, np.ndarray | None]:
     """Returns number and pose of the context of every rollout; None where all episodes start alike.
 
-    Too few contexts, and those asked for where there are none, are refused.
+    Too few contexts, and those asked for where there are none, are refused; so are rollouts without an environment.
     """
+    if task.env is None and config.env is None:
+        for name in ("episodes", "rollouts_per_context", "batch_size", "contexts_file"):
+            if getattr(config, name) != getattr(EvalConfig(), name):
+                raise ValueError(f"{name}: task {task.name!r} has no environment to roll out in: name one with --env")
+        return None, None
     each, file = config.rollouts_per_context, config.contexts_file
     if not task.objects or config.env is not None:
         where = f"task {task.name!r}" if config.env is None else "an environment of Gymnasium"

@@ -11,7 +11,7 @@ from typing import Any
 
 from torchrl_koap.data.sources import DEFAULT_TASK, find_task_of
 from torchrl_koap.evaluation import EvalConfig
-from torchrl_koap.evaluation.closed_loop import find_environment
+from torchrl_koap.evaluation.closed_loop import choose_contexts, find_environment
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
@@ -302,8 +302,9 @@ def check_study(study: Study) -> list[Cell]:
     contexts = study.evaluation.contexts_file
     if contexts is not None and not Path(contexts).is_file():
         raise ValueError(f"contexts_file: there is no file {contexts}")
-    if study.evaluation.env is not None:
-        for task in study.tasks:
+    for task in study.tasks:  # what evaluation would refuse, when everything is trained
+        choose_contexts(study.task(task), study.evaluation)
+        if study.evaluation.env is not None:
             observe = Observer.of(study.task(task), cameras_of(study.given_dataset(task)))
             find_environment(study.task(task), study.evaluation, observe)
     cells = study.cells()
