@@ -4,6 +4,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -85,6 +86,23 @@ def test_the_seed_decides_not_the_place_and_not_the_global_generator(together):
         assert len(new) == len(old)
         assert (new["next", "observation"] - old["next", "observation"]).abs().max() < 1e-4
     assert not any(len(other[1]) == len(e) and torch.allclose(other[1]["action"], e["action"]) for e in together)
+
+
+def test_an_environment_that_draws_its_own_starts_is_seeded():
+    class Drawn(EpisodesOfRandomLength):
+        def _set_seed(self, seed):
+            self.generator = np.random.default_rng(seed)
+
+        def _reset(self, tensordict):
+            seen = torch.tensor(self.generator.normal(size=(2, 3))).float()
+            return super()._reset(tensordict).set("observation", seen)
+
+    def starts(seeds):
+        policy = make_policy(wandering_planner(), EchoController(), state_of=(1, 2))
+        episodes = roll_out(policy, lambda num: Drawn(num, [[1]] * num), seeds, max_steps=2)
+        return torch.stack([episode[0]["observation"] for episode in episodes])
+
+    assert torch.equal(starts([5, 6]), starts([5, 6])) and not torch.equal(starts([5, 6]), starts([7, 8]))
 
 
 def test_one_episode_per_environment_even_if_some_end_early():

@@ -7,7 +7,7 @@ What an environment has to offer, D3IL's (:class:`~torchrl_koap.envs.Manipulatio
     max_steps        control steps after which an episode is truncated
     reset            reset(contexts=[n, bodies, 3]) starts the episodes there, where the task has bodies; x, y (m), yaw
                      (rad). Without it the environment draws them. One call resets all environments
-    set_seed         of the contexts that it draws
+    set_seed         of all that it draws; rollouts call it with the seed of their first episode, recordings too
     observation      [n, obs]; success [n, 1] bool, latched until the reset; mode [n, ...], one of Task.modes.leaves
     collision        [n, 1] bool, where an episode can end by one
     context          [n, bodies, 3], where the task has bodies

@@ -58,6 +58,7 @@ def roll_out(
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
+        env.set_seed(part[0])  # for all that it draws itself
         for module in env.modules():  # transforms, and the environment itself, with a generator per episode
             if hasattr(module, "seed_episodes"):
                 module.seed_episodes(part)

@@ -86,6 +86,15 @@ def test_replayed_actions_give_the_same_episode(recording):
         assert env.task.modes.index_of(step["mode"]).item() == report.each("mode")[take.number]
 
 
+def test_an_environment_that_draws_its_own_starts_is_seeded(monkeypatch):
+    seeds = []
+    monkeypatch.setattr(AvoidingEnv, "_set_seed", lambda env, seed: seeds.append(seed))
+    for seed in (0, 0, 1):
+        record_demonstrations("avoiding", 1, seed)
+    same, other = [value for value in seeds if value is not None][:2], seeds[-1]
+    assert same[0] == same[1] != other
+
+
 def test_modes_are_balanced():
     assert np.bincount(balanced_modes(96, 24, 0)).tolist() == [4] * 24
     counts = np.bincount(balanced_modes(29, 24, 1), minlength=24)

@@ -202,6 +202,7 @@ def _play_batches(
                 contexts = contexts_of(attempt - attempt % _PER_CONTEXT)
                 seeds = [(seed, row, attempt) for row in rows]
                 hand = Disturbances(task, seeds, disturbed[rows]) if disturbed[rows].any() else None
+                env.set_seed(hash(seeds[0]) % 2**31)  # for all that it draws itself
                 results = play(
                     env,
                     task,
