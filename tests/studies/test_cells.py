@@ -78,6 +78,7 @@ def test_a_row_says_what_a_cell_found(finished):
     assert row["action_error"] == 1e3 * result["action_errors"]["outside_budget"]["unit"][0][
         "controller"
     ] and math.isfinite(row["action_error"])
+    assert row["action_error_unit"] == "mm"
 
 
 def test_a_cell_that_is_not_done_is_missing_or_failed(tmp_path):

@@ -21,7 +21,7 @@ from torchrl_koap.studies.table import (
 def cell(method="koap", labels=0.02, seed=0, *, successes=20, episodes=30, **more):
     asked = ("avoiding", method, labels, 1.0, seed, "trajectory", "done", "", 4, 320 + seed, 4)
     found = (episodes, successes, successes / episodes, 0.1, 0.9, 0.5 + 0.1 * seed, 2, 80.5, 1.0 + seed, None, None, "")
-    row = (*asked, *found, 500, "", 12.25, 3.5, f"{method}/{labels}/{seed}")
+    row = (*asked, *found, 500, "", "mm", 12.25, 3.5, f"{method}/{labels}/{seed}")
     return dict(zip(CELL_COLUMNS, row, strict=True)) | more
 
 
@@ -108,6 +108,11 @@ def test_the_labels_that_errors_are_of_are_named():
         "left out and outside budget",
         "left out",
     ]
+
+
+def test_the_unit_of_action_errors_is_that_of_the_cells():
+    for unit, told in (("mrad", "mrad"), ("", "unit of the first column"), (None, "unit of the first column")):
+        assert f"action error ({told})" in table_rows(summarise([cell(action_error_unit=unit)]))[0]
 
 
 def test_columns_that_say_nothing_are_left_out():

@@ -136,9 +136,8 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
         "labelled_units": labels["selected_units"],
         "labelled_transitions": labels["labelled_transitions"],
         "trajectories_touched": labels["trajectories_touched"],
-        "action_error": _own_error(result),
         "controller_updates": summary["controller_updates"],
-    }
+    } | _own_error(result)
     if result.get("kind") == KIND:
         names = ("relative_plan_error", "relative_action_error", "action_errors_on")
         return common | {"kind": KIND} | {name: result[name] for name in names}
@@ -149,13 +148,14 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
     return common | {"mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy}
 
 
-def _own_error(result: Mapping[str, Any]) -> float | None:
-    """Error of the actions in the unit of the first column, as it is shown; None if nothing was measured."""
+def _own_error(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Error of the actions in the unit of the first column, as it is shown, and that unit; if it was measured."""
     split = result["action_errors_on"]
     if split is None:
-        return None
+        return {}
     row = result["action_errors"][split]["unit"][0]
-    return row["controller"] * thousandths(row["unit"])[1]
+    unit, factor = thousandths(row["unit"])
+    return {"action_error": row["controller"] * factor, "action_error_unit": unit}
 
 
 def _outcomes_of(result: Mapping[str, Any]) -> list[list[float]]:

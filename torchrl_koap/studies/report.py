@@ -16,8 +16,6 @@ from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, REFERENCE
 from torchrl_koap.studies.paper import paper_points, write_paper_layout
 from torchrl_koap.studies.plots import plot_measure
 from torchrl_koap.studies.table import Summary, markdown_table, not_done, percent, summarise, table_rows, write_csv
-from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training.methods import METHODS
 
 _CAPTIONS = {
@@ -131,7 +129,7 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
         wanted: dict[str, dict[str, Any]] = {
             "success": {"by": ("labels", "labelled_transitions"), "paper": points},
             "mode_entropy": {},
-            error: {"unit": _error_unit(task) if error == "action_error" else ""},
+            error: {"unit": ", ".join(main[0].action_error_units) if error == "action_error" else ""},
         }
         known = [kind for kind in wanted if any(kind in item.measures for item in main)]
         if error in known and min(item.measures[error].low for item in main if error in item.measures) <= 0:
@@ -149,13 +147,6 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
             plot_measure(items, folder / FOLDER / f"{name}_demonstrations.png", by=("demonstrations",), methods=methods)
             figures.append(_figure(name, "demonstrations", task))
     return figures
-
-
-def _error_unit(task: str) -> str:
-    try:
-        return thousandths(get_task(task).action_units[0])[0]
-    except ValueError:
-        return ""
 
 
 def _figure(name: str, kind: str, task: str, more: str = "") -> dict[str, Any]:

@@ -21,7 +21,7 @@ CELL_COLUMNS = (
     *("labelled_units", "labelled_transitions", "trajectories_touched"),
     *("episodes", "successes", "success_rate", "success_low", "success_high", "mode_entropy", "collisions"),
     *("mean_steps", "action_error", "relative_action_error", "relative_plan_error", "kind", "controller_updates"),
-    *("action_errors_on", "train_seconds", "eval_seconds", "run"),
+    *("action_errors_on", "action_error_unit", "train_seconds", "eval_seconds", "run"),
 )
 _MEASURES = (
     *("mode_entropy", "action_error", "relative_action_error", "relative_plan_error"),
@@ -64,6 +64,7 @@ class Summary:
     episodes: int
     measures: Mapping[str, Measure]
     action_errors_on: tuple[str, ...] = ()  # the labels that action errors without an environment are of
+    action_error_units: tuple[str, ...] = ()
 
     @property
     def offline(self) -> bool:
@@ -131,7 +132,8 @@ def _summary(task: str, method: str, labels: float, demonstrations: float, unit:
         rates = [row["successes"] / row["episodes"] for row in rolled_out]
         measures["success"] = Measure(successes / episodes, *wilson_interval(successes, episodes))
         measures["seed_success"] = Measure(successes / episodes, min(rates), max(rates))
-    compared = tuple(sorted({row["action_errors_on"] for row in done if row.get("action_errors_on")}))
+    names = ("action_errors_on", "action_error_unit")
+    compared, error_units = (tuple(sorted({row[name] for row in done if row.get(name)})) for name in names)
     return Summary(
         task,
         method,
@@ -143,6 +145,7 @@ def _summary(task: str, method: str, labels: float, demonstrations: float, unit:
         episodes=episodes,
         measures=measures,
         action_errors_on=compared,
+        action_error_units=error_units,
     )
 
 
@@ -150,12 +153,12 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     """The table as text, a row per method and share of labels; columns without any value are left out."""
     units = {item.label_unit for item in summaries}
     labels = f"labels ({plural_of(*units)})" if len(units) == 1 and "" not in units else "labels"
-    error = "unit of the first column" if any(item.offline for item in summaries) else "mm, mrad"
+    error = ", ".join(sorted({unit for item in summaries for unit in item.action_error_units}))
     numbers = {  # heading to measure and form
         "mode entropy": ("mode_entropy", ".2f"),
         "action error (of the mean action's)": ("relative_action_error", ".3g"),
         "plan error (of standing still's)": ("relative_plan_error", ".3g"),
-        f"action error ({error})": ("action_error", ".3g"),
+        f"action error ({error or 'unit of the first column'})": ("action_error", ".3g"),
         "labelled transitions": ("labelled_transitions", ",.0f"),
         "in trajectories": ("trajectories_touched", ".4g"),
         "training (s)": ("train_seconds", ",.0f"),
