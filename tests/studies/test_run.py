@@ -17,7 +17,7 @@ from tiny_runs import koap, read_csv
 from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig
 from torchrl_koap.files import one_at_a_time
 from torchrl_koap.runs.config_files import to_json
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies import run as run_module
 
@@ -81,7 +81,8 @@ def curve(whole_curve, tmp_path):
 
 def test_what_a_curve_writes(whole_curve):
     assert {path.name for path in whole_curve.iterdir()} == {
-        *("cells", "cells.csv", "comparisons.csv", "index.html", "lock", "planners", "plots", "study.json", "table.md")
+        *("begun_with", "cells", "cells.csv", "comparisons.csv", "index.html", "lock", "planners", "plots"),
+        *("study.json", "table.md"),
     }
     rows = rows_of(whole_curve)
     assert set(rows) == {DP, LINEAR} and {row["status"] for row in rows.values()} == {"done"}
@@ -150,6 +151,12 @@ def test_other_settings_are_named(options, message, curve, demonstrations, capsy
     before = marks(curve), (curve / "study.json").read_bytes()
     assert message in fails(capsys, *command_of(curve, demonstrations, **options))
     assert (marks(curve), (curve / "study.json").read_bytes()) == before
+
+
+def test_demonstrations_that_changed_are_refused(curve, demonstrations, monkeypatch):
+    monkeypatch.setattr(run_module, "fingerprint", lambda data: {"steps": 7, "sha256": ""})
+    with pytest.raises(RunDirectoryError, match="started with other demonstrations .* 7 now"):
+        run(curve, demonstrations, methods=("linear", "pca"))
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, capsys):

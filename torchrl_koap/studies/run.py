@@ -15,8 +15,9 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data import flatten_trajectories, open_dataset, save_ted
 from torchrl_koap.data.label_budget import subsample_trajectories
-from torchrl_koap.runs.config_files import changed_options, from_json, to_json
+from torchrl_koap.runs.config_files import changed_options, from_json, to_json, versions
 from torchrl_koap.runs.progress import count_up_to, progress_bar
+from torchrl_koap.runs.resume import check_data
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
 from torchrl_koap.studies.launchers import Job, Machines, launch
@@ -24,6 +25,7 @@ from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
 from torchrl_koap.studies.table import CELL_COLUMNS, STATUSES, write_csv
 from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.training.datasets import fingerprint
 
 _FILE = "study.json"
 # what a later call may add to; all else must be as it was
@@ -52,8 +54,8 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
 
     Raises:
         ValueError: for unknown names, shares out of range or that select nothing; before any work.
-        RunDirectoryError: if the folder holds something else, a study with other settings, or one that is being worked
-            on.
+        RunDirectoryError: if the folder holds something else, a study with other settings or demonstrations, or one
+            that is being worked on.
         PluginError: if a plugin cannot be imported.
 
     Examples:
@@ -70,14 +72,21 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
     study = complete(study, () if before is None else before.run.plugins)
     cells, root = check_study(study), RunDirectory(study.out)
     _check_folder(study)
+    facts = {}
     for name in study.tasks:
-        _check_labels(study, cells, name, _first_look(study, study.task(name)))
+        data = _first_look(study, study.task(name))
+        _check_labels(study, cells, name, data)
+        given = study.given_dataset(name)
+        facts[name] = {"dataset": given, "data": given and fingerprint(data), "versions": versions()}
+        check_data(_begun(study, name), facts[name])
     with root.locked("koap curve", "lock"):
         _check_folder(study)  # another one may have finished here in the meantime
         for name in study.tasks:
             _record(study, cells, name)
         whole = _together(study)
         root.write_json(_FILE, to_json(replace(whole, out=Path())))
+        for name, content in facts.items():
+            _begun(study, name).write_json("config.json", content)
         asked = set(cells)
         folders = {cell: study.out / cell.folder for cell in whole.cells() if cell not in asked}
         earlier = [cell for cell, folder in folders.items() if (folder / "log.txt").exists() or folder.is_file()]
@@ -88,6 +97,11 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         title = f"Label efficiency on {tasks[0] if len(tasks) == 1 else f'{len(tasks)} tasks'}"
         report = write_study_report(study.out, rows, table.outcomes, title=title, options=_given(to_json(whole)))
     return StudyResult(rows, {status: sum(row["status"] == status for row in rows) for status in STATUSES}, report)
+
+
+def _begun(study: Study, task: str) -> RunDirectory:
+    """Where is kept with which demonstrations, and versions of packages, the cells of a task were begun."""
+    return RunDirectory(study.out / "begun_with" / task)
 
 
 def _read_study(folder: Path) -> Study | None:
