@@ -89,6 +89,7 @@ def test_an_average_is_over_all_tasks_or_none():
 
 def test_what_is_written(tmp_path):
     made = write_paper_layout(tmp_path, ROWS)
+    assert "Rollouts per cell (n): 60, 120; table.md has that of each." in made["sentence"]
     assert made["sentence"] in (tmp_path / "paper_table.md").read_text()
     assert (tmp_path / made["picture"]).stat().st_size > 1000
     one = [cell("sorting", "koap", 0.01, 30)]  # its own picture of success shows the same

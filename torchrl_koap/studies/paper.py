@@ -98,7 +98,7 @@ class Entry:
 
     @property
     def text(self) -> str:
-        """Measured success and its interval in percent, number of rollouts and, in brackets, the paper's mean."""
+        """Measured success and its interval in percent and, in brackets, the paper's mean."""
         if self.success is None:
             here = "failed" if self.measured is not None and self.measured.failed else "not run"
         else:
@@ -188,6 +188,8 @@ def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) ->
     table = layout_rows(entries)
     above, both = above_the_paper(entries)
     sentence = f"KOAP succeeds more often than the paper's KOAP in {above} of {both} cells." if both else ""
+    numbers = sorted({entry.measured.episodes for entry in entries if entry.success is not None})
+    sentence += f" Rollouts per cell (n): {', '.join(map(str, numbers))}; table.md has that of each." if numbers else ""
     if table:
         with replacing_file(folder / "paper_table.md") as aside:
             aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
