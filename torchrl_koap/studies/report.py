@@ -28,9 +28,9 @@ _CAPTIONS = {
     ),
     "mode_entropy": (
         "Modes against the labels",
-        "Entropy of the modes of successful rollouts, 1 if all are equally frequent: mean over seeds, with the best and"
-        " the worst seed. Success alone can be had by playing one demonstration again, wherever episodes start alike;"
-        " then the entropy is 0.",
+        "Entropy of the modes of successful rollouts, 1 if all are equally frequent: mean over seeds with a success,"
+        " with the best and the worst seed. With few successes it says little. Success alone can be had by playing"
+        " one demonstration again, wherever episodes start alike; then the entropy is 0.",
     ),
     "action_error": (
         "Action error against the labels",
