@@ -170,6 +170,10 @@ def test_several_data_sets_must_name_their_tasks(tmp_path):
     assert complete(Study(out=tmp_path / "s", datasets=(str(places[0]),))).tasks == ("arm",)
 
 
+def test_the_controls_are_run_unless_methods_are_named(tmp_path):
+    assert {"koap_untrained", "linear_steps"} <= set(complete(Study(out=tmp_path / "s")).methods)
+
+
 def test_what_evaluation_would_refuse_is_refused_before_any_training(tmp_path):
     for task, options, message in (
         ("aligning", {"episodes": 61}, "there are 60"),

@@ -32,8 +32,8 @@ PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobse
 # options of a Study by name, those of its sections in mappings of their own
 USUAL: dict[str, Any] = {
     "methods": (
-        *("koap", "koap_untrained", "koap_labelled_only", "linear", "dd", "vae", "lapo", "dp", "relabel", "nonlinear"),
-        "pretrain",
+        *("koap", "koap_untrained", "koap_labelled_only", "linear_steps", "linear", "dd", "vae", "lapo", "dp"),
+        *("relabel", "nonlinear", "pretrain"),
     ),
     "labels": (0.01, 0.02, 0.05, 0.1, 0.25),
     "first_seed_only": (),
