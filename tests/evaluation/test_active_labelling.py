@@ -120,6 +120,8 @@ def test_recordings_without_actions_are_to_get_them_first(tmp_path):
     again = save_demonstrations(tmp_path / "more", states, more, control_hz=30, name="arm")
     words = [str(again) if word == "DATA" else word for word in then.removesuffix(" NEW").split()]
     assert koap(*words[1:], tmp_path / "new", "--quiet") == 0
+    planners = [(tmp_path / run / "planner.safetensors").read_bytes() for run in ("run", "new")]
+    assert planners[0] == planners[1]  # plans know no labels: it is not trained again
 
 
 def test_recordings_are_suggested_by_their_files(tmp_path):
@@ -142,12 +144,13 @@ def test_the_next_training_is_as_the_first_one(copied_run, tmp_path):
     config["planner"]["learning_rate"] = 2e-3
     (copied_run / "config.json").write_text(json.dumps(config))
     said = suggest(copied_run, SuggestConfig(count=1, plugins=("csv",)))["next"]
-    assert " --plugin csv --labels.episodes " in said
+    assert f" --plugin csv --planner.source {copied_run} --labels.episodes " in said
     assert koap(*said.removesuffix(" NEW").split()[1:], tmp_path / "new", "--quiet") == 0
     again = json.loads((tmp_path / "new" / "config.json").read_text())
     assert again["labels"]["episodes"] == list(map(int, said.split("--labels.episodes ")[1].split(" --out")[0].split()))
     assert again["run"]["plugins"] == ["json", "csv"] and again["controller"] == config["controller"]
-    assert again["dataset"] == config["dataset"] and again["planner"] == config["planner"]
+    assert again["dataset"] == config["dataset"]
+    assert again["planner"] == config["planner"] | {"source": str(copied_run.absolute())}
 
 
 def test_windows_that_had_labels_are_proposed_as_whole_trajectories(demonstrations, tmp_path):
@@ -179,7 +182,7 @@ def test_suggest_from_the_shell(copied_run, capsys):
         str(episode) for episode in [*written["labelled_episodes"], *(row["episode"] for row in rows)]
     ]
     assert len(written["labelled_episodes"]) == labels["trajectories_touched"]
-    assert f"koap train --config {copied_run / 'config.json'} --labels.episodes" in lines[3]
+    assert f"koap train --config {copied_run / 'config.json'} --planner.source" in lines[3]
     assert koap("suggest", copied_run, "--count", "7") == 1  # 2 of 8 are labelled
     assert "count must be in 1..6" in capsys.readouterr().err
 

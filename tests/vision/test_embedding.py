@@ -126,7 +126,7 @@ def test_bad_data_are_refused_by_camera_trajectory_and_frame(tmp_path):
     own = write_own(tmp_path)
     file = tmp_path / "raw" / "07" / "top.npy"
     np.save(file, np.load(file)[:, :8])
-    with pytest.raises(DataError, match=r"camera 'top' of 7 cannot be used: frame 0 is 8 x 24, .* others are 16 x 24"):
+    with pytest.raises(DataError, match=r"camera 'top' of 07.npz cannot be used: frame 0 is 8 x 24, .* others are 16"):
         embed(own, tmp_path / "seen")
     assert not (tmp_path / "seen" / "ted").exists()
     with pytest.raises(ValueError, match="unknown camera 'tip'; did you mean 'top'"):

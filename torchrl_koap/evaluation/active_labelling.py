@@ -234,6 +234,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     for plugin in config.plugins:
         again += ["--plugin", plugin]
     again += [] if trained.config.labels.unit == "trajectory" else ["--labels.unit", "trajectory"]
+    again += ["--planner.source", str(trained.folder)]  # plans know no labels
     return {
         "penalty": penalty,
         "labelled_steps": report.labelled_transitions,

@@ -138,7 +138,8 @@ def embed_recordings(
         [steps - added for steps in recordings.actions],
         action_dim=task.action_dim,
     )
-    save_ted(data, out / "ted", task, {"embedded": chosen, "network": backbone.name})
+    notes = {"embedded": chosen, "network": backbone.name, "sources": list(recordings.sources)}
+    save_ted(data, out / "ted", task, notes)
     shutil.rmtree(out / "unfinished")
     return reports
 

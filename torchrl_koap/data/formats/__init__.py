@@ -20,7 +20,7 @@ from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.data.formats.robomimic import read_robomimic
 from torchrl_koap.data.formats.tables import read_tables, table_files
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
-from torchrl_koap.data.ted import load_ted, read_about, stored_folder
+from torchrl_koap.data.ted import load_ted, read_about, source_names, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import DataError, option, read_json
 from torchrl_koap.lookup import lookup
@@ -55,7 +55,7 @@ def _read_stored(
         actions.split(lengths),
         state_names=task.observation_names,
         action_names=task.action_names,
-        sources=np.arange(len(lengths)).astype(str),
+        sources=source_names(folder) or np.arange(len(lengths)).astype(str),
         control_hz=task.control_hz,
         cameras=stored_clips(read_about(folder)["notes"]),
         source=source,
