@@ -6,9 +6,10 @@ import math
 import re
 import shutil
 
+import numpy as np
 import pytest
 import torch
-from offline_runs import save_arm, train_arm
+from offline_runs import record, save_arm, train_arm
 
 from torchrl_koap.commands.cli import main
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
@@ -169,3 +170,20 @@ def test_a_controller_worse_than_the_mean_is_a_fault():
     models["controller"] = true * torch.tensor([0.2, 0.05])  # well in the other column, which outweighs it
     (fault,) = offline_faults({}, {"left_out": summarise_errors(models, true, torch.tensor([4, 5]), task)})
     assert fault.startswith("action b is hardly better than always giving its mean") and "950 against 1000" in fault
+
+
+def test_a_recording_whose_labels_disagree_is_named(tmp_path):
+    for name, sign in (("good", 1), ("bad", -1)):  # in one file
+        (tmp_path / name).mkdir()
+        for index, (frames, steps) in enumerate(zip(*record(12, joints=2), strict=True)):
+            labelled = index in (0, 1, 2, 5, 10)
+            table = np.c_[frames, steps * (sign if index == 2 else 1)] if labelled else frames
+            header = ",".join(["x", "y", "goal_x", "goal_y", *(("action_0", "action_1") if labelled else ())])
+            np.savetxt(tmp_path / name / f"run_{index}.csv", table, delimiter=",", header=header, comments="")
+        call = ("convert", tmp_path / name, "--out", tmp_path / f"{name}_data", "--control-hz", "10", "--quiet")
+        assert main([*map(str, call)]) == 0
+        run = train_arm(tmp_path / f"{name}_run", tmp_path / f"{name}_data", method="linear_steps")
+        odd = [fault for fault in evaluate(run, FEW)["faults"] if "disagree" in fault]
+        assert len(odd) == (name == "bad")
+    assert odd[0].startswith("labels disagree with those of other recordings (each labelled recording left out in turn")
+    assert re.search(r"median of the others [\d.]+\): run_2\.csv \([\d.]+\)[^;]*; check the sign, order", odd[0])

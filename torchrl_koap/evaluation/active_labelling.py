@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_koap.data.ted import source_names
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.files import some
@@ -214,7 +213,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     )
     choices = [replace(choice, score=choice.score / each) for choice in ranked]
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
-    names = source_names(config.dataset or trained.config.dataset or "")
+    names = trained.names(data, config.dataset)
     rows = [
         {"rank": rank, "steps": int((unlabelled == choice.episode).sum()), **asdict(choice)}
         | ({"source": names[choice.episode]} if names else {})

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from statistics import median
 from typing import Any
 
+from torchrl_koap.files import some
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import thousandths
 
@@ -24,6 +27,7 @@ _FAR = 3.0  # standard deviations of the recorded states from the nearest of the
 STAYS = 0.2  # of the way of the demonstrations
 LEAVES = "cut pauses at their ends (`koap convert --trim-still`), or train longer (--steps)"  # what to do about it
 _LEFT = 0.1  # share of recorded paths that a controller may leave
+_ODD, _NOTABLE = 2.0, 0.5  # times the median error of other recordings from which labels are odd; relative error
 _WORSE = 2.0  # times the error of a comparable model from which a latent model counts as worse
 
 
@@ -100,8 +104,13 @@ def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
     return faults
 
 
-def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[str]:
-    """Says what is worse than what needs no learning at all, by the figures of an offline evaluation."""
+def offline_faults(
+    plan: Mapping[str, Any], action: Mapping[str, Any], names: Mapping[int, str] | None = None
+) -> list[str]:
+    """Says what is worse than what needs no learning, and which labels are odd, by the figures of an evaluation.
+
+    ``names`` are what to call trajectories, such as their files.
+    """
     faults = []
     for row in plan.get("unit", ()):
         own = row["planner"]["energy_score"]["overall"]
@@ -113,6 +122,18 @@ def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[s
                 faults.append(f"plans are worse than {name.replace('_', ' ')} ({what}): {against}; {MORE}")
     where = {"outside_budget": "labels outside the budget", "left_out": "each labelled recording left out in turn"}
     for split, words in where.items():
+        rows = action.get(split, {}).get("trajectory", ())
+        errors = {row["episode"]: row["relative_action_error"] or 0.0 for row in rows}
+        usual = {each: median([errors[it] for it in errors if it != each] or [math.inf]) for each in errors}
+        odd = [each for each, error in errors.items() if len(errors) > 2 and error > max(_ODD * usual[each], _NOTABLE)]
+        odd = sorted(odd, key=errors.__getitem__, reverse=True)
+        if odd:
+            said = [f"{(names or {}).get(each, f'trajectory {each}')} ({errors[each]:.3g})" for each in odd]
+            faults.append(
+                f"labels disagree with those of other recordings ({words}; relative error, median of the others"
+                f" {usual[odd[0]]:.3g}): {some(said)}; check the sign, order of columns and offset in time of the"
+                " first, unless no other label shows its motion"
+            )
         for row in action.get(split, {}).get("column", ()):
             if row["controller"] > HARDLY * row["mean_action"]:
                 against = _against(row["controller"], row["mean_action"], row["unit"])

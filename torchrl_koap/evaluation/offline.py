@@ -49,7 +49,7 @@ def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, An
     return {
         "kind": KIND,
         "relative_plan_error": plan.get("relative"),
-        "faults": offline_faults(plan, action) + loop.pop("faults"),
+        "faults": offline_faults(plan, action, trained.names(data, config.dataset)) + loop.pop("faults"),
         "loop": loop,
         "plan_errors": plan,
         **_summary_of(action),

@@ -15,6 +15,7 @@ from torch import nn
 from torchrl_koap.data import open_dataset
 from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.label_budget import LabelReport
+from torchrl_koap.data.ted import source_names
 from torchrl_koap.files import some
 from torchrl_koap.modules import Execution, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.modules.execution.followers import Follower
@@ -225,6 +226,11 @@ class Trained:
                 " directory?): say where it is with --dataset"
             )
         return open_dataset(where, task=self.task)[0]
+
+    def names(self, data: TensorDictBase, dataset: str | None = None) -> dict[int, str]:
+        """What the trajectories of :meth:`data` were read from, by number; empty where the data set does not say."""
+        numbers = data["episode"].unique_consecutive().tolist()
+        return dict(zip(numbers, source_names(dataset or self.config.dataset or ""), strict=False))
 
     def seen(self, data: TensorDictBase) -> TensorDictBase:
         """Converts flat data ``[N]`` to what the controller reads and predicts."""
