@@ -39,14 +39,14 @@ def warnings(states, actions=None, *, columns=("x", "y"), units=("m", "m"), name
 
 
 def test_sound_demonstrations_raise_none():
-    assert warnings([MOVED, MOVED + 1, MOVED], [STEPS, STEPS, 2 * STEPS]) == []
+    assert warnings([MOVED, MOVED + 1, MOVED + 2], [STEPS, STEPS, 2 * STEPS]) == []
 
 
 def test_each_warning_is_said_once_and_names_its_trajectory():
     names = [f"{letter}.pkl" for letter in "abcdef"]
     paths = [PATH, PATH, PATH * 0, PATH * 1e36, PATH + 1, PATH + 2]
     assert warnings(paths, [STEPS, STEPS, STEPS, STEPS, 0 * STEPS, None], names=names) == [
-        "b.pkl repeats a.pkl: every step is the same",
+        "b.pkl repeats a.pkl: every state is the same; leave out the one with fewer labels",
         "c.pkl: nothing moves in its 19 steps",
         "d.pkl: x reaches 3.6e+37 m",
         "e.pkl: all 19 labelled actions are zero",
@@ -175,3 +175,9 @@ def test_short_trajectories_are_left_out_and_named():
     assert found.sources == ("b", "c") and found.skipped == ("a (15 steps)",) and len(found.actions) == 2
     with pytest.raises(DataError, match="no trajectory has the 16 steps of a window"):
         drop_short(make_recordings([LINE[:9]], action_dim=1))
+
+
+def test_a_recording_with_labels_beside_itself_without_them():
+    said = warnings([MOVED, MOVED], [None, STEPS], names=["run_5.csv", "run_5_labelled.csv"])
+    wanted = "run_5_labelled.csv repeats run_5.csv: every state is the same; leave out the one with fewer labels"
+    assert said == [wanted]

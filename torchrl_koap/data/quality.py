@@ -100,9 +100,9 @@ def _trajectory_warnings(
     read = (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)
     parts = [data.get(key).split(lengths) for key in read]
     for name, observed, steps, has_action, last in zip(called, *parts, strict=True):
-        same = first.setdefault(_digest(observed, steps, last[-1:]), name)
+        same = first.setdefault(_digest(observed, last[-1:]), name)  # one with labels may lie beside one without
         if same is not name:
-            yield f"{name} repeats {same}: every step is the same"
+            yield f"{name} repeats {same}: every state is the same; leave out the one with fewer labels"
             continue
         labelled = steps[has_action.squeeze(-1)]
         if len(labelled) and not labelled.any():
