@@ -185,5 +185,5 @@ def test_a_recording_whose_labels_disagree_is_named(tmp_path):
         run = train_arm(tmp_path / f"{name}_run", tmp_path / f"{name}_data", method="linear_steps")
         odd = [fault for fault in evaluate(run, FEW)["faults"] if "disagree" in fault]
         assert len(odd) == (name == "bad")
-    assert odd[0].startswith("labels disagree with those of other recordings (each labelled recording left out in turn")
+    assert odd[0].startswith("labels disagree with those of other recordings (each left out in turn")
     assert re.search(r"median of the others [\d.]+\): run_2\.csv \([\d.]+\)[^;]*; check the sign, order", odd[0])

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
@@ -111,7 +110,7 @@ def offline_faults(
 
     ``names`` are what to call trajectories, such as their files.
     """
-    faults = []
+    faults = _odd_labels(action.get("left_out", {}).get("trajectory", ()), names or {})
     for row in plan.get("unit", ()):
         own = row["planner"]["energy_score"]["overall"]
         for name in ("standing_still", "constant_velocity"):
@@ -122,24 +121,30 @@ def offline_faults(
                 faults.append(f"plans are worse than {name.replace('_', ' ')} ({what}): {against}; {MORE}")
     where = {"outside_budget": "labels outside the budget", "left_out": "each labelled recording left out in turn"}
     for split, words in where.items():
-        rows = action.get(split, {}).get("trajectory", ())
-        errors = {row["episode"]: row["relative_action_error"] or 0.0 for row in rows}
-        usual = {each: median([errors[it] for it in errors if it != each] or [math.inf]) for each in errors}
-        odd = [each for each, error in errors.items() if len(errors) > 2 and error > max(_ODD * usual[each], _NOTABLE)]
-        odd = sorted(odd, key=errors.__getitem__, reverse=True)
-        if odd:
-            said = [f"{(names or {}).get(each, f'trajectory {each}')} ({errors[each]:.3g})" for each in odd]
-            faults.append(
-                f"labels disagree with those of other recordings ({words}; relative error, median of the others"
-                f" {usual[odd[0]]:.3g}): {some(said)}; check the sign, order of columns and offset in time of the"
-                " first, unless no other label shows its motion"
-            )
         for row in action.get(split, {}).get("column", ()):
             if row["controller"] > HARDLY * row["mean_action"]:
                 against = _against(row["controller"], row["mean_action"], row["unit"])
                 how = "worse" if row["controller"] > row["mean_action"] else "hardly better"
                 faults.append(f"action {row['name']} is {how} than always giving its mean ({words}): {against}; {KIND}")
     return faults
+
+
+def _odd_labels(rows: Sequence[Mapping[str, Any]], names: Mapping[int, str]) -> list[str]:
+    """Names labelled recordings that are predicted far worse than others when each is left out in turn."""
+    errors = {row["episode"]: row["relative_action_error"] or 0.0 for row in rows}
+    if len(errors) < 3:
+        return []
+    usual = {each: median([errors[it] for it in errors if it != each]) for each in errors}
+    odd = [each for each, error in errors.items() if error > max(_ODD * usual[each], _NOTABLE)]
+    odd = sorted(odd, key=errors.__getitem__, reverse=True)
+    if not odd:
+        return []
+    said = some([f"{names.get(each, f'trajectory {each}')} ({errors[each]:.3g})" for each in odd])
+    return [
+        f"labels disagree with those of other recordings (each left out in turn; relative error, median of the others"
+        f" {usual[odd[0]]:.3g}): {said}; check the sign, order of columns and offset in time of the first, unless no"
+        " other label shows its motion"
+    ]
 
 
 def loop_faults(loop: Mapping[str, Any]) -> list[str]:
