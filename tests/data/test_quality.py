@@ -181,3 +181,8 @@ def test_a_recording_with_labels_beside_itself_without_them():
     said = warnings([MOVED, MOVED], [None, STEPS], names=["run_5.csv", "run_5_labelled.csv"])
     wanted = "run_5_labelled.csv repeats run_5.csv: every state is the same; leave out the one with fewer labels"
     assert said == [wanted]
+
+
+def test_a_random_walk_is_no_sensor_noise():
+    walks = [np.random.default_rng(index).normal(size=(40, 2)).cumsum(0) for index in range(3)]
+    assert not still_ends(walks).any()
