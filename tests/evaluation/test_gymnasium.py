@@ -128,6 +128,13 @@ def test_the_closed_loop_is_inspected_there(arm_run):
     draw_experiments(found, RunFacts.read(arm_run))
 
 
+def test_rollouts_are_not_overwritten_by_errors_on_recorded_data(arm_run, tmp_path):
+    evaluate(arm_run, EvalConfig(episodes=1, env="toy_gym:ToyReach-v0", threads=1))
+    with pytest.raises(ValueError, match="eval.json holds rollouts in toy_gym:ToyReach-v0: name another folder"):
+        evaluate(arm_run, EvalConfig(threads=1))
+    assert evaluate(arm_run, EvalConfig(threads=1, out=tmp_path / "errors"))["kind"] == "offline"
+
+
 def test_success_keys_are_for_environments(trained_run):
     with pytest.raises(ValueError, match="success_key was given, but no env"):
         evaluate(trained_run, EvalConfig(success_key="is_success"))

@@ -21,11 +21,12 @@ from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
+from torchrl_koap.files import read_json
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, writable_folder
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, find_run, writable_folder
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Modes, Task
 from torchrl_koap.training.trained import Trained
@@ -129,8 +130,14 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
 
 
 def _judge_offline(run: str | Path, trained: Trained, config: EvalConfig) -> dict[str, Any]:
-    """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
+    """Evaluation without an environment; rollouts in one of Gymnasium are not overwritten."""
     choose_contexts(trained.task, config)  # refuses what has no meaning
+    earlier = find_run(run) / "eval.json"
+    if config.out is None and earlier.is_file() and (env := read_json(earlier).get("env")) is not None:
+        raise ValueError(
+            f"{earlier} holds rollouts in {env}: name another folder with --out for errors on recorded data, or"
+            f" roll out again with --env {env}"
+        )
     policy = trained_policy(trained, config.execution)
     result, actions = evaluate_offline(trained, config)
     directory = RunDirectory(writable_folder(run, config.out))
