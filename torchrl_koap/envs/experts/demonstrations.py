@@ -202,7 +202,8 @@ def _play_batches(
                 contexts = contexts_of(attempt - attempt % _PER_CONTEXT)
                 seeds = [(seed, row, attempt) for row in rows]
                 hand = Disturbances(task, seeds, disturbed[rows]) if disturbed[rows].any() else None
-                env.set_seed(hash(seeds[0]) % 2**31)  # for all that it draws itself
+                drawn = np.random.SeedSequence(seeds[0]).generate_state(1)
+                env.set_seed(int(drawn[0]))  # for all that the environment draws itself
                 results = play(
                     env,
                     task,
