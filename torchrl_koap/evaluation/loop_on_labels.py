@@ -123,11 +123,11 @@ def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> l
     """Says how many failed rollouts ``[T]`` hardly leave their start, in most columns, against demonstrations."""
 
     def way(rows: Tensor) -> Tensor:
-        smooth = rows.double().unfold(0, _SMOOTH, 1).mean(-1)  # sensor noise is no way
+        smooth = rows.double().unfold(0, min(_SMOOTH, len(rows)), 1).mean(-1)  # sensor noise is no way
         return (smooth - smooth[:1]).abs().amax(0)
 
     recorded = data[OBSERVATION].split(trajectory_lengths(data).tolist())
-    usual = torch.stack([way(rows) for rows in recorded if len(rows) >= _SMOOTH]).median(0).values
+    usual = torch.stack([way(rows) for rows in recorded]).median(0).values
     ways = [way(episode[OBSERVATION]) / usual for episode in failed if len(episode) >= _SMOOTH]
     stay = sum(bool(each[usual > 0].median() < STAYS) for each in ways)
     said = f"{stay} of {len(failed)} failed rollouts get less than {STAYS:g} times as far from their start as"
