@@ -217,10 +217,10 @@ class Export(Command):
             "observations": dict(zip(trained.task.observation_names, trained.task.known_units, strict=True)),
             "actions": dict(zip(trained.task.action_names, trained.task.action_units, strict=True)),
         }
-        what, file = exportable(load_policy(trained), columns=columns), out / f"policy{suffix}"
-        what.facts["outputs"]["actions"]["kinds"] = [meaning.kind for meaning in trained.task.actions.values()]
-        if trained.cameras:
-            what.facts["note"] += f" Columns of {', '.join(trained.cameras)} are embeddings: the file takes no frames."
+        kinds, seen = [action.kind for action in trained.task.actions.values()], ", ".join(trained.cameras)
+        note = f" Columns of {seen} are embeddings: the file takes no frames." if seen else ""
+        what = exportable(load_policy(trained), columns=columns, kinds=kinds, note=note)
+        file = out / f"policy{suffix}"
         export_policy(what, file, kind=self.format)
         result: dict[str, Any] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
         result |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}

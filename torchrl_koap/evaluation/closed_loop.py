@@ -26,7 +26,7 @@ from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, find_run, writable_folder
+from torchrl_koap.runs.run_directory import RunDirectory, find_run, writable_folder
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Modes, Task
 from torchrl_koap.training.trained import Trained
@@ -76,7 +76,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = find_environment(task, config, Observer.of(task, trained.cameras))
-    errors, actions = evaluate_actions(trained, config.dataset)
+    errors, actions, data = evaluate_actions(trained, config.dataset)
     directory = RunDirectory(writable_folder(run, config.out))  # a refused call copies nothing
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -106,10 +106,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         result["mean_return"] = statistics.fmean(returns) if returns else None
         result["left_out_of_return"] = len(episodes) - len(returns)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
-        with suppress(RunDirectoryError):  # the data set may have moved
+        if data is not None:
             pairs = zip(episodes, rows, strict=True)
             failed = [episode for episode, row in pairs if row["outcome"] not in ("success", "error")]
-            result["faults"] += standing_faults(failed, trained.data(config.dataset))
+            result["faults"] += standing_faults(failed, data)
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
                 "no episode ended with a positive reward, and info does not say at the first step what success is:"

@@ -19,6 +19,7 @@ from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.findings import LEAVES, STAYS, UNSTABLE, loop_faults
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
+from torchrl_koap.modules.execution.agent import FarStateWarning
 from torchrl_koap.modules.execution.command_limits import ends_of
 from torchrl_koap.modules.ridge import ridge
 from torchrl_koap.training.policy_facts import command_ranges
@@ -201,7 +202,7 @@ def _roll(
     origin, added = policy.origins or (0.0, 0.0)  # the agent reads and tells the robot's numbers
     for _ in range(steps):
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "in episode .* lie beyond")  # the distance to recorded states tells it
+            warnings.simplefilter("ignore", FarStateWarning)  # the distance to recorded states tells it
             action = agent.act(now + origin).double().cpu() - added
         change = response(now, change, action)
         now = now + change

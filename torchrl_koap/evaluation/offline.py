@@ -59,21 +59,23 @@ def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, An
     }, tensors
 
 
-def evaluate_actions(trained: Trained, dataset: str | None = None) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def evaluate_actions(
+    trained: Trained, dataset: str | None = None
+) -> tuple[dict[str, Any], dict[str, Tensor], TensorDictBase | None]:
     """Compares decoded actions with labels outside the budget, for evaluation only, beside rollouts in an environment.
 
     If the data set is not where it was, and ``dataset`` does not say where it is now, nothing is read; one that was
     named and is not that of the training is refused. ``action_errors``, what they come to, and the actions are as of
-    :func:`evaluate_offline`.
+    :func:`evaluate_offline`; last comes what was read.
     """
     try:
-        data = trained.data(dataset)
+        data: TensorDictBase | None = trained.data(dataset)
         outside, tensors = _outside_budget(trained, data, trained.hide_labels(data)[0])
     except RunDirectoryError as error:
         if dataset is not None:
             raise
-        outside, tensors = {"note": str(error)}, {}
-    return _summary_of({"outside_budget": outside}), tensors
+        data, outside, tensors = None, {"note": str(error)}, {}
+    return _summary_of({"outside_budget": outside}), tensors, data
 
 
 def _summary_of(action: Mapping[str, Any]) -> dict[str, Any]:

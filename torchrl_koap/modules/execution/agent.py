@@ -22,6 +22,10 @@ from torchrl_koap.modules.planning.sampler import ConditionalSampler
 KEPT = 10_000  # latencies of the last steps
 
 
+class FarStateWarning(UserWarning):
+    """A state column lies far outside of its demonstrated range."""
+
+
 def percentiles(seconds: Sequence[float]) -> dict[str, float]:
     """Returns ``p50``, ``p99`` and ``max`` of times of single ``steps`` in ms, and their number."""
     p50, p99, longest = (1e3 * np.percentile(seconds, (50, 99, 100))).tolist()
@@ -42,7 +46,7 @@ class Agent:
         seed (int): seed of the plans' start noise; robot ``i`` of a batch draws with ``seed + i``.
 
     Warns:
-        UserWarning: if a state column goes far outside of its demonstrated range, once per column and episode.
+        FarStateWarning: if a state column goes far outside of its demonstrated range, once per column and episode.
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
@@ -172,6 +176,7 @@ class Agent:
             warnings.warn(  # with the episode's number, as Python shows a repeated text once only
                 f"in episode {self._episode} columns {sorted(far)} of the state lie beyond the demonstrated range by"
                 " more than that range: another unit or robot, a faulty sensor, or a quaternion of the other sign?",
+                FarStateWarning,
                 stacklevel=4,
             )
         self._shape = shape

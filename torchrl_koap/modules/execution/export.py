@@ -70,8 +70,13 @@ class Exportable:
         return tuple(torch.cat([value + 0.1 * index for index in range(size)]) for value in self.inputs.values())
 
 
-def exportable(policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str]]) -> Exportable:
-    """Returns a policy as a plain module, with name to unit of every column of ``"observations"`` and ``"actions"``."""
+def exportable(
+    policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str]], kinds: Sequence[str] = (), note: str = ""
+) -> Exportable:
+    """Returns a policy as a plain module, with name to unit of every column of ``"observations"`` and ``"actions"``.
+
+    ``kinds`` of the actions and a ``note`` join the facts.
+    """
     planner, generator = policy.planner, torch.Generator().manual_seed(0)
     sizes = (1, policy.history, len(columns["observations"])), (1, *planner.noise_shape)
     seen, noise = (torch.randn(*size, generator=generator).to(next(planner.parameters())) for size in sizes)
@@ -81,12 +86,14 @@ def exportable(policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str
     module, inputs = _Stateless(policy).eval(), {"observations": seen, "noise": noise}
     with torch.no_grad():
         found = dict(zip(_OUTPUTS, module(*inputs.values()), strict=True))
+    outputs = _tensors(found, columns)
+    outputs["actions"] |= {"kinds": list(kinds)} if kinds else {}
     facts = {
         "inputs": _tensors(inputs, columns),
-        "outputs": _tensors(found, columns),
+        "outputs": outputs,
         "control_hz": policy.control_hz,
         "steps_per_plan": policy.execution.replan_interval,
-        "note": _OPEN_LOOP,
+        "note": _OPEN_LOOP + note,
     }
     return Exportable(module, inputs, facts)
 
