@@ -178,6 +178,7 @@ def test_what_evaluation_would_refuse_is_refused_before_any_training(tmp_path):
     for task, options, message in (
         ("aligning", {"episodes": 61}, "there are 60"),
         ("avoiding", {"rollouts_per_context": 2}, "has no contexts"),
+        ("aligning", {"contexts_file": "nowhere.pkl"}, "contexts_file: there is no file nowhere.pkl"),
         ("arm", {"episodes": 10}, "no environment to roll out in"),
     ):
         datasets = (str(save_arm(tmp_path / "arm", joints=2)),) if task == "arm" else ()

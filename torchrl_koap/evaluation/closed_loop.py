@@ -166,6 +166,8 @@ def choose_contexts(task: Task, config: EvalConfig) -> tuple[list[int] | None, n
             if given:
                 raise ValueError(f"{name} was given, but {where} has no contexts")
         return None, None
+    if file is not None and not Path(file).is_file():
+        raise ValueError(f"contexts_file: there is no file {file}")
     from torchrl_koap.envs.contexts import evaluation_contexts, load_contexts  # takes seconds
 
     table = evaluation_contexts(task) if file is None else load_contexts(file, task)

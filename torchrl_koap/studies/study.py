@@ -299,9 +299,6 @@ def check_study(study: Study) -> list[Cell]:
         config = getattr(study, section)
         if getattr(config, field) != getattr(type(config)(), field):
             raise ValueError(f"{name} is not for a study: {why}")
-    contexts = study.evaluation.contexts_file
-    if contexts is not None and not Path(contexts).is_file():
-        raise ValueError(f"contexts_file: there is no file {contexts}")
     for task in study.tasks:  # what evaluation would refuse, when everything is trained
         choose_contexts(study.task(task), study.evaluation)
         if study.evaluation.env is not None:
