@@ -167,6 +167,7 @@ def test_cells_without_an_environment_hold_errors_and_no_success(arm):
     koap, linear, dp = rows = [row for row, _ in found]
     assert [row["status"] for row in rows] == ["done"] * 3 and {row["kind"] for row in rows} == {"offline"}
     assert "success_rate" not in koap and koap["relative_action_error"] > 0 and koap["action_error"] > 0
+    assert koap["action_error_unit"] == "mrad"
     assert koap["relative_plan_error"] == linear["relative_plan_error"] > 0  # they share the planner
     assert dp["relative_plan_error"] is dp["relative_action_error"] is None
     held_out = [RunDirectory(root / cell.folder).read_json("config.json").get("held_out_episodes") for cell in OFFLINE]
