@@ -91,13 +91,14 @@ def test_origins_of_the_data_are_subtracted_from_observations_and_added_to_actio
         ("ToyReachOwnKey-v0", None, [False] * 6),
         ("ToyReachWon-v0", None, [False, False, True, True, True, True]),
         ("ToyReachLost-v0", None, [False] * 6),
+        ("ToyReachFell-v0", None, [False] * 6),
     ],
 )
 def test_what_counts_as_success(name, key, wanted):
     rollout = run(GymnasiumBatch(name, TASK, 2, success_key=key), 6)
     assert rollout["success"][0].flatten().tolist() == wanted
     over = rollout["done"][0].flatten().tolist()
-    ends = name in ("ToyReachWon-v0", "ToyReachLost-v0")
+    ends = name in ("ToyReachWon-v0", "ToyReachLost-v0", "ToyReachFell-v0")
     assert over == ([False, False, True, True, True, True] if ends else [False] * 5 + [True])
 
 

@@ -33,7 +33,8 @@ class Reach(gymnasium.Env):
         now = self.time == self.count
         info = {} if self.key is None else {self.key: now}
         terminated = self.terminates and self.time >= self.count
-        reward = 1.0 if now and self.terminates == "won" else 0.0
+        won = now and self.terminates == "won"
+        reward = 1.0 if won or self.terminates == "fell" else 0.0
         return self._observe(), reward, bool(terminated), self.time >= self.length, info
 
     def _observe(self):
@@ -74,6 +75,7 @@ for _id, _options in {
     "ToyReachOwnKey-v0": {"key": "arrived"},
     "ToyReachWon-v0": {"terminates": "won"},
     "ToyReachLost-v0": {"terminates": "lost"},
+    "ToyReachFell-v0": {"terminates": "fell"},  # rewarded in every step, as walkers are
 }.items():
     gymnasium.register(_id, entry_point=Reach, kwargs=_options)
 gymnasium.register("ToyBreaks-v0", Breaks)

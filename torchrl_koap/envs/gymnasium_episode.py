@@ -12,6 +12,7 @@ from gymnasium.wrappers.utils import create_zero_array
 
 SUCCESS_KEYS = ("is_success", "success")
 _ROUNDING = 1e-6  # share of an action that float32 may put it beyond its box
+_BONUS = 2.0  # times the largest reward before: one that rewards the end itself
 _LONGEST_PROBE = 1000  # steps in which a success key that was asked for must come
 
 
@@ -28,7 +29,8 @@ class GymnasiumEpisode(gymnasium.Wrapper):
     episode. A wrong observation (:class:`ObservationError`), whose columns have ``names``, is such an error.
 
     Success is what the entry ``success_key`` of the environment's ``info`` says, by default ``is_success`` or
-    ``success`` where there is one, else an episode that terminates with a positive reward.
+    ``success`` where there is one, else an episode whose last step terminates it with more than twice the reward of any
+    step before, and more than 0. A walker that falls has a positive reward in all steps, also in its last.
     """
 
     def __init__(
@@ -43,12 +45,12 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         super().__init__(env)
         self.index, self.max_steps, self.success_key, self.names = index, max_steps, success_key, names
         self._last = create_zero_array(env.observation_space)
-        self._error, self._steps, self._over, self._success = "", 0, True, False
+        self._error, self._steps, self._over, self._success, self._most = "", 0, True, False, 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode, unless ``options["begin"]``, a bool for each environment, says otherwise."""
         if options is None or options["begin"][self.index]:
-            self._error, self._steps, self._over, self._success = "", 0, False, False
+            self._error, self._steps, self._over, self._success, self._most = "", 0, False, False, 0.0
             try:
                 self._take(_begin(self.env, seed))
             except Exception as error:  # told with the first step: an episode without a step has no outcome
@@ -74,6 +76,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
                 self._take(seen)
                 reward = float(given)
                 self._success |= self._succeeded(info, reward, bool(terminated))
+                self._most = max(self._most, reward)
             except Exception as error:  # the episode has failed, the others go on
                 self._error, terminated, truncated = say(error), False, True
         self._steps += 1
@@ -99,7 +102,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
     def _succeeded(self, info: Mapping[str, Any], reward: float, terminated: bool) -> bool:
         found = success_entry(info, self.success_key)
         if found is None:
-            return self.success_key is None and terminated and reward > 0
+            return self.success_key is None and terminated and reward > _BONUS * self._most
         said = info[found]
         return said.strip().lower() in ("true", "1") if isinstance(said, str) else bool(np.any(said))
 

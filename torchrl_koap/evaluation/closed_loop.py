@@ -112,7 +112,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
             result["faults"] += standing_faults(failed, data)
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
-                "no episode ended with a positive reward, and info does not say at the first step what success is:"
+                "no episode ended with a reward of its own, and info does not say at the first step what success is:"
                 " name its entry with --success-key, or compare mean returns"
             )
     rollouts = rollouts_to_tensors(
@@ -231,5 +231,5 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
         "step_limit": f"{probe.max_steps} steps ({limit})",
     }
     if probe.success_key is None:
-        facts["success"] = "success: an end with a positive reward, or what info says where it comes later"
+        facts["success"] = "success: an end with more than twice any earlier reward, or what info says later"
     return RolloutEnvironment(make_env, probe.max_steps, Modes(), record=record, facts=facts)

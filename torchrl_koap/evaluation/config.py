@@ -30,7 +30,7 @@ class EvalConfig:
         env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
         env_kwargs: arguments of gymnasium.make, such as obs_type=state max_episode_steps=300.
         success_key: entry of its info that says whether the task is done (default: "is_success" or "success"; without
-            them, an episode that terminates with a positive reward succeeds).
+            them, an episode that terminates with more than twice any earlier reward succeeds).
         num_envs: environments at a time, each in a process of its own (default: all in this process).
         dataset: where the data set of the training is now (default: where it was).
         threads: torch and simulator threads (default: as many as torch has).
