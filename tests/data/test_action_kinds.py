@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from torchrl_koap.data import make_demonstrations
-from torchrl_koap.data.action_kinds import describe_likely, kind_warnings, likely_kinds
+from torchrl_koap.data.action_kinds import command_warnings, describe_likely, kind_warnings, likely_kinds
 
 NOISE = np.random.default_rng(0).normal(size=(4, 60, 3))
 PATHS = [noise.cumsum(0) for noise in NOISE]
@@ -184,3 +184,15 @@ def test_targets_that_are_the_robots_columns_need_not_be_named():
 def test_few_labels_say_nothing():
     assert not warnings([PATHS[0][:10]], [TARGETS[0][:9]])
     assert not likely_kinds(*demonstrations([PATHS[0][:10]], [TARGETS[0][:9]]))
+
+
+def test_a_joystick_is_no_command():
+    """It would be hidden from planner and controller."""
+    sticks = [np.column_stack([path[:, :2], np.sin(0.3 * np.arange(len(path)))]) for path in PATHS]
+    names = (*JOINTS[:2], "stick")
+    (said,) = command_warnings(*demonstrations(sticks, DELTAS, names, robot=JOINTS[:2], command=["stick"]))
+    assert said.startswith("command column 'stick' follows no action") and "--command" in said
+    for actions in (DELTAS, [path[1:, :2] for path in PATHS]):  # changes of the command, and the command itself
+        last = [np.column_stack([path[:, 2], path[:, :2]]) for path in PATHS]
+        described = {"names": ("q", "a", "b"), "robot": ["q"], "command": ["a", "b"], "action_kind": "raw"}
+        assert not list(command_warnings(*demonstrations(last, actions, **described)))

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap import keys
 from torchrl_koap.data.formats.resampling import quaternion_starts
-from torchrl_koap.files import some
+from torchrl_koap.files import option, some
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
@@ -20,6 +20,7 @@ NEAR, NAMED = 0.3, 1.0  # share of a column's spread within which its targets li
 NEARER = 3.0  # times as far from one reading of an action as from the other
 CLEARER = 2.0  # times as much that one reading leaves unexplained as the other
 FOLLOWS = 0.8  # correlation with a change that no level explains away
+UNLIKE = 0.5  # correlation with every action below which a column repeats no command
 FEW, MANY = 20, 20_000  # labels below which nothing is said, and that are looked at
 
 
@@ -104,6 +105,26 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     raw = [each for name, each in likely.items() if kinds[name] == "raw"]
     if len(raw) == task.action_dim and all(each.kind == "delta" for each in raw):
         yield f"actions follow changes of columns ({_correlations(raw)}): convert again with --action-kind delta"
+
+
+def command_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
+    """Finds command columns of flat data ``[N]`` that no action follows, neither their values nor their changes."""
+    labelled = data.get(keys.HAS_ACTION).squeeze(-1).nonzero().squeeze(-1)
+    if task.command_columns is None or len(labelled) < FEW:
+        return
+    rows = data[labelled[:: 1 + len(labelled) // MANY]]
+    before, after, actions = (
+        rows.get(key).double().cpu().numpy() for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION, keys.ACTION)
+    )
+    for column in range(*task.command_columns.indices(task.observation_dim)):
+        read = [values for values in (after[:, column], (after - before)[:, column]) if np.ptp(values)]
+        most = max([_correlation(values, actions).max() for values in read], default=1.0)
+        if most < UNLIKE:
+            yield (
+                f"command column {task.observation_names[column]!r} follows no action (largest correlation"
+                f" {most:.2f}): it is hidden from planner and controller; what the robot is to follow, such as a"
+                f" joystick, is no {option('command')}"
+            )
 
 
 def describe_likely(likely: dict[str, LikelyKind]) -> str:

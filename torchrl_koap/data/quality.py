@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap import keys
-from torchrl_koap.data.action_kinds import kind_warnings
+from torchrl_koap.data.action_kinds import command_warnings, kind_warnings
 from torchrl_koap.data.formats.clocks import FASTEST, SLOWEST, rises_evenly
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.data.odd_values import (
@@ -45,8 +45,8 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     unit, reach a place beyond 100 m or rad, or lie far from all labelled ones; state columns that never change, equal
     another one, leap, hold marks of what is missing, are clocks, quaternions that change their sign or angles a turn
     apart, or have no unit and move much farther than others; frames at both ends in which nothing moves; actions of
-    another kind than declared, that never change, leap for one frame or hold marks; labels that stand alone; an
-    unlikely rate; plans that are short against the motion.
+    another kind than declared, that never change, leap for one frame or hold marks; a command that no
+    action follows; labels that stand alone; an unlikely rate; plans that are short against the motion.
 
     ``names`` are what to call each trajectory, such as its file. Default: their numbers.
     """
@@ -61,6 +61,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     labels = [steps[labelled].double().cpu().numpy() for steps, labelled in actions]
     return [
         *kind_warnings(data, task),
+        *command_warnings(data, task),
         *_trajectory_warnings(data, task, lengths, called),
         *_short(lengths, called),
         *_column_warnings(state, task.state_names),
