@@ -135,9 +135,18 @@ def test_columns_that_differ_between_trajectories_alone_are_goals():
 def test_a_plan_that_is_short_against_the_motion():
     data = flatten_trajectories([torch.zeros(1001, 2)] * 3, None, action_dim=1)
     covers, short = plan_coverage(data, 500.0)
-    assert covers == "14 frames, 28 ms; demonstrations last 2000 ms (median)"
+    assert covers == "14 frames, 28 ms; demonstrations last 2 s (median)"
     assert "covers 14 frames, 28 ms, 1.4% of a demonstration" in short and "125 Hz (one frame in 4)" in short
     assert plan_coverage(data[:2000:4], 125.0)[1] is None
+
+
+def test_a_gait_of_many_minutes_needs_no_other_rate():
+    time = torch.arange(3001.0)[:, None]
+    for period in (14, 25, 40):  # frames; a plan has 14
+        gait = torch.sin(2 * torch.pi * (time / period + torch.rand(4)))
+        assert plan_coverage(flatten_trajectories([gait] * 2, None, action_dim=1), 50.0)[1] is None
+    slow = torch.sin(time / 300 + torch.rand(4))
+    assert plan_coverage(flatten_trajectories([slow] * 2, None, action_dim=1), 50.0)[1] is not None
 
 
 def test_stillness_is_told():

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -35,6 +36,7 @@ ROUNDING = 1e-5  # share of the farthest column's way below which a column rests
 NOISE = 8.0  # standard deviations of the noise at an end of the recordings, within which a robot stands still too
 CANCELS = 0.25  # of the mean square step, that much is the product of neighbours: 0.5 of noise, 0 of a random walk
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
+AS_FAR = 0.5  # of the mean square distance between any two frames
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
 
@@ -232,20 +234,30 @@ def drop_short(recordings: Recordings) -> Recordings:
 
 
 def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | None]:
-    """Says how long a plan and the demonstrations of flat data ``[N]`` last, in milliseconds at ``control_hz``.
+    """Says how long a plan and the demonstrations of flat data ``[N]`` last at ``control_hz``.
 
-    Second stands a warning where a plan is short against the motion, else None.
+    Second stands a warning where a plan is short against the motion, else None. Motions that repeat within a plan, such
+    as a gait, may go on as long as they like.
     """
     frames = float(trajectory_lengths(data).double().median())
     covers = f"{HORIZON} frames, {1e3 * HORIZON / control_hz:.4g} ms"
-    lasts = f"demonstrations last {1e3 * frames / control_hz:.4g} ms (median)"
-    if HORIZON >= SHORT * frames:
+    lasts = f"demonstrations last {frames / control_hz:.4g} s (median)"
+    if HORIZON >= SHORT * frames or _repeats(data):
         return f"{covers}; {lasts}", None
     every = math.ceil(ENOUGH * frames / HORIZON)
     return f"{covers}; {lasts}", (
         f"a plan covers {covers}, {HORIZON / frames:.1%} of a demonstration: short against the motion. A rate of"
         f" {control_hz / every:.3g} Hz (one frame in {every}) would let it look farther: {option('resample')}"
     )
+
+
+def _repeats(data: TensorDictBase) -> bool:
+    """Whether most columns move as far in a plan as between any two frames, as in a gait: its length says nothing."""
+    paths = data.get(keys.OBSERVATION).double().split(trajectory_lengths(data).tolist())
+    varies = torch.cat(paths).var(0)
+    moved = [torch.cat([path[ahead:] - path[:-ahead] for path in paths]) for ahead in (HORIZON // 2, HORIZON)]
+    share = torch.stack([steps.square().mean(0) for steps in moved]).amax(0) / (2 * varies)
+    return bool(share[varies > 0].nanmedian() > AS_FAR)
 
 
 def goal_columns(recordings: Recordings) -> list[str]:
