@@ -13,6 +13,7 @@ from toy_gym import NAMES, Reach
 from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, save_demonstrations, train
 from torchrl_koap.evaluation import InspectConfig, closed_loop, inspect
 from torchrl_koap.evaluation.statistics import rate
+from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.inspection_plots import draw_experiments
 from torchrl_koap.reports.rows import as_text, evaluation_rows
 from torchrl_koap.reports.run_facts import RunFacts
@@ -81,6 +82,17 @@ def test_the_mean_return_stands_beside_success(arm_run):
     found = evaluate(arm_run, EvalConfig(episodes=2, env="toy_gym:ToyReachWon-v0", threads=1))
     assert found["mean_return"] == found["rates"]["success"]["rate"] == 1.0
     assert not any("reward of its own" in fault for fault in found["faults"])
+    assert found["mean_return_interval"] == (1.0, 1.0) and found["ended_early"] == 0
+
+
+def test_a_task_without_success_has_returns_and_no_advice_about_success(arm_run):
+    found = evaluate(arm_run, EvalConfig(episodes=3, env="toy_gym:ToyReachFell-v0", threads=1))
+    assert found["rates"]["success"]["rate"] == 0 and found["ended_early"] == 3
+    assert [row["return"] for row in found["episode"]] == [3.0] * 3
+    run = RunFacts.read(arm_run)
+    row = as_text(evaluation_rows(run))["environment"]
+    assert "3 rollouts ended before that without success" in row and "mean return 3 (95 % interval 3 to 3)" in row
+    assert not [item for item in advice(run) if "success" in item.finding]
 
 
 def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
@@ -95,7 +107,7 @@ def test_an_episode_that_an_error_ended_is_not_in_the_mean_return(arm_run):
     found = evaluate(arm_run, config)
     assert found["mean_return"] == 1.0 and found["rates"]["success"] == rate([True, False, True])
     row = as_text(evaluation_rows(RunFacts.read(arm_run)))["environment"]
-    assert row.endswith("mean return 1 (1 rollouts that an error ended are left out)")
+    assert row.endswith("mean return 1 (95 % interval 1 to 1; 1 rollouts that an error ended are left out)")
     found = evaluate(arm_run, replace(config, episodes=1, seed=11))
     assert found["mean_return"] is None and found["left_out_of_return"] == 1
 

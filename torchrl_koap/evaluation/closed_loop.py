@@ -21,6 +21,7 @@ from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
+from torchrl_koap.evaluation.statistics import bootstrap_interval
 from torchrl_koap.files import read_json
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
@@ -101,9 +102,14 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if where.record is not None:
         result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
         # rewards that an error cut short are no return
-        played = [episode for episode, row in zip(episodes, rows, strict=True) if row["outcome"] != "error"]
-        returns = [float(episode["next", "reward"].sum()) for episode in played]
+        for episode, row in zip(episodes, rows, strict=True):
+            row["return"] = None if row["outcome"] == "error" else float(episode["next", "reward"].sum())
+        returns = [row["return"] for row in rows if row["return"] is not None]
         result["mean_return"] = statistics.fmean(returns) if returns else None
+        if len(returns) > 1:
+            result["mean_return_interval"] = bootstrap_interval(returns, statistics.fmean)
+        ends = [bool(episode[-1]["next", "terminated"]) for episode in episodes]
+        result["ended_early"] = sum(end and row["outcome"] != "success" for end, row in zip(ends, rows, strict=True))
         result["left_out_of_return"] = len(episodes) - len(returns)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
         if data is not None:

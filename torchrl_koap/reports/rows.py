@@ -190,9 +190,14 @@ def _environment(run: RunFacts) -> Row | None:
     limit = f"at most {made['step_limit']}" if made.get("step_limit") else None
     total = number(made.get("mean_return"))
     left = run.evaluated("left_out_of_return")
-    without = f" ({left:g} rollouts that an error ended are left out)" if left else ""
-    gained = None if total is None else f"mean return {total:.4g}{without}"
-    return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, success, gained))))
+    notes = [f"{left:g} rollouts that an error ended are left out"] if left else []
+    low, high = made.get("mean_return_interval") or (None, None)
+    notes = notes if low is None else [f"95 % interval {low:.4g} to {high:.4g}", *notes]
+    about = f" ({'; '.join(notes)})" if notes else ""
+    gained = None if total is None else f"mean return {total:.4g}{about}"
+    early = run.evaluated("ended_early")
+    ended = f"{early:g} rollouts ended before that without success" if early else None
+    return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, ended, success, gained))))
 
 
 def _speed(run: RunFacts) -> Row | None:
