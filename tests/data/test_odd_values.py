@@ -125,7 +125,7 @@ def test_a_trajectory_in_another_unit():
     assert not [*scale_warnings(frames, called, ["q"], "column")]
     frames[2] = np.degrees(frames[2])
     (warning,) = scale_warnings(frames, called, ["q"], "column")
-    assert re.fullmatch("column 'q' reaches .* times as far as usual in c: another unit, or .*", warning)
+    assert re.fullmatch("columns reach farther than usual, 'q' .* times, in c: another unit, or .*", warning)
     joints = [np.hstack([np.degrees(np.sin(TIME + index)) + 90, np.zeros_like(TIME)]) for index in range(4)]
     assert not [*scale_warnings(joints, called, ["q", "still"], "column")]
     joints[1] = np.radians(joints[1])

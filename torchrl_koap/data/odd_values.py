@@ -148,14 +148,16 @@ def scale_warnings(
     middle = np.median(np.concatenate([rows for _, rows in known]), axis=0)
     reach = np.stack([np.abs(rows - middle).max(0) for _, rows in known])
     usual = np.sort(reach, axis=0)[3 * (len(known) - 1) // 4]
-    for column, name in enumerate(names):
-        odd = np.flatnonzero(reach[:, column] > OTHER * usual[column]) if usual[column] > 0 else []
-        if len(odd):
-            times, where = reach[odd, column].min() / usual[column], some([known[index][0] for index in odd])
-            yield (
-                f"{kind} {name!r} reaches {times:.3g} times as far as usual in {where}: another unit, or a measurement"
-                " that failed?"
-            )
+    odd = (reach > OTHER * usual) & (usual > 0)
+    if odd.any():
+        said = [
+            f"{names[column]!r} {reach[odd[:, column], column].min() / usual[column]:.3g} times"
+            for column in np.flatnonzero(odd.any(0))
+        ]
+        where = some([known[index][0] for index in np.flatnonzero(odd.any(1))])
+        yield (
+            f"{kind}s reach farther than usual, {some(said)}, in {where}: another unit, or a measurement that failed?"
+        )
     moved = np.stack([np.ptp(rows, axis=0) for _, rows in known])
     usual = np.median(moved, axis=0)
     few = (moved > 0) & (OTHER * moved < usual)
