@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import statistics
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -236,6 +237,13 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
         "success_key": probe.success_key,
         "step_limit": f"{probe.max_steps} steps ({limit})",
     }
+    if not probe.own_limit:  # before rollouts that may take days
+        warnings.warn(
+            f"environment {config.env!r} has no step limit: an episode that it does not end lasts {probe.max_steps:,}"
+            " steps, the task's limit (--max-steps of `koap convert`); another one:"
+            " --env-kwargs max_episode_steps=500",
+            stacklevel=2,
+        )
     if probe.success_key is None:
         facts["success"] = "success: an end with more than twice any earlier reward, or what info says later"
     return RolloutEnvironment(make_env, probe.max_steps, Modes(), record=record, facts=facts)
