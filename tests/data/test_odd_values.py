@@ -52,6 +52,14 @@ def test_leaps_are_named_with_their_cause(columns, message):
     assert re.search(message, warning)
 
 
+def test_a_shove_is_no_wrapped_count():
+    """Unwrapped by its height, all that follows would be wrong."""
+    columns = 0.1 * np.sin(np.arange(600.0)[:, None] + np.arange(3))
+    columns[300:303, 0] = [11, 10, 9]
+    (warning,) = leap_warnings([columns], ["log"], ["gyro", "hip", "knee"])
+    assert "a switch, or" in warning and "where the robot was reset, say that an episode ends" in warning
+
+
 @pytest.mark.parametrize("axis", [(0.9, 0.43589, 0), (0, 0.6, 0.8)])
 def test_a_rotation_vector_turns_over_at_pi(axis):
     vector = ((3 * TIME + np.pi) % (2 * np.pi) - np.pi) * np.array(axis)

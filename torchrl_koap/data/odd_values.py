@@ -11,6 +11,7 @@ from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds, quaternio
 from torchrl_koap.files import some
 
 AWAY, OFTEN = 10.0, 3  # a mark lies that many ranges of the others away from them, and stands so often
+FILLS = 0.1  # share of its range that is the standard deviation of a counter that wraps, at least
 OTHER = 20.0  # times as far as in most trajectories
 AFAR = 0.1  # share of trajectories without labels that lie far from those with some
 
@@ -21,7 +22,7 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
     It says why, and what would mend them. :func:`quaternion_warnings` tells of quaternions that change their sign.
     """
     bound, usual = leap_bounds(trajectories)
-    low, high = (end(np.concatenate(trajectories), axis=0) for end in (np.min, np.max))
+    low, high, spread = (end(np.concatenate(trajectories), axis=0) for end in (np.min, np.max, np.std))
     found: dict[str, list[str]] = {}
     starts = quaternion_starts(trajectories)
     leaps = [(np.abs(np.diff(frames, axis=0)) > bound) & ~sign_flips(frames, starts) for frames in trajectories]
@@ -37,7 +38,8 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
         leaping = (np.abs(after - before) > bound).mean()
         flipped = (np.abs(after + before) < UNUSUAL * usual) & (np.abs(after - before) > UNUSUAL * usual)
         ends = np.sort(frames[at : at + 2, column]) - [low[column], high[column]]
-        wraps = bool((np.abs(ends) < 0.05 * (high - low)[column]).all())
+        reach = (high - low)[column]
+        wraps = bool((np.abs(ends) < 0.05 * reach).all()) and spread[column] > FILLS * reach  # else a spike
         near = UNUSUAL * usual[column]
         known = list(zip(trajectories, where, strict=True))
         start, end = (np.concatenate([path[leap + late] for path, leap in known]) for late in (0, 1))
@@ -81,7 +83,10 @@ def _cause(values: np.ndarray, near: float, flipped: bool, most: bool, wraps: bo
         )
     if wraps:
         return f"a count or an angle that was wrapped by {leap:.3g}? np.unwrap it with that period"
-    return "a switch, or a measurement that failed? fill it from its neighbours, or leave it out; range scans may leap"
+    return (
+        "a switch, or a measurement that failed? fill it from its neighbours, or leave it out; range scans may leap;"
+        " where the robot was reset, say that an episode ends (a column 'episode_index' or 'timeouts')"
+    )
 
 
 def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
