@@ -26,6 +26,7 @@ from torchrl_koap.data.odd_values import (
     unlabelled_warnings,
 )
 from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.files import DataError, option, some
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
@@ -37,6 +38,7 @@ NOISE = 8.0  # standard deviations of the noise at an end of the recordings, wit
 CANCELS = 0.25  # of the mean square step, that much is the product of neighbours: 0.5 of noise, 0 of a random walk
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
 AS_FAR = 0.5  # of the mean square distance between any two frames
+LOOKED_AT = 20_000  # windows, of which motions that repeat are told
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
 
@@ -253,9 +255,10 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
 
 def _repeats(data: TensorDictBase) -> bool:
     """Whether most columns move as far in a plan as between any two frames, as in a gait: its length says nothing."""
-    paths = data.get(keys.OBSERVATION).double().split(trajectory_lengths(data).tolist())
-    varies = torch.cat(paths).var(0)
-    moved = [torch.cat([path[ahead:] - path[:-ahead] for path in paths]) for ahead in (HORIZON // 2, HORIZON)]
+    observed, episode = data.get(keys.OBSERVATION), data.get(keys.EPISODE)
+    varies = observed.double().var(0)
+    now = spread_evenly((episode[:-HORIZON] == episode[HORIZON:]).nonzero().squeeze(-1), LOOKED_AT)
+    moved = [observed[now + ahead].double() - observed[now] for ahead in (HORIZON // 2, HORIZON)]
     share = torch.stack([steps.square().mean(0) for steps in moved]).amax(0) / (2 * varies)
     return bool(share[varies > 0].nanmedian() > AS_FAR)
 
