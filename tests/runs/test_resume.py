@@ -44,8 +44,10 @@ def test_a_folder_without_a_run_is_not_resumed(tmp_path):
     assert begun_with(nowhere, fresh) is fresh
 
 
-def test_other_places_and_threads_will_do(run):
+def test_other_places_and_threads_will_do(run, tmp_path):
     check_resume(run, replace(SAVED, dataset="/moved", run=replace(SAVED.run, resume=True, threads=1)))
+    run.write_json("config.json", to_json(replace(SAVED, dataset=str(tmp_path))))  # a copy: both are there
+    check_resume(run, replace(SAVED, dataset="/scratch/copy", run=replace(SAVED.run, resume=True)))
     built_on = replace(SAVED, planner=PlannerConfig(source="/no/longer/there"))  # as where a curve's folder was moved
     run.write_json("config.json", to_json(built_on))
     check_resume(run, replace(built_on, planner=PlannerConfig(source="/moved"), run=replace(SAVED.run, resume=True)))

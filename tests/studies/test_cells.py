@@ -131,6 +131,17 @@ def test_a_cell_that_was_killed_while_it_was_trained_goes_on(finished):
     assert read_result(folder)[1] == before
 
 
+def test_a_cell_is_evaluated_on_the_data_where_they_are_now(root, planner, tmp_path, monkeypatch):
+    folder, asked = root / CELL.folder, []
+    config = replace(cell_config(root, planner, tmp_path / "moved"), out=planner.parent / CELL.folder)
+    prepare_cell(folder, config, EvalConfig(episodes=1, threads=1))
+    (folder / "result.json").unlink()
+    found = RunDirectory(folder).read_json("eval.json")
+    monkeypatch.setattr(cells_file, "evaluate", lambda run, evaluation: asked.append(evaluation.dataset) or found)
+    run_cell(folder)
+    assert asked == [str(tmp_path / "moved")] and read_result(folder) is not None
+
+
 def test_outcomes_are_compared_by_context_and_else_by_seed():
     rows = [{"seed": 100, "outcome": "success", "context": 7}, {"seed": 101, "outcome": "timeout"}]
     assert cells_file._outcomes_of({"episode": rows}) == [[7, 100, True], [101, 101, False]]

@@ -144,7 +144,7 @@ def test_scripted_demonstrations_are_recorded_once_and_a_call_that_finds_too_few
     [
         ({"planner.steps": 4}, "holds a study with another planner.steps (3); choose another --out"),
         ({"evaluation.episodes": 2, "label_unit": "window"}, "label_unit (trajectory), evaluation.episodes (1)"),
-        ({"datasets": (".",)}, "with another datasets (avoiding="),
+        ({"datasets": ()}, "with another datasets (avoiding="),
     ],
 )
 def test_other_settings_are_named(options, message, curve, demonstrations, capsys):
@@ -157,6 +157,12 @@ def test_demonstrations_that_changed_are_refused(curve, demonstrations, monkeypa
     monkeypatch.setattr(run_module, "fingerprint", lambda data: {"steps": 7, "sha256": ""})
     with pytest.raises(RunDirectoryError, match="started with other demonstrations .* 7 now"):
         run(curve, demonstrations, methods=("linear", "pca"))
+
+
+def test_the_same_demonstrations_may_lie_elsewhere(curve, demonstrations, tmp_path):
+    scratch = shutil.copytree(demonstrations, tmp_path / "scratch")
+    assert run(curve, scratch, methods=("linear", "pca"))["done"] == 3
+    assert json.loads((curve / "study.json").read_text())["datasets"] == [f"avoiding={scratch}"]
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, capsys):

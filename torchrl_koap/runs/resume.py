@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from torchrl._utils import logger
@@ -14,8 +13,9 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import changed_options, fill_in, read_config
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
-# with which a run may be resumed differently; with other threads sums are rounded differently
-FREE = frozenset({"out", "run.threads", "run.resume", "run.plugins", "run.logger"})
+# with which a run may be resumed differently; with other threads sums are rounded differently. Demonstrations may lie
+# elsewhere: their checksum says whether they are the same
+FREE = frozenset({"dataset", "out", "run.threads", "run.resume", "run.plugins", "run.logger"})
 _ONE_OF = ("fraction", "count", "episodes")
 
 
@@ -44,8 +44,8 @@ def check_resume(run: RunDirectory, config: TrainConfig) -> None:
         raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
     saved = read_config(run)
     # a folder that is gone was moved, probably together with this run: there is nothing to compare with
-    paths: dict[str, Any] = {"dataset": saved.dataset, "planner.source": saved.planner.source}
-    moved = {name for name, path in paths.items() if path is not None and not Path(path).exists()}
+    source = saved.planner.source
+    moved = {"planner.source"} if source is not None and not source.exists() else set()
     if changed := [name for name in changed_options(config, saved) if name not in FREE | moved]:
         raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
 

@@ -25,7 +25,7 @@ ASKED, FOUND = "cell.json", "result.json"
 # evaluation seeds of a training seed lie so far from the next one's: rollouts that differ in nothing but the training
 # would count as 180 where they are hardly more than 60
 NOISE_STEP = 1000
-_MAY_CHANGE = ("out", "planner.source", "run.plugins")  # a folder may be moved, plugins may be added
+_MAY_CHANGE = ("dataset", "out", "planner.source", "run.plugins")  # a folder may be moved, plugins may be added
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def run_cell(folder: str | Path) -> None:
     if not (folder / "summary.json").exists():
         train(config)
     summary, trained = run.read_json("summary.json"), time.perf_counter()
-    result = evaluate(folder, evaluation)
+    result = evaluate(folder, replace(evaluation, dataset=config.dataset))  # where the data are now
     seconds = {"train_seconds": trained - began, "eval_seconds": time.perf_counter() - trained}
     run.write_json(FOUND, {"row": _found_in(summary, result) | seconds, "outcomes": _outcomes_of(result)})
 

@@ -118,6 +118,8 @@ def _together(study: Study) -> Study:
     if earlier is None:
         return study
     lists: dict[str, Any] = {name: union(vars(earlier)[name], vars(study)[name]) for name in _LISTS}
+    others = [text for text in earlier.datasets if text.partition("=")[0] not in study.tasks]
+    lists["datasets"] = union(others, study.datasets)  # where each is now
     first_seed_only = tuple(level for level in study.first_seed_only if level in earlier.first_seed_only)
     return replace(study, **lists, seeds=max(study.seeds, earlier.seeds), first_seed_only=first_seed_only)
 
@@ -133,12 +135,12 @@ def _check_folder(study: Study) -> None:
         return
     changed = changed_options(earlier, study)
     told = [f"{name} ({attrgetter(name)(earlier)})" for name in changed if name not in _MAY_CHANGE]
-    for name, before, after in (
-        ("datasets", earlier.given_dataset, study.given_dataset),
-        ("planners", earlier.given_planner, study.given_planner),
-    ):
-        if any(before(task) != after(task) for task in {*earlier.tasks} & {*study.tasks}):
-            told.append(f"{name} ({', '.join(vars(earlier)[name])})")
+    both = {*earlier.tasks} & {*study.tasks}
+    # whether a data set that was named holds the same, wherever it lies, says its checksum
+    if any((earlier.given_dataset(task) is None) != (study.given_dataset(task) is None) for task in both):
+        told.append(f"datasets ({', '.join(earlier.datasets)})")
+    if any(earlier.given_planner(task) != study.given_planner(task) for task in both):
+        told.append(f"planners ({', '.join(earlier.planners)})")
     if told:
         raise RunDirectoryError(f"{path} holds a study with another {', '.join(told)}; choose another --out")
 
