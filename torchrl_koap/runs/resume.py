@@ -53,6 +53,7 @@ def check_resume(run: RunDirectory, config: TrainConfig) -> None:
 def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
     """Refuses to go on with other demonstrations, or another version of this package, than a run was begun with.
 
+    Demonstrations are other ones, too, where the task that they hold says otherwise what the same numbers are.
     ``content`` is what ``config.json`` is to hold, ``data`` and ``versions`` included.
     """
     if not (run.path / "config.json").exists():
@@ -65,6 +66,12 @@ def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
         raise RunDirectoryError(
             f"{run.path} was started with other demonstrations than {content['dataset']} holds now ({sizes}); bring the"
             " earlier ones back, or choose another --out"
+        )
+    meant, means = earlier.get("task_definition") or {}, content.get("task_definition") or {}
+    if changed := [name for name in means if meant.get(name, means[name]) != means[name]]:
+        raise RunDirectoryError(
+            f"{run.path} was started when {content['dataset']} said otherwise what its columns are"
+            f" ({', '.join(changed)}); convert it again as it was, or choose another --out"
         )
     then, here = earlier.get("versions") or {}, content["versions"]
     if then.get("torchrl_koap", here["torchrl_koap"]) != here["torchrl_koap"]:

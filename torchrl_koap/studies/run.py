@@ -78,6 +78,7 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         _check_labels(study, cells, name, data)
         given = study.given_dataset(name)
         facts[name] = {"dataset": given, "data": given and fingerprint(data), "versions": versions()}
+        facts[name]["task_definition"] = given and study.task(name).definition()
         check_data(_begun(study, name), facts[name])
     with root.locked("koap curve", "lock"):
         _check_folder(study)  # another one may have finished here in the meantime

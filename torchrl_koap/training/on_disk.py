@@ -96,9 +96,9 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         _check_networks(task, config)
         used, held_out, report = _read_data(task, config, planner_only)
         content = to_json(config) | {"data": fingerprint(used), "versions": versions()}
-        check_data(run, content)
         if (definition := task.definition()) is not None:
             content["task_definition"] = definition
+        check_data(run, content)
         content |= held_out_facts(used, held_out)
         if not planner_only:
             check_lengths(task, config, used)
