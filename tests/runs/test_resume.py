@@ -4,6 +4,7 @@
 from dataclasses import replace
 
 import pytest
+from torchrl._utils import logger
 
 from torchrl_koap import LabelConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.runs.config_files import to_json, versions
@@ -72,3 +73,12 @@ def test_other_data_and_versions_are_refused(run, caplog):
     with pytest.raises(RunDirectoryError, match="started with torchrl_koap .*, this is 9"):
         check_data(run, content | {"versions": content["versions"] | {"torchrl_koap": "9"}})
     check_data(run, content | {"versions": content["versions"] | {"torch": "9"}})  # a warning is enough
+
+
+def test_code_that_changed_in_a_checkout_is_told(run, caplog, monkeypatch):
+    content = run.read_json("config.json")
+    monkeypatch.setattr(logger, "propagate", True)
+    check_data(run, content)
+    assert not caplog.text
+    check_data(run, content | {"versions": content["versions"] | {"code": "f00"}})
+    assert f"started with code {content['versions']['code']} (now f00): its results may differ" in caplog.text

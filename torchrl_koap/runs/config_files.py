@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -50,8 +51,18 @@ def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of Python and of the packages that results depend on."""
-    return {"python": platform.python_version()} | {name: version_of(name) for name in _PACKAGES}
+    """Returns the versions of Python and of the packages that results depend on, and a checksum of our own code."""
+    known = {"python": platform.python_version(), "code": code_checksum()}
+    return known | {name: version_of(name) for name in _PACKAGES}
+
+
+@functools.cache
+def code_checksum() -> str:
+    """Computes the checksum of the modules of this package, which change in a checkout without another version."""
+    digest, root = hashlib.sha256(), Path(__file__).resolve().parents[1]
+    for file in sorted(root.rglob("*.py")):
+        digest.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 @functools.cache

@@ -81,4 +81,4 @@ def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
         )
     others = [f"{name} {then[name]} (now {here[name]})" for name in here if then.get(name, here[name]) != here[name]]
     if others:
-        logger.warning("%s was started with %s: the last bits of its weights may differ", run.path, ", ".join(others))
+        logger.warning("%s was started with %s: its results may differ from a whole run's", run.path, ", ".join(others))

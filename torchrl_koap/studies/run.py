@@ -87,7 +87,8 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         whole = _together(study)
         root.write_json(_FILE, to_json(replace(whole, out=Path())))
         for name, content in facts.items():
-            _begun(study, name).write_json("config.json", content)
+            if not (_begun(study, name).path / "config.json").exists():
+                _begun(study, name).write_json("config.json", content)
         asked = set(cells)
         folders = {cell: study.out / cell.folder for cell in whole.cells() if cell not in asked}
         earlier = [cell for cell, folder in folders.items() if (folder / "log.txt").exists() or folder.is_file()]

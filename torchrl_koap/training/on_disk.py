@@ -107,7 +107,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             held.enter_context(run.locked("koap train"))
             check_resume(run, config)  # another one may have begun here in the meantime
         if (run.path / "config.json").exists():  # what it was begun with says what it is; going on leaves options out
-            command = run.read_json("config.json").get("command") or command
+            begun = run.read_json("config.json")
+            command, content["versions"] = begun.get("command") or command, begun.get("versions") or versions()
         # not before the data are known to be good: a wrong call leaves nothing
         run.write_json("config.json", content | ({"command": command} if command else {}))
         covers, short = plan_coverage(used, task.control_hz)
