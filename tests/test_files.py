@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from safetensors import SafetensorError
 
 from torchrl_koap.files import DataError, LockedError, one_at_a_time, replacing_file, replacing_folder
 
@@ -42,6 +43,9 @@ def test_a_file_that_cannot_be_written_leaves_the_earlier_one(tmp_path):
         with replacing_file(path) as aside:
             aside.write_text("half of it")
             raise OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(OSError, match="a could not be written: .*no room; what was there before is kept"):
+        with replacing_file(path) as aside:
+            raise SafetensorError("no room")  # of a full disk, too
     assert path.read_text() == "old" and list(path.parent.iterdir()) == [path]
     (tmp_path / "plain").touch()
     assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)

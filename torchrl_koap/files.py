@@ -21,6 +21,7 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import filelock
+from safetensors import SafetensorError
 
 _NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 _UNIONS = (Union, UnionType)
@@ -156,6 +157,8 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
         os.replace(aside, path)
     except BaseException as error:
         aside.unlink(missing_ok=True)
+        if isinstance(error, SafetensorError):  # it has no errno
+            error = OSError(errno.EIO, str(error))
         if not isinstance(error, OSError) or error.errno not in _NO_PLACE:
             raise
         kept = "what was there before is kept" if path.exists() else "nothing of it is left"

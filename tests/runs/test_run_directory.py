@@ -81,6 +81,15 @@ def test_a_folder_that_takes_no_files_is_refused_before_there_are_results(run, m
         writable_folder(run.path)
 
 
+def test_a_row_for_which_there_is_no_room_is_told_with_its_file(run, monkeypatch):
+    def full(*rest):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("csv.DictWriter.writerow", full)
+    with pytest.raises(OSError, match="metrics.csv could not be written: No space left"):
+        run.log("planner", 200, {"loss_planner": 0.2})
+
+
 def test_numbers_that_json_does_not_know_become_null(run):
     run.write_json("summary.json", {"error": float("inf"), "rows": [{"x": float("nan")}, (1.5, -float("inf"))]})
     assert run.read_json("summary.json") == {"error": None, "rows": [{"x": None}, [1.5, None]]}

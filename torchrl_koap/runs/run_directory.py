@@ -80,8 +80,11 @@ class RunDirectory:
         if new:
             self._write_metrics([*columns, *new], self.read_metrics())
             columns += new
-        with path.open("a", newline="") as file:
-            csv.DictWriter(file, columns).writerow(row)
+        try:
+            with path.open("a", newline="") as file:
+                csv.DictWriter(file, columns).writerow(row)
+        except OSError as error:  # of a full disk it does not say the file
+            raise OSError(error.errno, f"{path} could not be written: {error.strerror}") from error
 
     def _columns(self) -> list[str]:
         path = self.path / "metrics.csv"

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
@@ -64,12 +63,9 @@ def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping
     """Writes tensors by name, and facts of plain JSON types, to one safetensors file, aside and renamed."""
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing_file(path) as aside:
-        try:
-            # one entry alone: of several the order in the file would be another one every time
-            facts = dict(about or {})
-            save_file(tensors, aside, metadata={"about": json.dumps(facts | {_SHA256: _digest(tensors, facts)})})
-        except SafetensorError as error:  # it has no errno
-            raise OSError(errno.EIO, str(error)) from error
+        # one entry alone: of several the order in the file would be another one every time
+        facts = dict(about or {})
+        save_file(tensors, aside, metadata={"about": json.dumps(facts | {_SHA256: _digest(tensors, facts)})})
 
 
 def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
