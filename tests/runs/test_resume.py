@@ -29,9 +29,11 @@ def run(tmp_path):
 
 
 def test_what_is_left_out_is_as_it_was(run):
-    config = begun_with(run, TrainConfig(out="elsewhere", run=RESUME))
-    assert config == replace(SAVED, out=config.out, run=replace(SAVED.run, resume=True))
-    asked = begun_with(run, TrainConfig(out="run", labels=LabelConfig(count=3), run=RESUME))
+    config = begun_with(run, TrainConfig(dataset=".", out="elsewhere", run=RESUME))
+    assert config == replace(SAVED, dataset=".", out=config.out, run=replace(SAVED.run, resume=True))
+    with pytest.raises(RunDirectoryError, match="'/no/longer/there' of .*run is not there .* with --dataset"):
+        begun_with(run, TrainConfig(out="run", run=RESUME))
+    asked = begun_with(run, TrainConfig(dataset=".", out="run", labels=LabelConfig(count=3), run=RESUME))
     assert asked.labels == LabelConfig(count=3) and asked.planner.steps == 7
     fresh = TrainConfig(out="run")
     assert begun_with(run, fresh) is fresh

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from torchrl._utils import logger
 
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import changed_options, fill_in, read_config
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, no_data
 
 # with which a run may be resumed differently; with other threads sums are rounded differently. Demonstrations may lie
 # elsewhere: their checksum says whether they are the same
@@ -27,6 +28,8 @@ def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
     if not (asked.run.resume and begun):
         return asked
     saved = read_config(run)
+    if asked.dataset is None and saved.dataset is not None and not Path(saved.dataset).exists():
+        raise no_data(saved.dataset, run.path)
     if any(vars(asked.labels)[name] for name in _ONE_OF):
         saved = replace(saved, labels=replace(saved.labels, fraction=None, count=None, episodes=()))
     return fill_in(asked, saved)

@@ -191,6 +191,14 @@ def find_run(name: str | Path) -> Path:
     return lookup(folders, name.removeprefix(PREFIX), "pretrained policy")
 
 
+def no_data(where: str | None, run: str | Path | None) -> RunDirectoryError:
+    """Makes the error for demonstrations of a run that are not where it says."""
+    return RunDirectoryError(
+        f"the data set {where!r} of {run} is not there (moved, or named relative to another working directory?): say"
+        " where it is with --dataset"
+    )
+
+
 def copy_run(source: str | Path, target: str | Path) -> Path:
     """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run."""
     source, target = Path(source), Path(target)

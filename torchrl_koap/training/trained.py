@@ -22,7 +22,7 @@ from torchrl_koap.modules.execution.followers import Follower
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
 from torchrl_koap.runs.plugins import load_plugins
-from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryError, find_run
+from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryError, find_run, no_data
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
@@ -221,10 +221,7 @@ class Trained:
         """
         where = dataset or self.config.dataset
         if where is None or not Path(where).is_dir() and find_format(where) is None:
-            raise RunDirectoryError(
-                f"the data set {where!r} of {self.folder} is not there (moved, or named relative to another working"
-                " directory?): say where it is with --dataset"
-            )
+            raise no_data(where, self.folder)
         return open_dataset(where, task=self.task)[0]
 
     def names(self, data: TensorDictBase, dataset: str | None = None) -> dict[int, str]:
