@@ -81,6 +81,13 @@ def test_a_folder_that_takes_no_files_is_refused_before_there_are_results(run, m
         writable_folder(run.path)
 
 
+def test_the_time_of_a_phase_is_that_of_all_its_calls(tmp_path):
+    run = RunDirectory(tmp_path)
+    for phase, step, rate in (("planner", 100, 50), ("planner", 300, 20), ("controller", 50, 100)):
+        run.log(phase, step, {"iterations_per_second": rate})
+    assert run.seconds() == {"planner": 12.0, "controller": 0.5}
+
+
 def test_a_row_for_which_there_is_no_room_is_told_with_its_file(run, monkeypatch):
     def full(*rest):
         raise OSError(errno.ENOSPC, "No space left on device")

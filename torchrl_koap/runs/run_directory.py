@@ -127,6 +127,16 @@ class RunDirectory:
         values = {key: float(value) for key, value in rows[-1].items() if value and key not in ("phase", "step")}
         return values | {"updates": int(rows[-1]["step"])}
 
+    def seconds(self) -> dict[str, float]:
+        """The time that the updates of each phase took, by its rows, those of interrupted calls included."""
+        took, done = dict[str, float](), dict[str, int]()
+        for row in self.read_metrics():
+            phase, step = row["phase"], int(row["step"])
+            rate = float(row.get("iterations_per_second") or "inf")
+            took[phase] = took.get(phase, 0.0) + (step - done.get(phase, 0)) / rate
+            done[phase] = step
+        return took
+
     def rewind_metrics(self, phase: str, step: int) -> None:
         """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there."""
         kept = takewhile(lambda row: row["phase"] != phase or int(row["step"]) <= step, self.read_metrics())

@@ -85,9 +85,9 @@ def run_cell(folder: str | Path) -> None:
         return
     if not (folder / "summary.json").exists():
         train(config)
-    summary, trained = run.read_json("summary.json"), time.perf_counter()
+    summary, began = run.read_json("summary.json"), time.perf_counter()
     result = evaluate(folder, replace(evaluation, dataset=config.dataset))  # where the data are now
-    seconds = {"train_seconds": trained - began, "eval_seconds": time.perf_counter() - trained}
+    seconds = {"train_seconds": sum(summary["train_seconds"].values()), "eval_seconds": time.perf_counter() - began}
     run.write_json(FOUND, {"row": _found_in(summary, result) | seconds, "outcomes": _outcomes_of(result)})
 
 

@@ -131,13 +131,17 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             controller, results = learn_controller(task, config, data, loop)
             facts = facts_of("controller", task, config)
             save_tensors(run.path / "controller.safetensors", controller.state_dict(), facts)
+        seconds = {"planner": planned - began, "controller": time.perf_counter() - planned}
+        updating = run.seconds()  # of a run that was resumed, this call knows the end alone
+        seconds["planner"] = max(seconds["planner"], updating.pop("planner", 0.0))
+        seconds["controller"] = max(seconds["controller"], sum(updating.values()))
         summary = {
             "labels": asdict(report),
             "plan_covers": covers,
             "trajectories_used": len(data["episode"].unique()),
             "planner_parameters": 0 if planner is None else sum(p.numel() for p in planner.parameters()),
             "controller_parameters": sum(p.numel() for p in controller.parameters()),
-            "train_seconds": {"planner": planned - began, "controller": time.perf_counter() - planned},
+            "train_seconds": seconds,
             "planner": losses,
             **results,
         }
