@@ -258,6 +258,22 @@ def test_ctrl_c_within_a_loss_is_ctrl_c(kind):
         torch.testing.assert_close(value, before[key], equal_nan=True)
 
 
+def test_an_interrupt_behind_several_errors_is_one():
+    parts = Planner()
+
+    def sample():
+        try:
+            raise Interrupt
+        except Interrupt:
+            try:
+                raise ValueError("met on the way out")
+            except ValueError:
+                raise RuntimeError("Converting a tensordict to boolean value is not permitted")  # noqa: B904
+
+    with pytest.raises(Interrupt):
+        train_phase("x", parts.loss, sample, num_steps=1, learning_rate=1e-3)
+
+
 # ---- gradients far longer than those before
 
 

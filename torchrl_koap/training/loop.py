@@ -130,10 +130,11 @@ def train_phase(
             terms = update(sample())
 
         done = step + 1
-        if target_update is not None and (done % AVERAGE_EVERY == 0 or done == num_steps):
-            target_update.step()
         scored = best is not None and (done % best.every == 0 or done == num_steps)
-        scores = {} if best is None else best.check(done) if scored else best.kept()
+        with _interrupts_let_through():
+            if target_update is not None and (done % AVERAGE_EVERY == 0 or done == num_steps):
+                target_update.step()
+            scores = {} if best is None else best.check(done) if scored else best.kept()
         if scored or done % log_every == 0 or done == num_steps:
             values = {key: value.item() for key, value in terms.items()}
             bad = [key for key, value in values.items() if not math.isfinite(value)]
@@ -189,8 +190,11 @@ def _interrupts_let_through() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if isinstance(error.__context__, KeyboardInterrupt):
-            raise error.__context__ from None
+        behind: BaseException | None = error  # a second signal is met while the first one is
+        while behind is not None and not isinstance(behind, KeyboardInterrupt):
+            behind = behind.__context__
+        if behind is not None:
+            raise behind from None
         raise
 
 
