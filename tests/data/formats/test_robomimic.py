@@ -1,10 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """HDF5 files in robomimic's layout."""
 
+import io
 import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from torchrl_koap.data.formats.robomimic import read_robomimic
 from torchrl_koap.files import DataError
@@ -35,6 +37,27 @@ def test_demonstrations_in_the_order_of_their_numbers(file):
     assert not recordings.skipped and [len(clip) for clip in recordings.cameras["camera"]] == [4, 5]
     assert recordings.num_labels == 3 and np.isnan(recordings.actions[1]).all()
     np.testing.assert_array_equal(recordings.states[0][:, 3], np.arange(4.0))
+
+
+@pytest.mark.parametrize("form", ["padded", "of their own lengths"])
+def test_frames_that_are_compressed_are_a_camera_and_no_columns(form, file):
+    frame = np.kron([[0, 255], [255, 0]], np.ones((8, 8)))[..., None].repeat(3, -1).astype(np.uint8)
+    content = io.BytesIO()
+    Image.fromarray(frame).save(content, "PNG" if form == "padded" else "JPEG", quality=95)
+    content = np.frombuffer(content.getvalue(), np.uint8)
+    with h5py.File(file, "a") as stream:
+        for demo in stream["data"].values():
+            length = len(demo["obs/width"])
+            if form == "padded":
+                demo["obs/top"] = np.pad(content, (0, 9))[None].repeat(length, 0)
+            else:
+                rows = demo["obs"].create_dataset("top", (length,), h5py.vlen_dtype(np.uint8))
+                for row in range(length):
+                    rows[row] = content
+    recordings = read_robomimic(file)
+    assert recordings.state_names == ("eef_0", "eef_1", "eef_2", "width")
+    seen = np.stack(list(recordings.cameras["top"][1].read()))
+    assert seen.shape == (5, 16, 16, 3) and np.abs(seen.astype(int) - frame).max() < 16
 
 
 def test_chosen_observations(file):

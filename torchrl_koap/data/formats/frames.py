@@ -8,7 +8,8 @@
     recordings/run_000/top.npy          uint8 [T, H, W, 3]
     recordings/run_000/top_times.npy    optional, in s on the clock of the rows: a row takes the nearest frame
 
-HDF5 files hold ``[T, H, W, 3]`` beside the numbers, LeRobot data sets pictures in parquet, or videos (extra ``video``).
+HDF5 files hold ``[T, H, W, 3]``, or a JPEG or PNG file per row, beside the numbers; LeRobot data sets pictures in
+parquet, or videos (extra ``video``).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from torchrl_koap.files import read_bytes, some
 from torchrl_koap.lookup import import_extra
 
 PICTURES = (".png", ".jpg", ".jpeg")
+MAGIC = (b"\xff\xd8\xff", b"\x89PNG")  # how the content of such a file begins
 TIMES = "_times.npy"
 LATE = 1.5  # usual steps of a camera's clock that a frame may lie away from its row
 _COLOURS = {1: "greyscale", 2: "greyscale with alpha", 4: "RGBA"}
@@ -138,7 +140,8 @@ def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
     with h5py.File(clip.file, "r") as stream:
         frames, behind = stream[clip.entry], clip.entry.replace("/obs/", "/next_obs/")
         for number in clip.numbers:  # the one behind the last is that of the observation that followed
-            yield frames[number] if number < len(frames) else stream[behind][-1]
+            frame = frames[number] if number < len(frames) else stream[behind][-1]
+            yield frame if frames.ndim == 4 else _decode(np.asarray(frame).tobytes(), number)
 
 
 def _parquet(clip: Clip) -> Iterator[np.ndarray]:

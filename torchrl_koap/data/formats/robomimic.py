@@ -5,6 +5,7 @@
 
     data                     attribute env_args (JSON; env_kwargs/control_freq is the rate)
     data/demo_0/obs/<name>   [T, d] or [T] numbers, side by side the state; frames of a camera [T, H, W, 3]
+                             or JPEG or PNG files [T, bytes]
     data/demo_0/actions      [T, a]; may be missing
     data/demo_0/next_obs     optional; its last row is the frame behind the last action, the others repeat obs
     data/demo_0/dones        optional, as time stamps, counters and numbers of episodes: [T] beside obs
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.columns import Piece, assemble
-from torchrl_koap.data.formats.frames import Clip
+from torchrl_koap.data.formats.frames import MAGIC, Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, option, refuse
@@ -122,7 +123,8 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
                 states = states if beside is None else {entry: beside} | states
     file, cameras = str(Path(group.file.filename).resolve()), {}
     for film, part in group["obs"].items():
-        if len(_shape(part)) == 4:  # where nobody kept the frame behind the last one, that one is taken again
+        if len(_shape(part)) == 4 or _is_compressed(part):
+            # where nobody kept the frame behind the last one, that one is taken again
             last = (len(part) - (film not in following),) if behind else ()
             cameras[film] = Clip(file, (*range(len(part)), *last), f"data/{name}/obs/{film}")
     actions = group.get("actions")
@@ -154,7 +156,14 @@ def _number(name: str) -> tuple[int, str]:
 
 
 def _is_table(entry: Any) -> bool:
-    return len(_shape(entry)) in (1, 2) and entry.dtype.kind in "fiub"
+    return len(_shape(entry)) in (1, 2) and entry.dtype.kind in "fiub" and not _is_compressed(entry)
+
+
+def _is_compressed(entry: Any) -> bool:
+    """Whether every row is the content of a picture's file."""
+    if len(_shape(entry)) not in (1, 2) or not len(entry) or entry.dtype.kind not in "uOSV":
+        return False
+    return np.asarray(entry[0]).tobytes().startswith(MAGIC)
 
 
 def _control_frequency(text: Any) -> float | None:
