@@ -115,8 +115,8 @@ class Convert(Command):
     Example: `koap convert recordings --out arm --control-hz 30`
 
     Attributes:
-        source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout,
-            minari:NAME, or (with --to) a data set of this library.
+        source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, HDF5 in the layout of robomimic or
+            ALOHA (a file or a folder), minari:NAME, or (with --to) a data set of this library.
         out: folder to write.
         to: another format than this library's: "npz" or "lerobot" (3.0).
         name: name of the task (default: that of the folder).

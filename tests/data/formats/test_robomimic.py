@@ -3,11 +3,13 @@
 
 import io
 import json
+import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from torchrl_koap.data.formats import read_recordings
 from torchrl_koap.data.formats.robomimic import read_robomimic
 from torchrl_koap.files import DataError
 
@@ -58,6 +60,35 @@ def test_frames_that_are_compressed_are_a_camera_and_no_columns(form, file):
     assert recordings.state_names == ("eef_0", "eef_1", "eef_2", "width")
     seen = np.stack(list(recordings.cameras["top"][1].read()))
     assert seen.shape == (5, 16, 16, 3) and np.abs(seen.astype(int) - frame).max() < 16
+
+
+def test_a_folder_in_the_layout_of_aloha(tmp_path):
+    for number, length in ((10, 5), (2, 4)):
+        with h5py.File(tmp_path / f"episode_{number}.hdf5", "w") as stream:
+            stream["observations/qpos"] = np.full((length, 2), float(number))
+            stream["observations/qvel"] = np.zeros((length, 2))
+            stream["observations/images/top"] = np.full((length, 4, 6, 3), number, np.uint8)
+            stream["base_action"] = np.zeros((length, 2))
+            if number == 2:
+                stream["action"] = np.ones((length, 2))
+    recordings = read_recordings(tmp_path, observations=["qpos"], control_hz=50)
+    assert recordings.sources == ("episode_2", "episode_10") and recordings.state_names == ("qpos_0", "qpos_1")
+    assert recordings.num_labels == 3 and np.isnan(recordings.actions[1]).all()
+    assert recordings.skipped == ("obs/qvel", "base_action")
+    frames = list(recordings.cameras["top"][1].read())
+    assert len(frames) == 5 and frames[0].shape == (4, 6, 3) and frames[0].max() == 10
+    assert read_recordings(tmp_path / "episode_2.hdf5", control_hz=50).sources == ("episode_2",)
+
+
+def test_a_folder_of_files_that_agree_on_their_rate(file, tmp_path):
+    (tmp_path / "more").mkdir()
+    for name in ("a_1.hdf5", "a_2.hdf5"):
+        shutil.copy(file, tmp_path / "more" / name)
+    assert read_robomimic(tmp_path / "more").sources == ("a_1/demo_2", "a_1/demo_10", "a_2/demo_2", "a_2/demo_10")
+    with h5py.File(tmp_path / "more" / "a_2.hdf5", "a") as stream:
+        stream["data"].attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": 50}})
+    with pytest.raises(DataError, match="other rates: a_1.hdf5 20.0, a_2.hdf5 50.0"):
+        read_robomimic(tmp_path / "more")
 
 
 def test_chosen_observations(file):

@@ -17,7 +17,7 @@ from torchrl_koap.data.formats.lerobot import INFO, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
-from torchrl_koap.data.formats.robomimic import read_robomimic
+from torchrl_koap.data.formats.robomimic import hdf5_files, read_robomimic
 from torchrl_koap.data.formats.tables import read_tables, table_files
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
 from torchrl_koap.data.ted import load_ted, read_about, source_names, stored_folder
@@ -72,7 +72,6 @@ def _read_stored(
 _ELSEWHERE = {
     "*.npy": "it holds *.npy files: save each recording with np.savez(file, states=..., actions=...)",
     "*.tsv": "it holds *.tsv files: call them *.csv",
-    **dict.fromkeys(("*.h5", "*.hdf5"), "it holds HDF5 files: name one of them"),
     **dict.fromkeys(
         (f"{below}*.{kind}" for below in ("*/", "*/*/") for kind in ("npz", "csv", "parquet")),
         "folders below it hold tables: name one of them",
@@ -97,8 +96,8 @@ FORMATS = {
         ("resample", "action_kind"),
     ),
     "robomimic": Format(
-        "an HDF5 file in robomimic's layout (*.hdf5)",
-        lambda source: Path(source).suffix.lower() in (".hdf5", ".h5") and Path(source).is_file(),
+        "an HDF5 file in robomimic's layout or ALOHA's, or a folder of them (*.hdf5)",
+        lambda source: bool(hdf5_files(source)) and not table_files(source),
         read_robomimic,
         ("observations", *COMMON),
     ),
@@ -135,8 +134,8 @@ def read_recordings(
     """Reads recordings of any robot; where they lie decides which of the :data:`FORMATS` they are in.
 
     Args:
-        source (str or Path): a folder of tables, a LeRobot data set, an HDF5 file, ``minari:NAME``, or a data set of
-            this library.
+        source (str or Path): a folder of tables, a LeRobot data set, an HDF5 file or a folder of them, ``minari:NAME``,
+            or a data set of this library.
 
     Keyword Args:
         control_hz (float, optional): frames per second; time stamps are not looked at then. Default: as the source

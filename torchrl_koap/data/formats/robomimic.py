@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings from one HDF5 file in robomimic's layout.
+"""Recordings from HDF5 files in robomimic's layout, or in ALOHA's.
 
 ::
 
@@ -9,6 +9,10 @@
     data/demo_0/actions      [T, a]; may be missing
     data/demo_0/next_obs     optional; its last row is the frame behind the last action, the others repeat obs
     data/demo_0/dones        optional, as time stamps, counters and numbers of episodes: [T] beside obs
+
+    observations/<name>      [T, d] in ALOHA's layout, a demonstration per file
+    observations/images/<name>   frames of a camera
+    action                   [T, a]; may be missing
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,28 +38,45 @@ BESIDE = ("episode", "frame", "start", "end")  # what entries beside the observa
 _SAME, _ROUNDED = 1e-3, 1e-6  # share of a column's range, and of its numbers, that is rounding
 
 
+def hdf5_files(source: str | Path) -> list[Path]:
+    """Finds the HDF5 files in a folder, in the order of their numbers; one that is given itself is the only one."""
+    beside = sorted(Path(source).glob("[!.]*"), key=lambda path: _number(path.stem))
+    found = [Path(source)] if Path(source).is_file() else beside
+    return [path for path in found if path.suffix.lower() in (".hdf5", ".h5") and path.is_file()]
+
+
 def read_robomimic(
     file: str | Path, *, observations: Sequence[str] | None = None, drop_columns: Sequence[str] = (), **options: Any
 ) -> Recordings:
-    """Reads trajectories from an HDF5 file, which declares its rate by ``control_freq`` of ``env_args``.
+    """Reads trajectories from an HDF5 file, or a folder of them.
 
-    ``observations`` are the entries of ``obs`` that make up the state, in that order. Default: all that are no images,
-    by name. ``next_obs`` is one of the ``drop_columns``, too. The options are those of
+    Robomimic's declare their rate by ``control_freq`` of ``env_args``. ``observations`` are the entries of ``obs`` that
+    make up the state, in that order. Default: all that are no images, by name. ``next_obs`` is one of the
+    ``drop_columns``, too. The options are those of
     :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     h5py = import_extra("h5py", "hdf5", "HDF5 files are read with")
-    file = Path(file)
-    if not file.is_file():
-        raise FileNotFoundError(f"{file} is no file")
-    try:
-        with h5py.File(file, "r") as stream:
-            pieces, declared, skipped = _read(stream, file, observations, use_next=NEXT not in drop_columns)
-    except OSError as error:
-        raise DataError(file, "it is no HDF5 file, or damaged") from error
+    files = hdf5_files(file)
+    if not files:
+        raise FileNotFoundError(f"{file} is no HDF5 file, and no folder of them")
+    pieces, rates, skipped = [], {}, []
+    for each in files:
+        try:
+            with h5py.File(each, "r") as stream:
+                found, rates[each], unread = _read(stream, each, observations, use_next=NEXT not in drop_columns)
+        except OSError as error:
+            raise DataError(each, "it is no HDF5 file, or damaged") from error
+        several = len(files) > 1 and len(found) > 1
+        pieces += [replace(piece, name=f"{each.stem}/{piece.name}") if several else piece for piece in found]
+        skipped += unread
+    if len({*rates.values()}) > 1:
+        raise DataError(
+            file, f"its files declare other rates: {', '.join(f'{each.name} {hz}' for each, hz in rates.items())}"
+        )
     return assemble(
         pieces,
         str(file),
-        declared_hz=declared,
+        declared_hz=next(iter(rates.values())),
         skipped=skipped,
         drop_columns=[name for name in drop_columns if name != NEXT],
         no_rate="env_args holds no control_freq",
@@ -66,10 +88,12 @@ def _read(
     stream: Any, file: Path, observations: Sequence[str] | None, *, use_next: bool
 ) -> tuple[list[Piece], float | None, list[str]]:
     """Demonstrations, the rate that is declared, and what is not read."""
-    if not isinstance(stream.get("data"), Mapping):  # as groups are
-        wanted = "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions)"
+    data = stream.get("data") if "observations" not in stream else {file.stem: _aloha(stream)}
+    if not isinstance(data, Mapping):  # as groups are
+        wanted = (
+            "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions), or ALOHA's (observations, action)"
+        )
         raise DataError(file, f"no group 'data', {wanted}; the file holds {', '.join(stream) or 'nothing'}")
-    data = stream["data"]
     demos = sorted((name for name in data if isinstance(data.get(name), Mapping)), key=_number)
     lacking = [name for name in demos if not isinstance(data[name].get("obs"), Mapping)]
     faults = [(f"data/{name}", "it has no group 'obs'") for name in lacking]
@@ -90,8 +114,16 @@ def _read(
     skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - followed) else []
     skipped += [f"data/{name} (no group)" for name in data if name not in demos]
     said = {"mask": "mask (every demonstration is read)"}
-    skipped += [said.get(name, name) for name in stream if name != "data"]
-    return pieces, _control_frequency(data.attrs.get("env_args")), skipped
+    skipped += [said.get(name, name) for name in stream if "data" in stream and name != "data"]
+    return pieces, _control_frequency(getattr(data, "attrs", {}).get("env_args")), skipped
+
+
+def _aloha(stream: Any) -> dict[str, Any]:
+    """The one demonstration of a file in ALOHA's layout, as one in robomimic's."""
+    beside, observed = {**stream}, {**stream["observations"]}
+    observed |= observed.pop("images", {})
+    del beside["observations"]
+    return {"obs": observed} | {"actions" if name == "action" else name: part for name, part in beside.items()}
 
 
 def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]], *, behind: bool) -> Piece:
@@ -121,12 +153,13 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
             if single and (kind == "clock" or kind in BESIDE and len(part) == frames):
                 beside = as_numbers(entry, part[()].ravel())
                 states = states if beside is None else {entry: beside} | states
-    file, cameras = str(Path(group.file.filename).resolve()), {}
+    cameras = {}
     for film, part in group["obs"].items():
         if len(_shape(part)) == 4 or _is_compressed(part):
             # where nobody kept the frame behind the last one, that one is taken again
             last = (len(part) - (film not in following),) if behind else ()
-            cameras[film] = Clip(file, (*range(len(part)), *last), f"data/{name}/obs/{film}")
+            file = str(Path(part.file.filename).resolve())
+            cameras[film] = Clip(file, (*range(len(part)), *last), part.name.removeprefix("/"))
     actions = group.get("actions")
     if actions is not None and not _is_table(actions):
         faults.append((f"data/{name}", f"actions must be numbers [T, a], got {_shape(actions)}"))
