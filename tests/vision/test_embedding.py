@@ -49,6 +49,13 @@ def test_embeddings_are_further_columns_that_are_not_the_robot_s(tmp_path):
     torch.testing.assert_close(data["observation"][data["episode"] == 3][:, 2:7], wanted, rtol=1e-4, atol=1e-5)
 
 
+def test_pictures_unlike_those_of_other_recordings_are_named(tmp_path):
+    raw = write_filmed(tmp_path / "raw")
+    np.save(raw / "07" / "top.npy", np.zeros_like(np.load(raw / "07" / "top.npy")))
+    with pytest.warns(UserWarning, match="camera 'top': pictures of 07.npz are unlike those of the others: dark"):
+        embed(save_demonstrations(tmp_path / "own", read_recordings(raw)), tmp_path / "seen", cameras=["top"])
+
+
 @pytest.mark.parametrize("offset", [4e6, 1e8])
 def test_an_offset_of_the_numbers_beside_frames_is_subtracted_in_float64(offset, tmp_path):
     raw = write_filmed(tmp_path / "raw", cameras=("top",))

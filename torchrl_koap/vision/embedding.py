@@ -7,6 +7,7 @@ import hashlib
 import json
 import shutil
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
@@ -20,7 +21,7 @@ from torch import Tensor
 from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted
 from torchrl_koap.data.formats import Recordings
 from torchrl_koap.data.ted import stored_folder, stored_task
-from torchrl_koap.files import DataError, option, replacing_file
+from torchrl_koap.files import DataError, option, replacing_file, some
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task
 from torchrl_koap.vision.backbones import load_backbone
@@ -28,6 +29,7 @@ from torchrl_koap.vision.encoder import BATCH, CAMERAS, FrozenImageEncoder, Proj
 
 MOST = 4000  # frames that components are fitted to
 HELD_OUT = 10  # one trajectory in so many judges them
+UNLIKE = 4.0  # times the median distance from which a trajectory's pictures are unlike the others'
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,12 @@ def embed_recordings(
             done += count
             if progress is not None:
                 progress(done, total)
+        if unlike := film.unlike():
+            warnings.warn(
+                f"camera {name!r}: pictures of {some(unlike)} are unlike those of the others: dark, still, elsewhere?"
+                " if they are wrong, take these recordings out of the source and convert again",
+                stacklevel=2,
+            )
         width = task.observation[name].stop - task.observation[name].start if name in task.observation else components
         fitted = projection
         if fitted is None:
@@ -212,6 +220,13 @@ class _Film:
         """Features ``[T, F]`` of every trajectory."""
         for file in self._files:
             yield load_file(file)["features"]
+
+    def unlike(self) -> list[str]:
+        """Trajectories, of ten or more, whose mean features are far from the median of all."""
+        means = torch.stack([features.mean(0) for features in self.features()])
+        far = (means - means.median(0).values).norm(dim=1)
+        odd = torch.nonzero(far > UNLIKE * far.median()).flatten() if len(far) >= HELD_OUT else ()
+        return [self.recordings.sources[index] for index in odd]
 
     def sample(self, held_out: bool) -> Tensor:
         """Features of up to so many frames, spread evenly."""
