@@ -36,6 +36,7 @@ def test_embeddings_are_further_columns_that_are_not_the_robot_s(tmp_path):
     assert task.observation_dim == 2 + 5 + 5 and task.robot == (0, 1) and task.targets == earlier.targets
     assert task.defaults.recovery == 0 and earlier.defaults.recovery is None  # what pictures show is not shifted
     assert task.state_names[2:4] == ("top_0", "top_1") and task.state_names[-1] == "wrist_4"
+    assert task.state_units == ("", "") + ("embedding",) * 10  # errors of the joints are measured apart
     assert torch.equal(data["observation"][:, :2], before["observation"])
     assert torch.equal(data["action"], before["action"])
     columns = open_dataset(tmp_path / "seen", task=task)[0]["state"]

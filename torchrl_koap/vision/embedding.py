@@ -158,11 +158,12 @@ def _with_columns(
     """The task with the embeddings among its parts, and its observations."""
     further = {name: films[0].shape[1] for name, films in embedded.items() if name not in task.observation}
     if further:
+        units = ("embedding",) * sum(further.values())
         task = replace(
             task,
             observation_parts={**task.observation_parts, **further},
             observation_origin=task.observation_origin and task.observation_origin + (0.0,) * sum(further.values()),
-            observation_units=(task.observation_units or ("",) * task.observation_dim) + ("",) * sum(further.values()),
+            observation_units=(task.observation_units or ("",) * task.observation_dim) + units,
             state={**task.state, **dict.fromkeys(further, "plain")} if task.state else {},
             robot=task.robot or tuple(range(task.state_dim)),
             defaults=replace(task.defaults, recovery=0.0),  # pictures show the robot where it was
