@@ -229,7 +229,9 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
             held = [held[index] for index in _nearest(stamps, clock, name)]
         elif held != list(range(held[0], held[0] + len(held))):
             absent = sorted({*range(held[0], held[-1])} - {*held})
-            raise ValueError(f"camera {name!r}: frame {some(absent)} is missing")
+            raise ValueError(
+                f"camera {name!r}: frame {some(absent)} is missing: give the times of the others in {times.name}"
+            )
         found[name] = Clip(str(path.resolve()), tuple(held))
     return found
 
