@@ -19,6 +19,7 @@ ifdef HASHES
 	$(BIN)/python -m pip check
 else
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-deps $$(grep '^dm-control==' constraints.txt)  # all but labmaze
 endif
 	touch $@
 

@@ -28,8 +28,6 @@ TESTS = (
 TOOLS = ("pytest", "pytest-timeout", "hypothesis")
 EXTRAS = ("--extra", "lerobot", "--extra", "hdf5")
 SHOWN = ("torch", "torchrl", "numpy", "scipy", "mujoco", "dm-control", "gymnasium", "numba", "matplotlib")
-# dm-control asks for labmaze, which has no wheels for newer Pythons; the part that is used here does without
-OVERRIDE = "labmaze ; python_version < '3.13'\n"
 COLUMNS = ("python", "versions", "outcome", "passed", "failed", *SHOWN)
 
 
@@ -41,12 +39,11 @@ def uv(*words: object) -> subprocess.CompletedProcess[str]:
 
 def resolve(python: str, versions: str, torch: str | None, folder: Path) -> tuple[Path, dict[str, str], str]:
     """A file of versions that fit together, the versions by name, and why there is none."""
-    made, override, constraint = folder / "versions.txt", folder / "override.txt", folder / "torch.txt"
-    override.write_text(OVERRIDE)
+    made, constraint = folder / "versions.txt", folder / "torch.txt"
     constraint.write_text(f"torch=={torch}\n" if torch else "")
     done = uv(
         *("pip", "compile", "--no-build", "--no-annotate", "--no-header", "--resolution", STRATEGIES[versions]),
-        *("--python-version", python, "--override", override, "--constraint", constraint, "--output-file", made),
+        *("--python-version", python, "--constraint", constraint, "--output-file", made),
         *EXTRAS,
         "pyproject.toml",
     )
@@ -62,6 +59,7 @@ def run_tests(python: str, versions: Path, folder: Path) -> tuple[str, int, int]
         ("venv", "--quiet", "--python", python, home),
         ("pip", "install", "--quiet", "--python", home, "--no-deps", "--requirement", versions),
         ("pip", "install", "--quiet", "--python", home, *TOOLS, "--constraint", versions),
+        ("pip", "install", "--quiet", "--python", home, "--no-deps", "dm-control", "--constraint", versions),
         ("pip", "install", "--quiet", "--python", home, "--no-deps", "--editable", ROOT),
     ):
         done = uv(*words)

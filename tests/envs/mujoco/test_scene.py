@@ -1,12 +1,18 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The arm's numbers, its variants and the errors of a missing mesh package."""
 
+import importlib
 import importlib.util
+import re
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
 import pytest
+from packaging.requirements import Requirement
 
+from torchrl_koap.envs.mujoco import scene
 from torchrl_koap.envs.mujoco.kinematics import Q_REST
 from torchrl_koap.envs.mujoco.scene import compile_scene, panda
 
@@ -51,3 +57,21 @@ def test_a_missing_mesh_package_is_named(monkeypatch, tmp_path):
     specs["gymnasium_robotics"] = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
     with pytest.raises(FileNotFoundError, match="link0.stl"):
         panda()
+
+
+def test_without_dm_control_the_step_that_installs_it_is_named(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", {}.get)
+    monkeypatch.delitem(sys.modules, scene.__name__)
+    with pytest.raises(RuntimeError, match="pip install --no-deps dm-control"):
+        importlib.import_module(scene.__name__)
+
+
+def test_every_requirement_has_wheels_on_later_pythons():
+    """Labmaze, which dm-control asks for, has none: there dm-control itself must not be a requirement."""
+    text = (
+        (Path(__file__).parents[3] / "pyproject.toml").read_text().partition("dependencies = [")[2].partition("\n]")[0]
+    )
+    asked = [Requirement(each) for each in re.findall(r'^    "(.+)",$', text, re.MULTILINE)]
+    later = {each.name for each in asked if each.marker is None or each.marker.evaluate({"python_version": "3.13"})}
+    assert "torchrl" in later
+    assert not later & {"dm-control", "labmaze"}

@@ -21,6 +21,11 @@ from torchrl_koap.envs.mujoco.kinematics import TIMESTEP
 from torchrl_koap.graphics import no_graphics
 from torchrl_koap.tasks.panda_kinematics import LINKS
 
+if importlib.util.find_spec("dm_control") is None:
+    raise RuntimeError(
+        "the simulators of D3IL's tasks need dm-control, a separate step on Python 3.13 and later: pip install"
+        " --no-deps dm-control (it asks for labmaze, which has no wheels there and is not needed)"
+    )
 # Importing dm_control opens whatever OpenGL back end it finds (and fails if MUJOCO_GL names one that is not installed),
 # although building a scene needs none. A program that wants dm_control's own renderer imports it before this package.
 if "dm_control._render" in sys.modules:
