@@ -22,7 +22,7 @@ from scipy.stats import t as student
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data import controller_view, cut_windows, make_window_buffer, open_dataset
+from torchrl_koap.data import cut_windows, make_window_buffer, open_dataset
 from torchrl_koap.evaluation.active_labelling import rank_trajectories, variance_reduction
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, Normalizer
@@ -34,6 +34,7 @@ from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 from torchrl_koap.training.loop import train_phase
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller
+from torchrl_koap.training.policy_facts import controller_data
 
 CHOICES = ("a_optimal", "uncertainty", "random", "longest")
 
@@ -124,7 +125,7 @@ def main() -> None:
     set_up_torch(arguments.threads, "cpu")
     task = get_task(arguments.task)
     data = open_dataset(arguments.dataset, task=task)[0]
-    data = controller_view(data, task.controller_columns("robot"))
+    data = controller_data(task, ControllerConfig(columns="robot"), data)
     began = time.perf_counter()
     controller = train_unlabelled(data, task, arguments.preset, arguments.updates)
     steps = infer_steps(controller, data)

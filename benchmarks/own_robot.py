@@ -30,7 +30,7 @@ from torchrl_koap import (
     load_policy,
     train,
 )
-from torchrl_koap.data import controller_view, make_demonstrations, save_ted, select_state
+from torchrl_koap.data import make_demonstrations, save_ted, select_state
 from torchrl_koap.evaluation.data_errors import first_actions
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.training.closed_form import fit_closed_form
@@ -82,7 +82,7 @@ def action_errors(run: Path, states: list[np.ndarray], actions: list[np.ndarray]
     """Errors on the demonstrations whose actions were kept back, of the controller and of a ridge (rad)."""
     trained = Trained.load(run)
     every, few = (
-        controller_view(select_state(data, task.state_of), trained.columns)
+        trained.seen(select_state(data, task.state_of))
         for data, task in (
             make_demonstrations(states, part, control_hz=30, robot=range(JOINTS)) for part in (actions, _few(actions))
         )

@@ -32,16 +32,18 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import step_mdp
 
 from torchrl_koap import fit
-from torchrl_koap.data import controller_view, make_demonstrations, open_dataset, select_state
+from torchrl_koap.data import make_demonstrations, open_dataset, select_state
 from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.data_errors import first_actions
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import Execution, InverseDynamics, Normalizer, blend_plan
+from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training.closed_form import action_facts, fit_closed_form
+from torchrl_koap.training.policy_facts import controller_data
 
 RESULTS = Path(__file__).parent / "results"
 KEYS = ("dataset", "regime", "labels", "seed", "method")
@@ -70,7 +72,7 @@ Cell = tuple[str, int]  # method, number of labelled trajectories
 
 def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
     """Flat data with the robot's own columns as ``state``, and targets, but no commands, as distances from it."""
-    return controller_view(data, task.controller_columns("robot"), distances=task.distances)
+    return controller_data(task, ControllerConfig(columns="robot"), data)
 
 
 def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:

@@ -9,7 +9,6 @@ import torch
 
 from torchrl_koap.data import (
     DataError,
-    controller_view,
     make_demonstrations,
     open_dataset,
     read_recordings,
@@ -18,16 +17,18 @@ from torchrl_koap.data import (
 )
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.keys import validate
+from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training import TrainConfig
 from torchrl_koap.training.closed_form import action_facts
 from torchrl_koap.training.defaults import resolve
-from torchrl_koap.training.policy_facts import command_ranges, commanded_columns
+from torchrl_koap.training.policy_facts import command_ranges, commanded_columns, controller_data
 
 RANDOM = np.random.default_rng(0)
 STATES = [RANDOM.normal(size=(30, 4)).cumsum(0) for _ in range(3)]
 ACTIONS = [np.diff(STATES[0][:, :2], axis=0), None, None]
 NAMES = ["q1", "q2", "cup_x", "cup_y"]
+ROBOT = ControllerConfig(columns="robot")
 
 
 def test_a_folder_holds_data_and_task(tmp_path):
@@ -88,7 +89,7 @@ def test_joints_beside_a_switch_are_learnt_as_distances():
     options = {"action_kind": ("absolute", "raw"), "targets": [0], "robot": [0, 1], "control_hz": 20}
     data, task = make_demonstrations(STATES, aims, **options)
     data = select_state(data, task.state_of)
-    view = controller_view(data, task.robot, distances=task.distances)["action"][:29]
+    view = controller_data(task, ROBOT, data)["action"][:29]
     torch.testing.assert_close(view, torch.from_numpy(np.hstack([steps, opens])).float(), atol=1e-5, rtol=0)
     torch.testing.assert_close(task.action_rule(data["state"][:29], view), data["action"][:29])
 
@@ -113,7 +114,7 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
     names = {"state_names": NAMES, "robot": ["q1", "q2"]}
     folder = save_demonstrations(tmp_path / "reach", STATES, targets, control_hz=20, action_kind="absolute", **names)
     data, task = open_dataset(folder)
-    view, known = controller_view(data, task.robot, distances=task.distances), data["has_action"].squeeze(-1)
+    view, known = controller_data(task, ROBOT, data), data["has_action"].squeeze(-1)
     torch.testing.assert_close(view["action"][known], torch.from_numpy(ACTIONS[0]).float(), atol=1e-5, rtol=0)
     assert view["action"][~known].isnan().all()
     again = task.action_rule(data["state"], view["action"])

@@ -9,7 +9,7 @@ from torchrl_koap.data.replay import D3ILExperienceReplay
 from torchrl_koap.data.sources import open_dataset
 from torchrl_koap.data.symmetries import ObjectPermutation, RandomPlanarTransform
 from torchrl_koap.data.ted import load_ted, save_ted
-from torchrl_koap.data.trajectories import controller_view, extrapolate_ends, flatten_trajectories, select_state
+from torchrl_koap.data.trajectories import extrapolate_ends, flatten_trajectories, select_state
 from torchrl_koap.data.windows import WindowSampler, WindowTable, WindowUnit, cut_windows, make_window_buffer
 from torchrl_koap.files import DataError
 
@@ -24,7 +24,6 @@ __all__ = [
     "WindowSampler",
     "WindowTable",
     "WindowUnit",
-    "controller_view",
     "cut_windows",
     "extrapolate_ends",
     "flatten_trajectories",

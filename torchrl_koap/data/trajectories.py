@@ -8,10 +8,8 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
 from torchrl_koap import keys
-from torchrl_koap.tasks.action_rules import shift_actions
 
 _VELOCITY = 3  # steps whose mean is the last velocity
 
@@ -162,38 +160,6 @@ def select_state(
     if not columns or not all(0 <= column < width for column in columns):
         raise ValueError(f"state columns must be one or more of 0..{width - 1}, got {columns}")
     return data.copy().set(keys.STATE, data.get(keys.OBSERVATION)[..., columns])
-
-
-def controller_view(
-    data: TensorDictBase,
-    reads: Sequence[int] | Callable[[Tensor], Tensor],
-    *,
-    distances: Sequence[tuple[int, int]] = (),
-) -> TensorDictBase:
-    """The same data as a controller with a mask sees them.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]`` with ``state``; not changed.
-        reads (sequence of int, or callable): columns of the state to keep, or what is read of states ``[N, d]``.
-
-    Keyword Args:
-        distances (sequence of tuple): action column and state column of actions that become the distance from that
-            state. Default: actions stay as they are.
-
-    Returns:
-        TensorDictBase: a copy ``[N]`` with another ``state`` and, with distances, another ``action``.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import controller_view
-        >>> controller_view(TensorDict({"state": torch.tensor([[1.0, 2.0, 3.0]])}, [1]), (0, 2))["state"]
-        tensor([[1., 3.]])
-    """
-    state, view = data.get(keys.STATE), data.copy()
-    if distances:
-        view.set(keys.ACTION, shift_actions(view.get(keys.ACTION), state, distances, -1))
-    return view.set(keys.STATE, reads(state) if callable(reads) else state[..., list(reads)])
 
 
 def extrapolate_ends(data: TensorDictBase, frames: int) -> TensorDict:

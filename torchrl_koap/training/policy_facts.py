@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import controller_view
 from torchrl_koap.keys import ACTION, HAS_ACTION, LABEL_COMMAND, OBSERVATION, STATE
 from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.modules.windows import StateReader
 from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.method import Method
 
@@ -95,7 +95,10 @@ def state_reader(task: Task, section: ControllerConfig) -> StateReader:
 
 def controller_data(task: Task, section: ControllerConfig, data: TensorDictBase) -> TensorDictBase:
     """Flat data ``[N]`` of :func:`with_commands` as a controller sees them: what it reads, and actions as distances."""
-    return controller_view(data, state_reader(task, section), distances=task.distances)
+    state, view = data[STATE], data.copy()
+    if task.distances:
+        view.set(ACTION, shift_actions(data[ACTION], state, task.distances, -1))
+    return view.set(STATE, state_reader(task, section)(state))
 
 
 def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]:
