@@ -132,7 +132,7 @@ def test_scripted_demonstrations_are_recorded_once_and_a_call_that_finds_too_few
     assert "selects none of the" in capsys.readouterr().err.splitlines()[-1]
     assert {path.name for path in out.iterdir()} == {"demonstrations", "lock"}
     monkeypatch.setattr(
-        "torchrl_koap.envs.experts.demonstrations.record_demonstrations", lambda *rest, **more: pytest.fail("again")
+        "torchrl_koap.envs.experts.demonstrations.record_to_folder", lambda *rest, **more: pytest.fail("again")
     )
     assert run(out, None, **options)["done"] == 1
     (row,) = rows_of(out).values()
@@ -198,7 +198,7 @@ def test_what_cannot_be_done_is_said_in_one_line_before_any_work(
     options, message, tmp_path, demonstrations, capsys, monkeypatch
 ):
     monkeypatch.setattr(
-        "torchrl_koap.envs.experts.demonstrations.record_demonstrations", lambda *rest, **more: pytest.fail("work")
+        "torchrl_koap.envs.experts.demonstrations.record_to_folder", lambda *rest, **more: pytest.fail("work")
     )
     assert message in fails(capsys, *command_of(tmp_path / "curve", demonstrations, **options))
     assert list(tmp_path.iterdir()) == []

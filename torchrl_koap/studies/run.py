@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import flatten_trajectories, open_dataset, save_ted
+from torchrl_koap.data import flatten_trajectories, open_dataset
 from torchrl_koap.data.label_budget import subsample_trajectories
 from torchrl_koap.runs.config_files import changed_options, from_json, to_json, versions
 from torchrl_koap.runs.progress import count_up_to, progress_bar
@@ -24,7 +24,7 @@ from torchrl_koap.studies.launchers import Job, Machines, launch
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
 from torchrl_koap.studies.table import CELL_COLUMNS, STATUSES, write_csv
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import fingerprint
 
 _FILE = "study.json"
@@ -170,12 +170,11 @@ def _record(study: Study, cells: Sequence[Cell], name: str) -> None:
     folder, task = study.dataset_folder(name), study.task(name)
     if study.given_dataset(name) is not None or (folder / "ted").exists():
         return
-    from torchrl_koap.envs.experts.demonstrations import record_demonstrations  # needs a simulator
+    from torchrl_koap.envs.experts.demonstrations import record_to_folder  # needs a simulator
 
     episodes = study.record or task.defaults.demonstrations
     with progress_bar(episodes, "demonstrations", unit="episode") as bar:
-        data, _ = record_demonstrations(name, episodes, 0, progress=count_up_to(bar))
-    save_ted(data, folder / "ted", get_task(task.source))
+        record_to_folder(folder, task, episodes, progress=count_up_to(bar))
     _check_labels(study, cells, name, open_dataset(folder, task=task)[0])
 
 
