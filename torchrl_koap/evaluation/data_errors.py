@@ -22,6 +22,7 @@ from torchrl_koap.data import cut_windows
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.rollouts import device_of
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics, StatePlanner
 from torchrl_koap.modules.planning.energy_score import energy_score, relative_score, sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
@@ -60,11 +61,11 @@ def plan_errors(planner: StatePlanner, data: TensorDictBase, task: Task, *, seed
         still, the mean over units; ``trajectory``: the relative score per trajectory.
     """
     horizon, history = planner.horizon, max(planner.history, 2)  # constant velocity needs two frames
-    keys = ["state", "episode"]
+    keys = [STATE, EPISODE]
     windows = cut_windows(data, history + horizon, select=keys, pad_before=history - 1, most=SITUATIONS)
-    states = windows["state"].float().cpu()
+    states = windows[STATE].float().cpu()
     past, future = planner.split_window(states[:, history - planner.history :])
-    episode = windows["episode"][:, -1].cpu()
+    episode = windows[EPISODE][:, -1].cpu()
     models = {"planner": sample_sequences(planner, past.to(device_of(planner)), samples=SAMPLES, seed=seed).cpu()}
     models |= {name: plan[None] for name, plan in baseline_plans(states[:, :history], horizon).items()}
     groups = unit_groups(task.state_units)
@@ -104,7 +105,7 @@ def _score(sampled: Tensor, true: Tensor) -> dict[str, dict[str, Any]]:
 
 def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
     """Returns the numbers of the trajectories of which no label was in the budget."""
-    every = data["episode"].unique()
+    every = data[EPISODE].unique()
     return every[~torch.isin(every, labelled_episodes(labelled).to(every.device))]
 
 
@@ -116,17 +117,17 @@ def first_actions(
 
     Returned are predicted and true actions ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
     """
-    wanted = torch.isin(data["episode"], torch.as_tensor(episodes, device=data["episode"].device))
-    numbers, lengths = data["episode"][wanted].unique(return_counts=True)
-    part = data[torch.isin(data["episode"], numbers[lengths > AFTER])]
+    wanted = torch.isin(data[EPISODE], torch.as_tensor(episodes, device=data[EPISODE].device))
+    numbers, lengths = data[EPISODE][wanted].unique(return_counts=True)
+    part = data[torch.isin(data[EPISODE], numbers[lengths > AFTER])]
     if not len(part):
-        return data["action"][:0].cpu(), data["action"][:0].cpu(), data["episode"][:0].cpu()
-    windows = cut_windows(part, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
-    windows = windows[windows["action"][:, BEFORE].isfinite().all(-1)]  # the data may lack labels themselves
+        return data[ACTION][:0].cpu(), data[ACTION][:0].cpu(), data[EPISODE][:0].cpu()
+    windows = cut_windows(part, BEFORE + 1 + AFTER, select=[STATE, ACTION, EPISODE], pad_before=BEFORE)
+    windows = windows[windows[ACTION][:, BEFORE].isfinite().all(-1)]  # the data may lack labels themselves
     past = min(controller.num_past, BEFORE)
-    states = windows["state"][:, BEFORE - past :].to(device_of(controller))
-    predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
-    return predicted[:, past].cpu(), windows["action"][:, BEFORE], windows["episode"][:, -1]
+    states = windows[STATE][:, BEFORE - past :].to(device_of(controller))
+    predicted = controller(TensorDict({controller.in_keys[0]: states}, [len(states)]))[controller.out_keys[-1]]
+    return predicted[:, past].cpu(), windows[ACTION][:, BEFORE], windows[EPISODE][:, -1]
 
 
 def errors_outside_budget(
@@ -155,13 +156,13 @@ def _beside(
     task: Task,
 ) -> dict[str, Tensor]:
     """Actions ``[N, act]`` on some trajectories: a controller's, a ridge's on raw frames, the mean of those known."""
-    linear = LinearInverseDynamics(known["state"].shape[-1], task.action_dim).to(known["state"].dtype)
+    linear = LinearInverseDynamics(known[STATE].shape[-1], task.action_dim).to(known[STATE].dtype)
     fit_closed_form(linear, known)
     fixed = torch.tensor([action.constant is not None for action in task.actions.values()])
     return {
         "controller": torch.where(fixed, true, predicted),  # as a policy commands: what never changes is what it was
         "ridge": first_actions(linear, data, episodes)[0],
-        "mean_action": known["action"][known["has_action"].squeeze(-1)].mean(0).expand_as(true),
+        "mean_action": known[ACTION][known[HAS_ACTION].squeeze(-1)].mean(0).expand_as(true),
     }
 
 
@@ -180,9 +181,9 @@ def errors_left_out(
     folds = []
     for number in spread_evenly(episodes, _MOST_FOLDS):
         fold = labelled.copy()
-        hidden = labelled["episode"] == number
-        fold["has_action"] = labelled["has_action"] & ~hidden.unsqueeze(-1)
-        fold["action"] = torch.where(fold["has_action"], labelled["action"], math.nan)
+        hidden = labelled[EPISODE] == number
+        fold[HAS_ACTION] = labelled[HAS_ACTION] & ~hidden.unsqueeze(-1)
+        fold[ACTION] = torch.where(fold[HAS_ACTION], labelled[ACTION], math.nan)
         again = copy.deepcopy(controller)
         fit_closed_form(again, fold, **action_facts(task, columns))
         predicted, true, episode = first_actions(again, labelled, [int(number)])
@@ -206,33 +207,33 @@ def errors_of_chunks(
     """
     history, targets = policy.history, tuple(task.targets.items())
     episodes = episodes_outside(data, labelled)
-    keys = ["state", "action", "has_action", "episode"]
+    keys = [STATE, ACTION, HAS_ACTION, EPISODE]
     now = history - 1
-    outside = data[torch.isin(data["episode"], episodes)]
+    outside = data[torch.isin(data[EPISODE], episodes)]
     windows = cut_windows(outside, now + policy.horizon, select=keys, pad_before=now).cpu()
-    windows = spread_evenly(windows[windows["has_action"][:, now, 0]], SITUATIONS)
+    windows = spread_evenly(windows[windows[HAS_ACTION][:, now, 0]], SITUATIONS)
     if not len(windows):
         return {"note": "no trajectory outside the budget has labels"}
     known = cut_windows(labelled, history + 1, select=keys, pad_before=now).cpu()
-    known = known[known["has_action"][:, now, 0]]
+    known = known[known[HAS_ACTION][:, now, 0]]
 
     def moved(action: Tensor, states: Tensor) -> Tensor:
         """Absolute actions as distances from where their columns are in the present frame."""
         return shift_actions(action, states[:, now], targets, sign=-1)
 
-    past, device = windows["state"][:, :history].float(), device_of(policy)
-    true, seen = (moved(part["action"][:, now], part["state"]) for part in (windows, known))
+    past, device = windows[STATE][:, :history].float(), device_of(policy)
+    true, seen = (moved(part[ACTION][:, now], part[STATE]) for part in (windows, known))
     sampled = sample_sequences(policy, past.to(device), samples=SAMPLES, seed=seed)[:, :, 0].mean(0).cpu()
     condition, asked = (
-        policy.encode_history(frames.float().to(device)).cpu() for frames in (known["state"][:, :history], past)
+        policy.encode_history(frames.float().to(device)).cpu() for frames in (known[STATE][:, :history], past)
     )
-    linear = ridge(condition, seen, groups=known["episode"][:, -1], default_penalty=DEFAULT_PENALTY)
+    linear = ridge(condition, seen, groups=known[EPISODE][:, -1], default_penalty=DEFAULT_PENALTY)
     models = {
         "controller": moved(sampled, past),
         "ridge": linear.predict(asked),
         "mean_action": seen.mean(0).expand(len(true), -1),
     }
-    return summarise_errors(models, true, windows["episode"][:, -1], task)
+    return summarise_errors(models, true, windows[EPISODE][:, -1], task)
 
 
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.data.trajectories import labelled_episodes, trajectory_lengths
 from torchrl_koap.evaluation.rollouts import device_of, roll_out
-from torchrl_koap.keys import OBSERVATION, PLAN
+from torchrl_koap.keys import EPISODE, OBSERVATION, PLAN, STATE
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 
@@ -97,10 +97,10 @@ def follow_recordings(
     others are followed. Episodes have the entry :data:`RECORDED` ``[T, 1]``.
     """
     lengths = trajectory_lengths(data).tolist()
-    own = torch.isin(data["episode"].unique_consecutive(), labelled_episodes(data)).nonzero().squeeze(-1)
+    own = torch.isin(data[EPISODE].unique_consecutive(), labelled_episodes(data)).nonzero().squeeze(-1)
     own = own if len(own) else torch.arange(len(lengths))
     chosen = own[torch.linspace(0, len(own) - 1, min(episodes, len(own))).long().unique()].tolist()
-    paths = data["state"].split(lengths)
+    paths = data[STATE].split(lengths)
     starts = torch.stack([data[OBSERVATION].split(lengths)[index][0] for index in chosen])
     planner = RecordedPlanner(policy.planner)
     perfect = PlanningPolicy(
@@ -160,8 +160,8 @@ def distance_to_demonstrations(task: Task, episodes: Sequence[TensorDict], data:
     Every second demonstration is compared with the others, so that both figures are distances to strangers: their 95 %
     quantiles. Nothing is measured if there is a single demonstration.
     """
-    every = data["episode"] % 2 == 0
-    known, held_out = data["state"][every], data["state"][~every]
+    every = data[EPISODE] % 2 == 0
+    known, held_out = data[STATE][every], data[STATE][~every]
     if not len(held_out):
         return {}
     scale = known.std(0).clamp_min(1e-6) * task.state_dim**0.5

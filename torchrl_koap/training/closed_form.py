@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import WindowTable, spread_evenly
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.tasks import Task
 
@@ -24,14 +25,14 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     was applied; what is ``known`` of the actions is that of :func:`action_facts`. Returns what
     :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
     """
-    data = data[torch.isin(data["episode"], labelled_episodes(data))]
+    data = data[torch.isin(data[EPISODE], labelled_episodes(data))]
     table = WindowTable.build(data, controller.num_window_frames, pad_before=controller.num_past)
     frames, _ = table.frames()
-    frames = spread_evenly(frames[data["has_action"].squeeze(-1)[frames[:, controller.num_past]]], MOST)
-    windows = data.select("state", "action", "episode")[frames]
+    frames = spread_evenly(frames[data[HAS_ACTION].squeeze(-1)[frames[:, controller.num_past]]], MOST)
+    windows = data.select(STATE, ACTION, EPISODE)[frames]
     mask = torch.zeros_like(frames, dtype=torch.bool)
     mask[:, controller.num_past] = True  # at other frames a clamped look-ahead would count a step again
-    for name, own in (("state", controller.in_key), ("action", controller.out_key)):
+    for name, own in ((STATE, controller.in_key), (ACTION, controller.out_key)):
         if own != name:
             windows.rename_key_(name, own)
     return controller.fit_labels(windows, mask, **known)

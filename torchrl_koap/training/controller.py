@@ -13,6 +13,7 @@ from torch import nn
 from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import WindowTable, spread_evenly
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
@@ -29,7 +30,7 @@ from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
 FITTED = 50_000  # windows that statistics without labels are fitted to
-_KEYS = ["state", "action", "has_action"]
+_KEYS = [STATE, ACTION, HAS_ACTION]
 
 
 def learn_controller(
@@ -101,8 +102,8 @@ def _train_network(
     everything = method.sees == "all"
     windows = cut_windows(data, window, select=_KEYS, pad_before=history, most=FITTED if everything else None)
     if not everything:
-        windows = spread_evenly(windows[windows["has_action"].any(dim=(1, 2))], FITTED)
-    states = windows["state"]
+        windows = spread_evenly(windows[windows[HAS_ACTION].any(dim=(1, 2))], FITTED)
+    states = windows[STATE]
     losses: dict[str, float] = {}
     with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
         controller.prepare(states, updates=budget if method.phases else 0, progress=count_up_to(bar))
@@ -141,10 +142,10 @@ def _train_sampler(
     """A network that samples actions, with the updates that a planner would have."""
     (phase,) = method.phases
     sampler, section = method.build(task, config.planner), config.planner
-    seen = data[torch.isin(data["episode"], labelled_episodes(data))]
+    seen = data[torch.isin(data[EPISODE], labelled_episodes(data))]
     extended = extrapolate_ends(seen, HORIZON - 1)
-    states = cut_windows(extended, WINDOW, select=["state"], pad_before=1, most=MOST_WINDOWS)["state"]
-    sampler.fit_normalizers(states, data["action"][data["has_action"].squeeze(-1)])
+    states = cut_windows(extended, WINDOW, select=[STATE], pad_before=1, most=MOST_WINDOWS)[STATE]
+    sampler.fit_normalizers(states, data[ACTION][data[HAS_ACTION].squeeze(-1)])
     sampler.to(config.run.device)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(
@@ -180,5 +181,5 @@ def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDi
     view = controller_data(task, config.controller, data)
     labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
     if task.distances:
-        labelled["action"] = shift_actions(labelled["action"], data["state"], task.distances)
-    return data.copy().update(labelled.select("action", "has_action"))
+        labelled[ACTION] = shift_actions(labelled[ACTION], data[STATE], task.distances)
+    return data.copy().update(labelled.select(ACTION, HAS_ACTION))

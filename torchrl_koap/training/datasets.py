@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.data.trajectories import labelled_episodes
+from torchrl_koap.keys import EPISODE, STATE
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import digest_of
@@ -49,7 +50,7 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
         return []
     if not 0 < fraction < 1:
         raise ValueError(f"planner.held_out must be in [0, 1), got {fraction}")
-    episodes = data["episode"].unique_consecutive().cpu()
+    episodes = data[EPISODE].unique_consecutive().cpu()
     total = len(episodes)
     number = min(max(math.floor(fraction * total + 0.5), 1 if total < 10 else 2), total - 1)
     labelled = torch.isin(episodes, labelled_episodes(data).cpu())
@@ -62,7 +63,7 @@ def held_out_facts(data: TensorDictBase, episodes: Sequence[int]) -> dict[str, A
     """What ``config.json`` says of the trajectories that a planner does not see: numbers and a checksum of states."""
     if not len(episodes):
         return {}
-    states = data["state"][torch.isin(data["episode"].cpu(), torch.tensor(list(episodes)))]
+    states = data[STATE][torch.isin(data[EPISODE].cpu(), torch.tensor(list(episodes)))]
     return {"held_out_episodes": list(episodes), "held_out_states": digest_of([("state", states)])}
 
 
@@ -82,7 +83,7 @@ def split_held_out(
     """
     if not len(episodes):
         return data, None, data
-    episode = data["episode"]
+    episode = data[EPISODE]
     held_out = torch.isin(episode, torch.as_tensor(list(episodes), device=episode.device))
     if held_out.all():
         raise ValueError(

@@ -9,6 +9,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import nn
 
+from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, DiffusionPolicy, MLPDenoiser, Normalizer, StatePlanner, TemporalUnet
 from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
@@ -101,9 +102,9 @@ def build_controller(
     if labelled is None:
         state, action = Normalizer(len(columns)), Normalizer(task.action_dim)
     else:
-        seen = labelled["has_action"] if method.sees == "labelled" else None
-        state = Normalizer.fit(labelled["state"], mode=modes["state"], mask=seen)
-        action = Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"])
+        seen = labelled[HAS_ACTION] if method.sees == "labelled" else None
+        state = Normalizer.fit(labelled[STATE], mode=modes["state"], mask=seen)
+        action = Normalizer.fit(labelled[ACTION], mode=modes["action"], mask=labelled[HAS_ACTION])
     normalizers = {"state_normalizer": state, "action_normalizer": action}
     return method.build(task, columns, normalizers, section.preset)
 

@@ -23,6 +23,7 @@ from torchrl_koap.data import (
 )
 from torchrl_koap.data.recovery import GripperRecovery, NeighborRecovery
 from torchrl_koap.data.windows import spread_evenly
+from torchrl_koap.keys import STATE
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.planning.energy_score import relative_distance, relative_score, sample_sequences
 from torchrl_koap.objectives import PlannerLoss
@@ -66,13 +67,13 @@ def learn_planner(
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
     extended = extrapolate_ends(data, planner.horizon - 1)
-    windows = cut_windows(extended, length, select=["state"], pad_before=1, most=MOST_WINDOWS)["state"]
+    windows = cut_windows(extended, length, select=[STATE], pad_before=1, most=MOST_WINDOWS)[STATE]
     planner.fit_normalizers(windows[:, unseen:])
     planner.to(config.run.device)
     augment = augmentation(task, windows)
     score = None if held_out is None else plan_score(planner, held_out, spread_evenly(windows, RECORDED), task)
     del windows  # may be larger than the data
-    buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
+    buffer = make_window_buffer(extended, length, section.batch_size, select=[STATE], pad_before=1)
 
     weights = column_weights(task)
     loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision], weights=weights).to(config.run.device)
@@ -132,7 +133,7 @@ def plan_score(
     """
     length = planner.history + planner.horizon
     past = planner.history - 1
-    states = cut_windows(data, length, select=["state"], pad_before=past, most=SITUATIONS)["state"]
+    states = cut_windows(data, length, select=[STATE], pad_before=past, most=SITUATIONS)[STATE]
     history, future = planner.split_window(states)
     still, groups = history[:, -1:].expand_as(future), list(unit_groups(task.state_units).values())
     known = recorded[:, -planner.horizon :].to(future)

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data.trajectories import begins
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION, STATE
 from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.policy_facts import commanded_columns
@@ -129,15 +130,15 @@ def _around(values: Tensor, row: Tensor, first: int, last: int) -> Tensor:
 def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[LabelledSteps, Tensor]:
     """The steps that may be fitted to, and the changes of the command ``[N, J]``, NaN where they are not known."""
     memory, axes = response.memory, response.num_axes
-    episode, labelled = data["episode"], data["has_action"].reshape(-1)
-    positions = data["state"][:, response.states].double()
-    action = torch.where(labelled.unsqueeze(-1), data["action"][:, response.actions].double(), torch.nan)
+    episode, labelled = data[EPISODE], data[HAS_ACTION].reshape(-1)
+    positions = data[STATE][:, response.states].double()
+    action = torch.where(labelled.unsqueeze(-1), data[ACTION][:, response.actions].double(), torch.nan)
     if response.absolute:
         after = action
         changes = torch.where(begins(data).unsqueeze(-1), torch.nan, action.diff(dim=0, prepend=action[:1]))
     else:
         changes = action
-        after = data["observation"][:, response.commands].double() + changes
+        after = data[OBSERVATION][:, response.commands].double() + changes
     row = torch.arange(memory, len(episode) - 1, device=episode.device)
     measured, told = (~values.isnan().any(-1) for values in (positions, changes))
     good = _around(measured, row, -memory, 1).all(-1) & _around(told, row, -memory, -1).all(-1)
@@ -192,7 +193,7 @@ def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSte
     start = take(steps, enough)
     start = take(start, torch.arange(0, len(start.row), 2, device=row.device))
     row = start.row
-    positions = data["state"][:, response.states].double()
+    positions = data[STATE][:, response.states].double()
     return Stretches(
         _around(positions, row, -memory, 0),
         positions[row] + start.coordinates[..., memory],  # the lead
