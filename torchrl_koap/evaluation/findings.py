@@ -31,13 +31,8 @@ _WORSE = 2.0  # times the error of a comparable model from which a latent model 
 
 
 def error_unit(part: str, task: Task) -> tuple[str, float]:
-    """Returns the unit in which errors of a part of the state are shown, none for several units, and the factor to it.
-
-    Where the task says no units, positions are in m and joints in rad.
-    """
-    if not task.observation_units:
-        return ("", 1.0) if task.env is None else thousandths("rad" if "joints" in part else "m")
-    units = set(task.observation_units[task.observation[part]])
+    """Returns the unit in which errors of a part of the state are shown, none for several, and the factor to it."""
+    units = set(task.known_units[task.observation[part]])
     return thousandths(units.pop()) if len(units) == 1 else ("", 1.0)
 
 

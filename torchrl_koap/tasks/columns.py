@@ -53,7 +53,7 @@ class Columns:
         name (str): whose columns they are.
         observation_parts (dict): parts of the observation in the order of the columns: a number of columns, or their
             names. Numbered ones are called as the part, with a number if it has several.
-        observation_units (tuple of str): unit of every observation column; empty: m for positions, rad for angles.
+        observation_units (tuple of str): unit of every observation column; empty: see :attr:`known_units`.
         observation_origin (tuple of float): what was subtracted from every column of the data, so that float32 holds
             them; robots report and take numbers with it (:class:`~torchrl_koap.modules.Agent`). Empty: nothing.
         command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
@@ -130,10 +130,10 @@ class Columns:
 
     @property
     def known_units(self) -> tuple[str, ...]:
-        """Unit of every observation column; where a task says none, metres of parts that are called positions."""
-        parts = {part: range(self.observation_dim)[columns] for part, columns in self.observation.items()}
-        metres = [part.endswith(("_xy", "_xyz", "_position")) for part, columns in parts.items() for _ in columns]
-        return self.observation_units or tuple("m" if metre else "" for metre in metres)
+        """Unit of every observation column; where a task says none, metres of parts called positions, rad of joints."""
+        called = {"_xy": "m", "_xyz": "m", "_position": "m", "joints": "rad"}
+        unit = {part: next((u for end, u in called.items() if part.endswith(end)), "") for part in self.observation}
+        return self.observation_units or tuple(unit[part] for part in unit for _ in self._column_names(part))
 
     @property
     def state_units(self) -> tuple[str, ...]:
