@@ -34,6 +34,19 @@ _FOURIER: dict[str, Any] = {
     "position_weight": 0.0,
 }
 
+# the paper: g MLP, f LSTM, dense K, look-ahead k = 8
+_PAPER: dict[str, Any] = _DEFAULT | {
+    "normalization": {"state": "minmax", "action": "minmax"},
+    "network": LatentActionLSTM,
+    "latent_dim": 64,
+    "hidden_dim": 128,
+    "include_state": False,
+    "num_past": 1,
+    "look_ahead": 8,
+    "clamped": True,
+    "relative": False,
+}
+
 # everything that a variant is; what only its network takes stands last
 PRESETS: dict[str, dict[str, Any]] = {
     # observables of the frames relative to the current one, an input matrix B, no clamped look-ahead, a
@@ -62,30 +75,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     }
     | {"num_features": 512},
     # commands of joints that are not observed: the paper's networks, wider, and labels shape the latent action, too
-    "scene": _DEFAULT
-    | {
-        "normalization": {"state": "standard", "action": "standard"},
-        "network": LatentActionLSTM,
-        "latent_dim": 64,
-        "hidden_dim": 256,
-        "include_state": False,
-        "num_past": 1,
-        "look_ahead": 8,
-    }
-    | {"relative": False},
-    # the paper: g MLP, f LSTM, dense K, look-ahead k = 8
-    "paper": _DEFAULT
-    | {
-        "normalization": {"state": "minmax", "action": "minmax"},
-        "network": LatentActionLSTM,
-        "latent_dim": 64,
-        "hidden_dim": 128,
-        "include_state": False,
-        "num_past": 1,
-        "look_ahead": 8,
-        "clamped": True,
-    }
-    | {"relative": False},
+    "scene": _PAPER
+    | {"normalization": {"state": "standard", "action": "standard"}, "hidden_dim": 256, "clamped": False},
+    "paper": _PAPER,
 }
 
 # a smoothed lifting keeps states of at most so many columns as they are
