@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, TypeVar
+from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, TrainConfig
-from torchrl_koap.runs.config_files import read_config
+from torchrl_koap.runs.config_files import fill_in, read_config
 from torchrl_koap.runs.device import default_threads, find_precision
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, HORIZON, REPLAN_INTERVAL, Task
@@ -29,7 +30,6 @@ FOLLOWED = "delayed"  # where they are targets of state columns, which a robot t
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.4  # of plans where no figure counts the modes
 PLAN_SECONDS = 0.1  # with feedback, at least: plans made anew every few ms begin where the robot lags behind the last
-Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 
 
 def resolve(config: TrainConfig, task: Task) -> TrainConfig:
@@ -77,7 +77,7 @@ def _planner(asked: PlannerConfig, method: Method, task: Task) -> PlannerConfig:
         own |= {"frames": HISTORY, "held_out": 0.0}
     layers = [own if network == theirs else _unsized(own), usual if network == usual["network"] else _unsized(usual)]
     library = {"steps": 12000, "frames": HISTORY, "held_out": 0.0, "network": network}
-    return _filled(asked, *layers, lookup(NETWORKS, network, "planner.network"), library)
+    return reduce(fill_in, [*layers, lookup(NETWORKS, network, "planner.network"), library], asked)
 
 
 def _unsized(layer: Mapping[str, Any]) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
         usual = PLACES if places else FOLLOWED if task.targets else usual
     declared = {"columns": method.columns, "steps": method.updates}
     library = {"preset": usual, "steps": CONTROLLER_UPDATES, "columns": "robot"}
-    section = _filled(asked, {k: v for k, v in declared.items() if v is not None}, own, library)
+    section = reduce(fill_in, [declared, own, library], asked)
     lookup(PRESETS, section.preset, "preset")
     if section.preset not in presets:
         raise ValueError(f"method {method.name!r} has no preset {section.preset!r}, it has {list(method.presets)}")
@@ -124,18 +124,10 @@ def _execution(asked: ExecutionConfig, method: Method, task: Task, preset: str) 
     if not method.plans:
         own["strategy"] = "open_loop"
     own |= method.execution
-    method.check_execution(asked, Execution().replaced(**own))
-    if asked.on(Execution().replaced(**own)).strategy == "feedback":
+    usual = Execution().replaced(**own)
+    method.check_execution(asked, usual)
+    if asked.on(usual).strategy == "feedback":
         # actions of later frames would need frames beyond the plan's end
         most = HORIZON + 1 - np.max(PRESETS[preset]["look_ahead"]).item()
         own = {"replan_interval": min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), most)} | own
     return ExecutionConfig(**vars(asked.on(Execution().replaced(**own))))
-
-
-def _filled(asked: Section, *layers: Mapping[str, Any]) -> Section:
-    """A section whose open options are those of the first layer that has them."""
-    known = {field.name for field in fields(asked)}
-    for layer in layers:
-        missing = {name: value for name, value in layer.items() if name in known and getattr(asked, name) is None}
-        asked = replace(asked, **missing)
-    return asked
