@@ -12,10 +12,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_koap.keys import ACTION, STATE
+from torchrl_koap.tasks.action_rules import OPEN_ABOVE, OPENING
 
 _DIFFERENCE = 1e-3  # rad, of the numerical Jacobian
 _DAMPING = 1e-4  # m2 / rad2, added to the squared reach of the joints: bounds them where the arm is stretched out
-_OPEN, _OPENING, _LEFT = 0.075, 5, 0.5  # m that count as open; steps that opening takes; share left after each
+_LEFT = 0.5  # share of the way that is left after each step of opening fingers
 EMPTY = 0.05  # m; fingers nearer to each other than that hold nothing: the boxes of Stacking are 0.06 m wide
 
 
@@ -39,8 +40,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
     its way back already, as in the next steps of the loop: :math:`x'_{t-j} = x_{t-j} + \rho^{-j} \delta`. Choose it
     where motions are so smooth that velocity follows from position, so that the difference of the two betrays a shift.
 
-    A redundant arm is displaced at the tool, and the joints follow
-    by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`.
+    A redundant arm is displaced at the tool, and the joints follow by the least motion that does it,
+    :math:`\delta = J(x_t)^+ \delta_{tool}`.
 
     Args:
         sigma (float or Tensor): typical size of the shift, in the units of the state, or of every column, ``[d]``; with
@@ -168,8 +169,8 @@ class GripperRecovery(TensorDictModuleBase):
         width = state[..., self.column]
         kind = {"dtype": width.dtype, "device": width.device}
         chosen, begin = torch.rand(2, *width.shape[:-1], 1, **kind)
-        looked_at = width[..., : self.history + _OPENING]
-        chosen = (chosen < self.share) & (looked_at > _OPEN).all(-1, keepdim=True)
+        looked_at = width[..., : self.history + OPENING]
+        chosen = (chosen < self.share) & (looked_at > OPEN_ABOVE).all(-1, keepdim=True)
         ahead = (torch.arange(width.shape[-1], **kind) - (self.history - 1)).clamp_min(0)
         widest = width[..., self.history - 1 : self.history]
         opening = widest - _LEFT**ahead * (widest - EMPTY * begin)

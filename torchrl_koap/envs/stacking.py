@@ -12,13 +12,12 @@ from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.action_rules import OPEN, OPEN_ABOVE
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.stacking import BOXES, TARGET, TARGET_HALF, ZONE_RADIUS, piled
 
-OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them
 COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
 JOINT_BOUND = 0.03  # rad per control step
-GRIPPER_BOUND = 0.08  # m
 
 
 class StackingEnv(ManipulationEnv):
@@ -64,7 +63,7 @@ class StackingEnv(ManipulationEnv):
         2.1499041610538185,
         0.78539816721171052,
     )
-    ACTION_BOUND = ((-JOINT_BOUND,) * 7 + (0.0,), (JOINT_BOUND,) * 7 + (GRIPPER_BOUND,))
+    ACTION_BOUND = ((-JOINT_BOUND,) * 7 + (0.0,), (JOINT_BOUND,) * 7 + (OPEN,))
     MODE_ENTRIES, MODE_VALUES = None, 3
     COMMAND_DIM, RESET_WIDTH = 8, controller.FINGER_OPEN
 

@@ -16,9 +16,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-OPEN_ABOVE = 0.075  # m; greater numbers open
+OPEN_ABOVE = 0.075  # m; a greater gripper command opens the fingers, any other closes them
 PLANNED_OPEN_ABOVE = 0.07  # m; half way from a box held to fingers open: plans err by some millimetres
-OPEN = 0.08
+OPEN = 0.08  # m; distance of the fingers
 OPENING = 5  # control steps that the fingers need to open
 _MOVES = 1e-4
 ActionKind = Literal["delta", "absolute", "raw", "gripper"]

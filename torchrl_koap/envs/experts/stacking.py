@@ -22,9 +22,10 @@ import numpy as np
 
 from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
+from torchrl_koap.tasks.action_rules import OPEN
 from torchrl_koap.tasks.stacking import BOXES, ORDERS, TARGET
 
-GRIPPER_OPEN, GRIPPER_CLOSED = 0.08, 0.06  # gripper commands: the distances of the fingers that will result (m)
+GRIPPER_CLOSED = 0.06  # gripper command: the distance of the fingers that will result (m)
 HALF_SIZES = np.array([size[:2] for _, size in BOXES])
 BOX_HEIGHT = 0.06
 ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
@@ -125,7 +126,7 @@ class _Person:
         there = error < 0.007 and tilt < 0.05 and abs(tcp[2] - low) < 0.008
         if (there and width > 0.07 and self._since > 8) or (tcp[2] - low < 0.03 and self._since > 250):
             self._enter(self._close)
-        return GRIPPER_OPEN
+        return OPEN
 
     def _close(self, tcp, yaw, width, boxes) -> float:
         self._velocity[:], self._spin = 0.5 * self._velocity, 0.5 * self._spin
@@ -146,7 +147,7 @@ class _Person:
         if np.linalg.norm(offset) > 0.05 or width < 0.05:  # lost
             self._grasp = None
             self._enter(self._reach)
-            return GRIPPER_OPEN
+            return OPEN
         goal, height = self._place(boxes)
         error, tilt = np.linalg.norm(goal - box[:2]), abs(yaw)
         low = height + offset[2]
@@ -165,12 +166,12 @@ class _Person:
             self._placed += 1
             self._grasp = None
             self._enter(self._retreat if self._placed == 3 else self._reach)
-        return GRIPPER_OPEN
+        return OPEN
 
     def _retreat(self, tcp, yaw, width, boxes) -> float:
         self._move(tcp[:2], ON_TABLE + 3 * BOX_HEIGHT, 0.0, tcp)
         self.finished |= self._since > 12
-        return GRIPPER_OPEN
+        return OPEN
 
     def _place(self, boxes: np.ndarray) -> tuple[np.ndarray, float]:
         """Where the centre of the box in hand shall come to rest: xy and height."""
