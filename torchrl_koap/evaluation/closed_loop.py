@@ -32,7 +32,7 @@ from torchrl_koap.runs.run_directory import RunDirectory, find_run, writable_fol
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Modes, Task
 from torchrl_koap.training.trained import Trained
-from torchrl_koap.vision import Observer
+from torchrl_koap.vision import Observer, Projection
 
 if TYPE_CHECKING:
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord  # takes seconds
@@ -77,7 +77,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    where = find_environment(task, config, Observer.of(task, trained.cameras))
+    where = find_environment(task, config, trained.cameras)
     errors, actions, data = evaluate_actions(trained, config.dataset)
     directory = RunDirectory(writable_folder(run, config.out))  # a refused call copies nothing
     policy = policy.to(config.device)
@@ -198,8 +198,10 @@ class RolloutEnvironment:
     facts: Mapping[str, Any] = field(default_factory=dict)  # and what it is, for ``eval.json``
 
 
-def find_environment(task: Task, config: EvalConfig, observe: Observer | None = None) -> RolloutEnvironment:
-    """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures ``observe`` embeds.
+def find_environment(
+    task: Task, config: EvalConfig, cameras: Mapping[str, Projection] | None = None
+) -> RolloutEnvironment:
+    """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures are embedded.
 
     One that does not exist, has other widths than the task, or does not report success by the key that was asked for is
     refused, like contexts that do not suffice.
@@ -223,7 +225,7 @@ def find_environment(task: Task, config: EvalConfig, observe: Observer | None = 
         task,
         env_kwargs=environment_arguments(config.env_kwargs),
         processes=config.num_envs is not None,
-        observe=observe,
+        observe=Observer.of(task, cameras or {}),
         success_key=config.success_key,
         record=record,
     )

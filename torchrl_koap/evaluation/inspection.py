@@ -33,7 +33,6 @@ from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.training.trained import Trained
-from torchrl_koap.vision import Observer
 
 
 @dataclass
@@ -89,7 +88,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         writable_folder(run)  # a pretrained run is refused before its data are looked for
     data = trained.data(config.dataset)
     labelled = trained.hide_labels(data)[0][HAS_ACTION].squeeze(-1)
-    where = None if config.latent_only else find_environment(task, config, Observer.of(task, trained.cameras))
+    where = None if config.latent_only else find_environment(task, config, trained.cameras)
     directory = RunDirectory(writable_folder(run, config.out))  # a wrong call leaves no copy
     if where is not None:
         result = _experiments(config, trained, data, where)

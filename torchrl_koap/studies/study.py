@@ -25,7 +25,6 @@ from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.on_disk import planner_of_source
 from torchrl_koap.training.trained import Trained, build_networks
-from torchrl_koap.vision import Observer
 from torchrl_koap.vision.encoder import cameras_of
 
 PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
@@ -302,8 +301,7 @@ def check_study(study: Study) -> list[Cell]:
     for task in study.tasks:  # what evaluation would refuse, when everything is trained
         choose_contexts(study.task(task), study.evaluation)
         if study.evaluation.env is not None:
-            observe = Observer.of(study.task(task), cameras_of(study.given_dataset(task)))
-            find_environment(study.task(task), study.evaluation, observe)
+            find_environment(study.task(task), study.evaluation, cameras_of(study.given_dataset(task)))
     cells = study.cells()
     for task in study.tasks:
         for method in study.methods:
