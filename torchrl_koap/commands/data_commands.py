@@ -21,7 +21,7 @@ from torchrl_koap.data.formats import FORMATS, Recordings, write_recordings
 from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
 from torchrl_koap.data.sources import check_new, find_task_of
 from torchrl_koap.data.ted import source_names, stored_folder
-from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, RecordingReport, record_to_folder
+from torchrl_koap.envs.experts.demonstrations import RecordingReport, record_to_folder
 from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.scooping.recording import VideoReport, record_videos
 from torchrl_koap.keys import validate
@@ -52,7 +52,6 @@ class Demos(Command):
         episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
         seed: seed of the experts' variation.
         threads: simulator threads.
-        batch_size: episodes simulated at once; the demonstrations do not depend on it.
         disturbance: share of the demonstrations in which the expert is disturbed now and then (pushes, slips, late
             turns, a height that drifts); those from which it recovers are kept, and OUT/ted/about.json says how often
             it did (default: that of the task).
@@ -66,7 +65,6 @@ class Demos(Command):
     episodes: int | None = None
     seed: int = 0
     threads: int = 2
-    batch_size: int = BATCH_SIZE
     disturbance: float | None = None
     embodiment: str | None = None
     plugins: Plugins = ()
@@ -92,7 +90,6 @@ class Demos(Command):
                 self.seed,
                 progress=count_up_to(bar),
                 num_threads=self.threads,
-                batch_size=self.batch_size,
                 disturbance=self.disturbance,
             )
 

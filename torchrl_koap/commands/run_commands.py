@@ -193,20 +193,18 @@ class Export(Command):
         out: folder to write (default: RUN/exported).
         format: "torch" (torch.export), "onnx" (ONNX Runtime), "aoti" (AOTInductor, needs a C++ compiler) or "lerobot"
             (a folder for lerobot-eval and lerobot-record).
-        threads: torch threads.
         plugins: modules that register task or method, or hold a camera's network, where they are now.
     """
 
     run: tyro.conf.Positional[str]
     out: Path | None = None
     format: str = "torch"
-    threads: int = 1
     plugins: Plugins = ()
 
     def __call__(self) -> dict[str, Any]:
         """Exports and compares."""
         suffix = lookup(SUFFIXES | {"lerobot": None}, self.format, "export format")
-        set_up_torch(self.threads, "cpu")
+        set_up_torch(1, "cpu")
         trained = Trained.load(self.run, plugins=self.plugins)
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
         RunDirectory(out).refuse_data()

@@ -154,13 +154,11 @@ class SuggestConfig:
     Attributes:
         count: demonstrations to suggest (default: 5, or all that are left).
         dataset: where the data set of the training is now (default: where it was).
-        threads: torch threads.
         plugins: modules that register tasks or methods, besides those that the run was trained with.
     """
 
     count: int | None = None
     dataset: str | None = None
-    threads: int = 1
     plugins: Plugins = ()
 
 
@@ -185,7 +183,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         >>> suggest("runs/koap", SuggestConfig(count=3))["suggestions"]  # doctest: +SKIP
     """
     config = SuggestConfig() if config is None else config
-    set_up_torch(config.threads, "cpu")
+    set_up_torch(1, "cpu")
     trained = Trained.load(run, plugins=config.plugins)
     controller = trained.controller
     if not isinstance(controller, KoopmanInverseDynamics):
