@@ -16,6 +16,7 @@ from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensor
 from torchrl_koap.training import loop as loop_file
 from torchrl_koap.training.loop import (
     SETTLED,
+    WARMUP,
     AdaptiveClipping,
     DivergedError,
     moving_average,
@@ -65,8 +66,8 @@ def test_shape_of_the_learning_rate():
 def test_first_update_is_that_of_adamw_on_the_sum_of_the_losses():
     """After one step Adam's moments cancel: x - lr wd x - lr sign(gradient), with lr after one step of warm-up."""
     loss = Quadratic()
-    values = train_phase("x", loss, constant(), num_steps=1, learning_rate=0.4, weight_decay=0.1, warmup=4)
-    rate = 0.4 / 4
+    values = train_phase("x", loss, constant(), num_steps=1, learning_rate=0.4, weight_decay=0.1)
+    rate = 0.4 / WARMUP
     assert loss.x.item() == pytest.approx(3 - rate * 0.1 * 3 - rate, abs=1e-6)
     assert values["loss_a"] == 3 and values["loss_b"] == 6 and values["learning_rate"] == pytest.approx(rate)
     assert "diagnostic" not in values and values["iterations_per_second"] > 0
@@ -147,7 +148,7 @@ def run_training(kind, path, **options):
         parts.sample,
         target_update=parts.average,
         run=run,
-        **{"num_steps": 40, "learning_rate": 1e-2, "warmup": 10, "log_every": 5, "checkpoint_every": 10, **options},
+        **{"num_steps": 40, "learning_rate": 1e-2, "log_every": 5, "checkpoint_every": 10, **options},
     )
     return parts.loss, run, values
 

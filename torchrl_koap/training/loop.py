@@ -24,6 +24,7 @@ from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.checkpoints import load_training_state, save_training_state
 
 CHECKPOINT_EVERY = 500
+WARMUP = 100  # updates until the learning rate has its peak
 TIMES = 5.0  # lengths of mini-batch gradients vary by a factor of two or so about their mean square
 SETTLED = 100  # updates before which their mean says little
 AVERAGE_EVERY = 4  # updates between two steps of the average: each reads and writes every weight
@@ -55,7 +56,6 @@ def train_phase(
     num_steps: int,
     learning_rate: float,
     weight_decay: float = 0.0,
-    warmup: int = 100,
     target_update: SoftUpdate | None = None,
     best: BestWeights | None = None,
     run: RunDirectory | None = None,
@@ -123,7 +123,7 @@ def train_phase(
     for step in range(start, num_steps):
         if best is not None and best.finished(step):
             break
-        rate = learning_rate * warmup_cosine(step, num_steps, warmup)
+        rate = learning_rate * warmup_cosine(step, num_steps, WARMUP)
         for group in optimizer.param_groups:
             group["lr"] = device_rate.fill_(rate) if replay else rate
         with _interrupts_let_through():
