@@ -122,10 +122,17 @@ def grounds_table() -> str:
         first = next(score for score in scores if score is not None)
         key = f"{ground}_published_mean"
         row = [title, str(usual_labels(ground)), f"{first.seeds} x {first.n // first.seeds}"]
-        row += ["not run" if score is None else score.text for score in scores]
+        row += [_beside(score, first.seeds) for score in scores]
         body.append([*row, fact(key) if key in published else "none"])
     heads = [name for name, _ in COMPARED.values()]
     return table(["benchmark", "labelled", "training seeds x n", *heads, "published, all labels"], body)
+
+
+def _beside(score: Score | None, seeds: int) -> str:
+    """A cell of a row whose first method had so many training seeds."""
+    if score is None:
+        return "not run"
+    return score.text if score.seeds == seeds else f"{score.text}, {score.seeds} seed{'s' * (score.seeds > 1)}"
 
 
 def draw_grounds(path: Path) -> Path:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import shutil
+import tokenize
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +65,11 @@ def write_tutorial_pages() -> None:
 
 def digest(path: Path) -> str:
     """Short hash of a tutorial's code without docstring, comments and layout: text may change without a new run."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    if ast.get_docstring(tree) is not None:
-        del tree.body[0]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    after = iter(lines[ast.parse("".join(lines)).body[0].end_lineno :])
+    signs = {tokenize.COMMENT: "", tokenize.INDENT: "{", tokenize.DEDENT: "}"}
+    kept = "".join(signs.get(kind, text) for kind, text, *_ in tokenize.generate_tokens(lambda: next(after, "")))
+    return hashlib.sha256("".join(kept.split()).encode()).hexdigest()[:12]  # Pythons part f-strings differently
 
 
 def introduction(path: Path) -> tuple[str, str]:

@@ -4,6 +4,7 @@
 import json
 import shutil
 import sys
+from importlib.metadata import version
 from unittest.mock import Mock
 
 import torch
@@ -23,7 +24,7 @@ def test_what_a_training_writes(trained_run, demonstrations):
     assert config["dataset"] == str(demonstrations)
     assert config["planner"]["steps"] == 20 and config["planner"]["width"] == 8
     assert config["method"] == "koap" and config["controller"]["columns"] == "robot"
-    assert config["versions"]["torch"] == torch.__version__
+    assert config["versions"]["torch"] == version("torch")
     assert summary["labels"]["selected_units"] == 2 and summary["labels"]["trajectories_touched"] == 2
     assert summary["labels"]["total_transitions"] == sum(29 + index for index in range(8))
     controller = Trained.load(trained_run).controller

@@ -47,11 +47,16 @@ def test_a_tutorial_that_is_not_listed_is_an_error(monkeypatch):
 
 def test_the_digest_is_that_of_the_code_not_of_the_text(tmp_path):
     digests = []
-    for number, text in enumerate(("x = 1", "# a word\nx   = 1\n", "x = 2")):
+    for number, text in enumerate(("x = 1", "# a word\nx   = 1\n", "x = 2", "if x:\n    y\nz", "if x:\n    y\n    z")):
         script = tmp_path / f"{number}.py"
-        script.write_text(text)
+        script.write_text(f'"""Docstring {number}."""\n{text}')
         digests.append(tutorial_pages.digest(script))
-    assert digests[0] == digests[1] != digests[2]
+    assert digests[0] == digests[1] and len(set(digests)) == 4
+
+
+def test_the_digest_is_the_same_on_every_python(tmp_path):
+    (tmp_path / "script.py").write_text('"""Docstring."""\nprint(f"{x + 1:.2f} of {len([])}")')
+    assert tutorial_pages.digest(tmp_path / "script.py") == "1635bce882f3"
 
 
 def test_every_tutorial_has_the_output_of_its_code():
