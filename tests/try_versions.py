@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PYTHONS = ("3.10", "3.11", "3.12", "3.13")
+PYTHONS = ("3.11", "3.12", "3.13")
 STRATEGIES = {"lowest": "lowest-direct", "newest": "highest"}
 TESTS = (
     *("tests/test_keys.py", "tests/test_files.py", "tests/test_lookup.py", "tests/tasks", "tests/modules"),
