@@ -33,6 +33,7 @@ COMPARED = {
     "vpt": ("VPT", "#b39ddb"),
     "dp": ("Diffusion Policy", MUTED),
 }
+ONE_SEED = "\N{DAGGER}"  # behind a score of fewer training seeds than its row says
 STEP = 0.9 / len(COMPARED)  # between two bars
 
 
@@ -132,7 +133,7 @@ def _beside(score: Score | None, seeds: int) -> str:
     """A cell of a row whose first method had so many training seeds."""
     if score is None:
         return "not run"
-    return score.text if score.seeds == seeds else f"{score.text}, {score.seeds} seed{'s' * (score.seeds > 1)}"
+    return score.text + ONE_SEED * (score.seeds < seeds)
 
 
 def draw_grounds(path: Path) -> Path:
