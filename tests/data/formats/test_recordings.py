@@ -109,3 +109,32 @@ def test_all_faults_are_told_at_once():
     with pytest.raises(DataError) as caught:
         make_recordings([FRAMES[:1], FRAMES.astype(complex)], [None, np.ones((9, 1))], sources=["left", "right"])
     assert len(caught.value.problems) == 2 and "trajectory left" in str(caught.value)
+
+
+class Frame:
+    """What is read of a data frame of pandas."""
+
+    ndim, shape = 2, (2, 2)
+
+    def __init__(self, columns, values):
+        self.columns, self.values = list(columns), np.asarray(values, dtype=float)
+
+    def __getitem__(self, names):
+        return Frame(names, self.values[:, [self.columns.index(name) for name in names]])
+
+    def __array__(self, dtype=None, copy=None):
+        return self.values
+
+
+def test_columns_of_data_frames_are_matched_by_name():
+    first, second = Frame("ab", [[1, 2], [3, 4]]), Frame("ba", [[2, 1], [4, 3]])
+    recordings = make_recordings([first, second], [Frame(["u"], [[7]]), None])
+    assert (recordings.state_names, recordings.action_names) == (("a", "b"), ("u",))
+    assert np.array_equal(recordings.states[0], recordings.states[1])
+    turned = make_recordings([first, second], action_dim=1, state_names=["b", "a"])
+    assert turned.state_names == ("b", "a") and turned.states[0].tolist() == [[2, 1], [4, 3]]
+    assert make_recordings([first], action_dim=1, state_names=["x", "y"]).state_names == ("x", "y")
+    with pytest.raises(DataError, match="trajectory 1: states here and before do not both have the columns b, c"):
+        make_recordings([first, Frame("ac", [[1, 2], [3, 4]])], action_dim=1)
+    with pytest.raises(DataError, match=r"states must be a list of recordings \[T, d\]"):
+        make_recordings(first, action_dim=1)

@@ -89,7 +89,7 @@ def make_recordings(
     Args:
         states (sequence of array): frames of every trajectory ``[T_i, d]``.
         actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, or
-            None for one without; None for no labels at all.
+            None for one without; None for no labels at all. Columns of data frames are matched by their names.
 
     Keyword Args:
         action_dim (int, optional): number of action columns, needed where no trajectory has actions.
@@ -121,6 +121,8 @@ def make_recordings(
     labels = [str(index) for index in range(len(states))] if sources is None else list(sources)
     faults: list[tuple[str, str]] = []
     what = [f"trajectory {label}" for label in labels]
+    states, state_names = _by_name(states, state_names, "states", what, faults)
+    actions, action_names = _by_name(actions, action_names, "actions", what, faults)
     frames = [_table(value, "states", FRAMES, name, faults) for value, name in zip(states, what, strict=True)]
     width = next((array.shape[1] for array in frames if array is not None), 0)
     known = [
@@ -197,7 +199,7 @@ def wrong_rate(value: Any, name: str) -> list[str]:
 
 
 def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
-    if isinstance(values, (np.ndarray, torch.Tensor)) and values.ndim == 2:
+    if getattr(values, "ndim", None) == 2:  # arrays, and data frames, which would be a list of their names
         raise DataError(source, f"{what} must be a list of recordings {wanted}, got one array {list(values.shape)}")
     with contextlib.suppress(TypeError, RuntimeError):  # what is no sequence; nested tensors
         if not isinstance(values, (str, Path, Mapping)):
@@ -205,6 +207,24 @@ def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
     kind = type(values).__name__
     said = f"{what} must be a sequence of arrays {wanted}, one per trajectory, got {kind}"
     raise DataError(source, f"{said}: files are read by read_recordings (`koap convert`)")
+
+
+def _by_name(
+    tables: list[Any], names: Sequence[str] | None, what: str, labels: Sequence[str], faults: list[tuple[str, str]]
+) -> tuple[list[Any], Sequence[str] | None]:
+    """Brings the columns of data frames into one order, that of ``names`` or of the first; other names are faults."""
+    heads = [list(getattr(table, "columns", ())) for table in tables]
+    order = next(filter(None, heads), [])
+    if not all(isinstance(name, str) for name in order):  # pandas counts what has no names
+        return tables, names
+    for label, head in zip(labels, heads, strict=True):
+        if head and (odd := set(head) ^ set(order)):
+            faults.append((label, f"{what} here and before do not both have the columns {some(sorted(map(str, odd)))}"))
+    order = list(names) if names is not None and set(names) == set(order) else order
+    ordered = [
+        table[order] if head and set(head) == set(order) else table for table, head in zip(tables, heads, strict=True)
+    ]
+    return ordered, order or None if names is None else names
 
 
 def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str, str]]) -> np.ndarray | None:
