@@ -12,7 +12,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.modules.planning.noise_schedule import NUM_TRAIN_STEPS
 from torchrl_koap.objectives import PlannerLoss
-from torchrl_koap.runs.device import default_threads, find_precision, has_bfloat16_units, set_up_torch
+from torchrl_koap.runs.device import default_threads, find_precision, has_bfloat16_units, set_up_torch, torch_as_before
 from torchrl_koap.training.loop import SETTLED, train_phase
 
 
@@ -86,3 +86,12 @@ def test_a_gpu_learns_what_a_processor_learns(replay):
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
     for name, value in average.items():
         torch.testing.assert_close(found_average[name], value, rtol=1e-2, atol=1e-3)
+
+
+def test_threads_and_random_numbers_are_given_back():
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    with pytest.raises(KeyboardInterrupt), torch_as_before():  # a cell that is stopped
+        torch.set_num_threads(threads + 1)
+        torch.manual_seed(torch.initial_seed() + 1)
+        raise KeyboardInterrupt
+    assert torch.get_num_threads() == threads and torch.equal(torch.get_rng_state(), state)

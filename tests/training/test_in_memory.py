@@ -53,7 +53,7 @@ def test_the_weights_of_a_training_bit_for_bit(tmp_path):
     sections = {"planner": PlannerConfig(steps=30, **SMALL), "controller": ControllerConfig(steps=20)}
     train(TrainConfig(dataset=str(folder), out=tmp_path / "run", run=RunConfig(seed=3), **sections))
     data, task = load_ted(folder / "ted")[0], make_demonstrations(name="arm", **few_labels())[1]
-    before = torch.manual_seed(11).get_state()  # train() leaves another one, at which fit() would end too
+    before = torch.manual_seed(11).get_state()
     trained = fit(data, task, planner={"steps": 30, **SMALL}, controller={"steps": 20}, seed=3, progress=False)
     assert torch.equal(torch.get_rng_state(), before)
     assert same_weights(trained.planner, load_tensors(tmp_path / "run" / "planner.safetensors")[0])

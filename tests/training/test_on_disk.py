@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, Trained, train
-from torchrl_koap.data import LabelBudget, open_dataset, save_demonstrations
+from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, Trained, fit, train
+from torchrl_koap.data import LabelBudget, make_demonstrations, open_dataset, save_demonstrations
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.tasks import get_task
@@ -236,3 +236,19 @@ def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):
     assert Trained.load(tmp_path / "other").task.name == "two"
     with pytest.raises(CheckpointError, match="was trained on task 'one', not on 'slow'"):
         train(TrainConfig(out=tmp_path / "wrong", dataset=str(tmp_path / "slow"), **shared))
+
+
+def test_a_training_leaves_the_caller_its_threads_and_random_numbers(tmp_path, demonstrations, planner):
+    threads, state = torch.get_num_threads(), torch.manual_seed(11).get_state()
+    train_tiny(tmp_path / "run", demonstrations, planner, "linear", run=RunConfig(threads=threads + 1))
+    assert torch.get_num_threads() == threads and torch.equal(torch.get_rng_state(), state)
+
+
+def test_fitting_has_the_threads_that_its_options_say(monkeypatch):
+    told = []
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(torch, "set_num_threads", told.append)
+    states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(3)]
+    data, task = make_demonstrations(states, [np.diff(s[:, :2], axis=0) for s in states], control_hz=30)
+    trained = fit(data, task, method="linear", planner=False, progress=False)
+    assert told[0] == trained.config.run.threads == 1

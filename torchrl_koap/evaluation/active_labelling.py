@@ -21,7 +21,7 @@ from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.files import some
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 
@@ -162,6 +162,7 @@ class SuggestConfig:
     plugins: Plugins = ()
 
 
+@torch_as_before()
 def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, Any]:
     """Ranks the unlabelled demonstrations of a run.
 

@@ -25,7 +25,7 @@ from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval
 from torchrl_koap.files import read_json
 from torchrl_koap.runs.config_files import to_json
-from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, find_run, writable_folder
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord  # takes seconds
 
 
+@torch_as_before()
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 

@@ -29,7 +29,7 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.training.trained import Trained
@@ -50,6 +50,7 @@ class InspectConfig(EvalConfig):
     latent_only: bool = False
 
 
+@torch_as_before()
 def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, Any]:
     """Makes the three experiments and looks into the latent space; writes ``inspect.json``.
 

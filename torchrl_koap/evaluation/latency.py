@@ -19,7 +19,7 @@ from torchrl_koap.evaluation.rollouts import device_of
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules import Agent, AsynchronousAgent, PlanningPolicy
 from torchrl_koap.modules.execution.agent import FarStateWarning, percentiles
-from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
@@ -69,6 +69,7 @@ def measure_latency(policy: PlanningPolicy, observation_dim: int) -> dict[str, f
     return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
 
 
+@torch_as_before()
 def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, Any]:
     """Runs :func:`run_control_loop` with a trained policy; ``koap latency`` calls this."""
     if config.steps < 1:

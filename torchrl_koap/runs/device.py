@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import warnings
+from collections.abc import Iterator
 
 import torch
 
@@ -42,6 +44,18 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
 def default_threads() -> int:
     """Threads of a training: what ``OMP_NUM_THREADS`` says, else 1, since two beside another program wait for it."""
     return torch.get_num_threads() if os.environ.get("OMP_NUM_THREADS") else 1
+
+
+@contextlib.contextmanager
+def torch_as_before() -> Iterator[None]:
+    """Gives torch its threads and random numbers back at the end: the caller's program goes on with them."""
+    threads = torch.get_num_threads()
+    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []
+    try:
+        with torch.random.fork_rng(devices):
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def set_up_torch(threads: int | None, device: str) -> None:

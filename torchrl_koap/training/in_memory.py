@@ -22,6 +22,7 @@ from torchrl_koap.data.trajectories import mark_labels
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
+from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.progress import without_progress_bars
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training.controller import check_lengths, learn_controller
@@ -72,7 +73,7 @@ def fit(
             :class:`~torchrl_koap.PlannerConfig` such as ``{"steps": 5000}``; False trains a controller alone. Default:
             the task's options.
         controller (mapping, optional): options of :class:`~torchrl_koap.ControllerConfig`.
-        seed (int): seed of initialisation and batches; torch's generators are left as they were.
+        seed (int): seed of initialisation and batches; torch's generators and threads are left as they were.
         device (str): ``"cpu"`` or ``"cuda"``.
         precision (str): of the planner's matrix products, see :class:`~torchrl_koap.RunConfig`.
         progress (bool): show progress bars.
@@ -128,7 +129,8 @@ def fit(
     if shared is not None and not plans:
         raise ValueError(f"planner: method {config.method!r} samples actions and has no planner")
     bars = contextlib.nullcontext() if progress else without_progress_bars()
-    with torch.random.fork_rng(devices=None if device != "cpu" else []), bars:
+    with torch_as_before(), bars:
+        set_up_torch(config.run.threads, device)
         torch.manual_seed(seed)
         if plans and shared is None and planner is not False:
             shared, results["planner"] = learn_planner(task, config, seen, Phases(), held_out=unseen)

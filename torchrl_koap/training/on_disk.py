@@ -20,7 +20,7 @@ from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import to_json, versions
-from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, progress_bar
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
@@ -91,6 +91,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         task = find_task_of(config.dataset, config.task)
         config = resolve(config, task)
         check_logger(config.run.logger)
+        held.enter_context(torch_as_before())
         set_up_torch(config.run.threads, config.run.device)
         check_resume(run, config)
         _check_networks(task, config)
