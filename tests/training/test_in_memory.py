@@ -237,7 +237,9 @@ def test_refusals():
         fit(data, task, method="dp", planner=planner)
     with pytest.raises(ValueError, match="planner: it plans 2 columns, states of the data have 4"):
         fit(data, task, planner=StatePlanner(TemporalUnet(2, 4), state_dim=2))
-    with pytest.raises(ValueError, match="planner must be a StatePlanner, a mapping of options, None or False, got 3"):
+    with pytest.raises(
+        ValueError, match="planner must be a StatePlanner, a mapping of options, None or False, got int"
+    ):
         fit(data, task, planner=3)
 
 
@@ -310,3 +312,27 @@ def test_plans_of_smooth_motions_at_a_high_rate_do_not_grow_in_a_loop():
             following = planner.sample(frames, torch.zeros(len(frames), *planner.noise_shape))[:, :1]
             frames = torch.cat([frames[:, 1:], following], 1)
     assert frames.diff(dim=1).abs().max() < 3 * max(np.abs(rows).max() for rows in actions)
+
+
+def test_wrong_arguments_are_named():
+    states = few_labels()["states"]
+    data, task = make_demonstrations(**few_labels())
+    for wrong in (states, (data, task)):
+        with pytest.raises(
+            TypeError, match=f"data must be the data of make_demonstrations.*got {type(wrong).__name__}"
+        ):
+            fit(wrong)
+    with pytest.raises(ValueError, match="planner.steps must be a number >= 1, got '500'"):
+        fit(data, task, planner={"steps": "500"})
+    with pytest.raises(ValueError, match=r"planner.steps must be a whole number, got 2\.5"):
+        fit(data, task, planner={"steps": 2.5})
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="device 'cuda' was asked for"):
+            fit(data, task, device="cuda")
+    options = {"device": torch.device("cpu"), "seed": np.int64(3)}
+    assert fit(data, task, planner=False, controller={"steps": 2.0}, progress=False, **options).config.run.seed == 3
+
+
+def test_sections_of_a_training_are_of_their_classes():
+    with pytest.raises(TypeError, match="planner must be a PlannerConfig, got {'steps': 5}"):
+        TrainConfig(out="run", planner={"steps": 5})

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.lookup import lookup
@@ -184,11 +186,24 @@ class TrainConfig:
 
     def __post_init__(self):
         object.__setattr__(self, "out", Path(self.out))  # so that a string will do in Python
+        for section in fields(self):
+            kind: Any = section.default_factory
+            given = getattr(self, section.name)
+            if isinstance(kind, type) and not isinstance(given, kind):
+                raise TypeError(f"{section.name} must be a {kind.__name__}, got {given!r}")
 
 
 def _check(section: str, config: object, **wanted: tuple[str, Callable[[float], bool]]) -> None:
     """Refuses numbers that are not what is wanted; None is left out."""
     for name, (words, fits) in wanted.items():
         value = getattr(config, name)
-        if value is not None and not (math.isfinite(value) and fits(value)):
+        if value is None:
+            continue
+        if not isinstance(value, (int, float, np.number)):
+            raise ValueError(f"{section}.{name} must be a number {words}, got {value!r}")
+        if not (math.isfinite(value) and fits(value)):
             raise ValueError(f"{section}.{name} must be {words}, got {value}")
+        if words not in (_POSITIVE[0], _SHARE[0], _PART[0]):  # 1e4, or a number of NumPy: torch takes neither
+            if value % 1:
+                raise ValueError(f"{section}.{name} must be a whole number, got {value}")
+            object.__setattr__(config, name, int(value))

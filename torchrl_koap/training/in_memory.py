@@ -100,12 +100,19 @@ def fit(
         >>> other.planner is trained.planner, other.results["decoder_fit"]["labels_used"]
         (True, 31)
     """
+    if not isinstance(data, TensorDictBase):
+        wanted = "the data of make_demonstrations(), the first of the two that it returns"
+        raise TypeError(f"data must be {wanted}, got {type(data).__name__}")
+    device = str(device)
     data, task = _prepared(data, task)
     shared = planner if isinstance(planner, StatePlanner) else None
     if shared is not None and shared.state_dim != task.state_dim:
         raise ValueError(f"planner: it plans {shared.state_dim} columns, states of the data have {task.state_dim}")
     if shared is None and not (planner is None or planner is False or isinstance(planner, Mapping)):
-        raise ValueError(f"planner must be a StatePlanner, a mapping of options, None or False, got {planner!r}")
+        raise ValueError(
+            f"planner must be a StatePlanner, a mapping of options, None or False, got {type(planner).__name__}"
+        )
+    set_up_torch(None, device)
     # a planner from elsewhere may have seen all trajectories
     given = {"held_out": 0.0} | ({} if shared is None else sizes_of(shared))
     options = given if shared is not None or planner is False else dict(planner or {})
@@ -119,6 +126,7 @@ def fit(
         ),
         task,
     )
+    seed = config.run.seed
     held_out = choose_held_out(data, config.planner.held_out, seed=seed)
     if not data[keys.HAS_ACTION].any():
         raise ValueError(f"none of the {len(data)} steps has an action: there are no labels to learn from")
