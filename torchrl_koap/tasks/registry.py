@@ -35,7 +35,8 @@ def register_task(task: Task) -> Task:
         raise TypeError(f"wanted a Task, got {type(task).__name__}")
     known = TASKS.setdefault(task.name, task)
     if known != task:
-        raise ValueError(f"another task named {task.name!r} is registered already; choose another name")
+        cure = f"choose another name, or first `del torchrl_koap.tasks.TASKS[{task.name!r}]`"
+        raise ValueError(f"another task named {task.name!r} is registered already; {cure}")
     return known
 
 
