@@ -105,3 +105,8 @@ def test_another_run_is_not_overwritten(trained_run, tmp_path):
     with pytest.raises(RunDirectoryError, match="holds another run than"):
         copy_run(trained_run, tmp_path / "mine")
     assert json.loads((tmp_path / "mine" / "config.json").read_text())["run"]["seed"] == 9
+
+
+def test_what_is_no_path_is_no_run():
+    with pytest.raises(TypeError, match=r"must be named by its folder, got dict: train\(TrainConfig"):
+        find_run({})

@@ -44,7 +44,7 @@ def check_resume(run: RunDirectory, config: TrainConfig) -> None:
             raise RunDirectoryError(f"{run.path} holds {', '.join(left)} but no config.json; choose another --out")
         return
     if not config.run.resume:
-        raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
+        raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it (run.resume)")
     saved = read_config(run)
     # a folder that is gone was moved, probably together with this run: there is nothing to compare with
     source = saved.planner.source

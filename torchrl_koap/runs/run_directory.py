@@ -187,8 +187,11 @@ def pretrained_folders() -> dict[str, Path]:
     return {folder.name: folder for folder in reversed(folders) if (folder / "config.json").exists()}
 
 
-def find_run(name: str | Path) -> Path:
+def find_run(name: object) -> Path:
     """The folder of a run: a path as it is, ``pretrained:NAME`` looked up; an unknown name suggests the nearest."""
+    if not isinstance(name, (str, Path)):
+        made = "train(TrainConfig(...)) writes one, fit() does not"
+        raise TypeError(f"a run must be named by its folder, got {type(name).__name__}: {made}")
     name = str(name)
     if not name.startswith(PREFIX):
         return Path(name)
