@@ -147,3 +147,8 @@ def test_what_cannot_be_saved_or_executed(own, tmp_path):
     for part in ("planner", "controller"):
         with pytest.raises(ValueError, match=f"a policy needs planner and controller: no {part} was trained here"):
             replace(own, **{part: None}).policy()
+
+
+def test_a_training_is_shown_in_one_line(own, trained_run):
+    assert repr(own) == "Trained(task='my_arm', method='linear', folder=None)"
+    assert repr(Trained.load(trained_run)) == f"Trained(task='avoiding', method='koap', folder='{trained_run}')"

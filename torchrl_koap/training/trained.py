@@ -69,6 +69,10 @@ class Trained:
     folder: Path | None = None
     cameras: Mapping[str, Projection] = field(default_factory=dict)
 
+    def __repr__(self) -> str:  # the fields' own fill pages
+        where = self.folder and str(self.folder)
+        return f"Trained(task={self.task.name!r}, method={self.config.method!r}, folder={where!r})"
+
     @classmethod
     def load(cls, where: str | Path, *, plugins: Sequence[str] = ()) -> Trained:
         """Loads a run directory, ``"pretrained:NAME"``, or a file of :meth:`save`.
