@@ -152,3 +152,18 @@ def test_recordings_without_labels_that_lie_elsewhere(shift, labelled, told):
     found = list(unlabelled_warnings(frames, known, called, ["x", "y"]))
     where = "'x' lie far from all labelled trajectories in 2 of 6 without labels (take 8, take 9)"
     assert [where in said for said in found] == [True] * told
+
+
+@pytest.mark.parametrize(
+    ("share", "columns", "rests", "told"),
+    [(0.01, 2, False, True), (0.0, 2, False, True), (0.01, 1, False, False), (0.01, 2, True, False)],
+)
+def test_recordings_without_labels_in_a_smaller_unit_or_with_sensors_off(share, columns, rests, told):
+    """Pressures in bar instead of kPa, or an arm that was led by hand; other columns move as usual."""
+    frames = [np.hstack([np.sin(TIME + index), np.cos(TIME), 100 * TIME, 90 * TIME]) for index in range(10)]
+    for index in (8, 9, *([0] if rests else [])):  # what also rests with labels is a part that may rest
+        frames[index][:, 4 - columns :] *= share
+    called, known = [f"take {index}" for index in range(10)], [index < 4 for index in range(10)]
+    found = list(unlabelled_warnings(frames, known, called, ["x", "y", "p", "q"]))
+    where = "'p', 'q' move less than a tenth as far as in labelled trajectories in 2 of 6 without labels (take 8, take"
+    assert [where in said for said in found] == [True] * told

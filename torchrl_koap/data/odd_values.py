@@ -13,7 +13,8 @@ from torchrl_koap.files import some
 AWAY, OFTEN = 10.0, 3  # a mark lies that many ranges of the others away from them, and stands so often
 FILLS = 0.1  # share of its range that is the standard deviation of a counter that wraps, at least
 OTHER = 20.0  # times as far as in most trajectories
-AFAR = 0.1  # share of trajectories without labels that lie far from those with some
+AFAR = 0.1  # share of trajectories without labels that differ from those with some
+LESS = 10.0  # times less far than with labels: sensor noise alone may still move
 
 
 def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -201,7 +202,9 @@ def unlabelled_warnings(
 ) -> Iterator[str]:
     """Finds columns of ``[T_i, d]`` where one in ten of those without labels is mostly where no labelled one is.
 
-    The range of the labelled ones is widened by half of it on both sides. ``known`` says which ones have labels.
+    The range of the labelled ones is widened by half of it on both sides. Also found are columns that all labelled ones
+    move, and one in ten of the others at most a tenth as far, two or more of them together. ``known`` says which ones
+    have labels.
     """
     labelled, others = (
         [frames for frames, one in zip(trajectories, known, strict=True) if one == has] for has in (True, False)
@@ -211,12 +214,28 @@ def unlabelled_warnings(
     low, high = (end(np.concatenate(labelled), axis=0) for end in (np.min, np.max))
     room = (high - low) / 2
     out = np.stack([((frames < low - room) | (frames > high + room)).mean(0) > 0.5 for frames in others])
-    far = np.flatnonzero((out.mean(0) > AFAR) & (room > 0))
-    if len(far):
-        unknown = [name for name, one in zip(called, known, strict=True) if not one]
-        where = np.flatnonzero(out[:, far].any(1))
-        yield (
-            f"columns {some([repr(names[column]) for column in far])} lie far from all labelled trajectories in"
-            f" {len(where)} of {len(others)} without labels ({some([unknown[index] for index in where])}): another"
-            " origin or unit, or places that no label shows? use one origin, or label some"
-        )
+    out &= room > 0
+    with_labels, without = (np.stack([np.ptp(frames, axis=0) for frames in part]) for part in (labelled, others))
+    least = np.median(with_labels, axis=0) / LESS
+    rests = (without < least) & (with_labels > least).all(0)
+    rests &= rests.sum(1, keepdims=True) > 1  # one alone may have its goal near
+    unknown = [name for name, one in zip(called, known, strict=True) if not one]
+    for odd, said, why in (
+        (
+            out,
+            "lie far from all labelled trajectories",
+            "another origin or unit, or places that no label shows? use one origin, or label some",
+        ),
+        (
+            rests,
+            "move less than a tenth as far as in labelled trajectories",
+            "another unit, or sensors that were off? bring them to one unit; leave out what was not measured",
+        ),
+    ):
+        found = np.flatnonzero(odd.mean(0) > AFAR)
+        if len(found):
+            where = [unknown[index] for index in np.flatnonzero(odd[:, found].any(1))]
+            yield (
+                f"columns {some([repr(names[column]) for column in found])} {said} in {len(where)} of {len(others)}"
+                f" without labels ({some(where)}): {why}"
+            )

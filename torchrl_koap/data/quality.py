@@ -46,10 +46,10 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     """Finds what is unlikely in demonstrations, flat data ``[N]`` with ``state``, a sentence each.
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, are in another
-    unit, reach a place beyond 100 m or rad, or lie far from all labelled ones; state columns that never change, equal
-    another one, leap, hold marks of what is missing, are clocks, quaternions that change their sign or angles a turn
-    apart, or have no unit and move much farther than others; frames at both ends in which nothing moves; actions of
-    another kind than declared, that never change, leap for one frame or hold marks; a command that no
+    unit, reach a place beyond 100 m or rad, or lie far from all labelled ones or move much less; state columns that
+    never change, equal another one, leap, hold marks of what is missing, are clocks, quaternions that change their sign
+    or angles a turn apart, or have no unit and move much farther than others; frames at both ends in which nothing
+    moves; actions of another kind than declared, that never change, leap for one frame or hold marks; a command that no
     action follows; labels that stand alone; an unlikely rate; plans that are short against the motion.
 
     ``names`` are what to call each trajectory, such as its file. Default: their numbers.
