@@ -79,6 +79,17 @@ def test_rollouts_that_do_not_leave_their_start_are_told(arm_run, monkeypatch):
     assert found["faults"][-1].startswith(said)
 
 
+def test_rollouts_that_start_elsewhere_are_told(arm_run, monkeypatch):
+    """A sensor whose zero has drifted, or columns in another order, and the policy is not to blame."""
+    own = Reach._observe
+    elsewhere = "rollouts start where no recording does: q2 at "
+    asked = {"episodes": 5, "env": "toy_gym:ToyReach-v0", "env_kwargs": ("count=99",), "threads": 1}
+    for shift, told in ((0.0, 0), (40.0, 1)):
+        monkeypatch.setattr(Reach, "_observe", lambda env, shift=shift: own(env) + [0, shift, 0, 0])
+        for found in (evaluate(arm_run, EvalConfig(**asked)), inspect(arm_run, InspectConfig(**asked))):
+            assert sum(fault.startswith(elsewhere) for fault in found.get("faults", ())) == told
+
+
 def test_the_mean_return_stands_beside_success(arm_run):
     found = evaluate(arm_run, EvalConfig(episodes=2, env="toy_gym:ToyReachWon-v0", threads=1))
     assert found["mean_return"] == found["rates"]["success"]["rate"] == 1.0

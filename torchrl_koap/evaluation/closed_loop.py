@@ -17,7 +17,7 @@ import torch
 
 from torchrl_koap.evaluation.config import EvalConfig, environment_arguments
 from torchrl_koap.evaluation.latency import measure_latency
-from torchrl_koap.evaluation.loop_on_labels import limited_commands, standing_faults
+from torchrl_koap.evaluation.loop_on_labels import limited_commands, standing_faults, start_faults
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
@@ -116,8 +116,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
         if data is not None:
             pairs = zip(episodes, rows, strict=True)
-            failed = [episode for episode, row in pairs if row["outcome"] not in ("success", "error")]
+            sound = [(episode, row["outcome"]) for episode, row in pairs if row["outcome"] != "error"]
+            failed = [episode for episode, outcome in sound if outcome != "success"]
             result["faults"] += standing_faults(failed, data)
+            result["faults"] += start_faults([episode for episode, _ in sound], data, task) if failed else []
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
                 "no episode ended with a reward of its own, and info does not say at the first step what success is:"

@@ -21,8 +21,9 @@ from torchrl_koap.evaluation.diagnosis import (
     planner_rollout,
     tracking_errors,
 )
-from torchrl_koap.evaluation.findings import NEAR, describe_inspection
+from torchrl_koap.evaluation.findings import GOOD, NEAR, describe_inspection
 from torchrl_koap.evaluation.latent_space import analyse_latent
+from torchrl_koap.evaluation.loop_on_labels import start_faults
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import outcome_of
@@ -135,8 +136,10 @@ def _experiments(
             planned = planner_rollout(planner, start, interval=interval, max_steps=steps, seed=config.seed).cpu()
             found["planner_alone"] = rate(task.goal_reached(planned).any(-1).tolist())
         bar.update()
-    if where.record is not None and where.record.faults():
-        found["faults"] = where.record.faults()
+    if where.record is not None:
+        elsewhere = start_faults(closed, data, task) if found["both"]["rate"] < GOOD else []
+        if faults := [*where.record.faults(), *elsewhere]:
+            found["faults"] = faults
     return found
 
 

@@ -17,16 +17,19 @@ from torch import Tensor
 from torchrl_koap.data.trajectories import begins, labelled_episodes, trajectory_lengths
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.evaluation.findings import LEAVES, STAYS, UNSTABLE, loop_faults
+from torchrl_koap.files import some
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
 from torchrl_koap.modules.execution.agent import FarStateWarning
 from torchrl_koap.modules.execution.command_limits import ends_of
 from torchrl_koap.modules.ridge import ridge
+from torchrl_koap.tasks import Task
 from torchrl_koap.training.policy_facts import command_ranges
 from torchrl_koap.training.trained import Trained
 
 STEPS, ROBOTS = 300, 16
 AWAY = 1e12  # where states have run away: far from what a network's type can square
+_FEW, _ASIDE = 5, 0.02  # rollouts that say where all start; share of its range by which a column starts elsewhere
 _EXPLAINED = 0.5  # of the variance of changes, below which labels do not say how states follow actions
 _SMOOTH = 8  # frames that are averaged before the way of a rollout is measured
 _DRIFT = 1.0  # standard deviations that recorded actions may end beside their recording
@@ -133,6 +136,22 @@ def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> l
     stay = sum(bool(each[usual > 0].median() < STAYS) for each in ways)
     said = f"{stay} of {len(failed)} failed rollouts get less than {STAYS:g} times as far from their start as"
     return [f"{said} demonstrations; {LEAVES}"] if stay else []
+
+
+def start_faults(rollouts: Sequence[TensorDictBase], data: TensorDictBase, task: Task) -> list[str]:
+    """Names columns in which nine in ten of at least five rollouts ``[T]`` start on one side of all recordings."""
+    if len(rollouts) < _FEW:
+        return []
+    observed = data[OBSERVATION].double()
+    (low, high), (least, most) = (torch.aminmax(rows, dim=0) for rows in (observed[begins(data)], observed))
+    seen = torch.stack([episode[OBSERVATION][0].double() for episode in rollouts])
+    room = _ASIDE * (most - least)
+    out = (seen.quantile(0.1, 0) > high + room) | (seen.quantile(0.9, 0) < low - room)
+    origin = torch.tensor((task.origins or (0.0,))[0], dtype=torch.float64)
+    table = torch.stack([seen.median(0).values, low, high], -1) + origin.unsqueeze(-1)
+    rows = [(task.observation_names[column], *table[column].tolist()) for column in out.nonzero().flatten().tolist()]
+    said = some([f"{name} at {start:.4g} (recordings: {low:.4g} to {high:.4g})" for name, start, low, high in rows])
+    return [f"rollouts start where no recording does: {said}: another zero, unit or order of columns?"] if rows else []
 
 
 def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, float]:
