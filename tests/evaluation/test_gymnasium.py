@@ -114,6 +114,14 @@ def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
     assert any("failed by an error of the environment: seed 11, step 1" in fault for fault in found["faults"])
 
 
+def test_an_error_of_the_environment_is_the_first_finding_of_an_inspection(arm_run):
+    asked = InspectConfig(episodes=3, seed=10, env="toy_gym:ToyBreaks-v0", env_kwargs=("count=99",), threads=1)
+    found = inspect(arm_run, asked)
+    assert found["findings"].startswith("1 episodes failed by an error of the environment: seed 11, step 1: reset")
+    with pytest.raises(ValueError, match="no episode is without an error of the environment: 1 episodes failed"):
+        inspect(arm_run, replace(asked, episodes=1, seed=11))
+
+
 def test_an_episode_that_an_error_ended_is_not_in_the_mean_return(arm_run):
     config = EvalConfig(episodes=3, seed=10, env="toy_gym:ToyBreaks-v0", env_kwargs=("terminates=won",), threads=1)
     found = evaluate(arm_run, config)

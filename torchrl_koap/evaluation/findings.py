@@ -56,7 +56,7 @@ def _describe_experiments(result: Mapping[str, Any]) -> str:
     planner, controller, both = (result[name]["rate"] if name in result else None for name in EXPERIMENTS)
     if both >= GOOD:
         return "nothing to find: the closed loop succeeds"
-    parts = []
+    parts = [fault for fault in result.get("faults", ()) if "error of the environment" in fault]
     if planner is not None and planner < GOOD:
         parts.append(f"the planner alone reaches the goal in {planner:.0%} of the episodes only")
     if "recordings_left" in result:

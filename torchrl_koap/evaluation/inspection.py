@@ -68,7 +68,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         dict: what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, and ``findings``.
 
     Raises:
-        ValueError: for a run without a planner, or a task without an environment.
+        ValueError: for a run without a planner, a task without an environment, or if it raises errors in all episodes.
         RunDirectoryError: if the folder is no finished run, or its demonstrations are not there or others.
 
     Examples:
@@ -116,8 +116,10 @@ def _experiments(
     with progress_bar(3, "experiments", unit="experiment") as bar:
         closed = roll_out(policy, where.make_env, seeds, **options)
         bar.update()
+        found["both"] = rate([outcome_of(episode) == "success" for episode in closed])
+        if not (closed := [episode for episode in closed if outcome_of(episode) != "error"]):
+            raise ValueError(f"no episode is without an error of the environment: {where.record.faults()[-1]}")
         found |= {
-            "both": rate([outcome_of(episode) == "success" for episode in closed]),
             "plan_to_execution": tracking_errors(task, closed, interval),
             "distance_to_demonstrations": distance_to_demonstrations(task, closed, data),
         }
