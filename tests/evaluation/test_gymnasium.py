@@ -12,6 +12,7 @@ from toy_gym import NAMES, Reach
 
 from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, save_demonstrations, train
 from torchrl_koap.evaluation import InspectConfig, closed_loop, inspect
+from torchrl_koap.evaluation.config import environment_arguments
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.inspection_plots import draw_experiments
@@ -165,6 +166,13 @@ def test_rollouts_are_not_overwritten_by_errors_on_recorded_data(arm_run, tmp_pa
     with pytest.raises(ValueError, match="eval.json holds rollouts in toy_gym:ToyReach-v0: name another folder"):
         evaluate(arm_run, EvalConfig(threads=1))
     assert evaluate(arm_run, EvalConfig(threads=1, out=tmp_path / "errors"))["kind"] == "offline"
+
+
+def test_arguments_of_an_environment_are_numbers_with_a_point_at_their_end():
+    """Else an environment gets the text 15., and every episode fails."""
+    words = ("a=15.", "b=-.5", "c=3", "d=v1.0", "e=[1, 2]", "f=1.2.3", "g=007")
+    wanted = {"a": 15.0, "b": -0.5, "c": 3, "d": "v1.0", "e": [1, 2], "f": "1.2.3", "g": "007"}
+    assert environment_arguments(words) == wanted
 
 
 def test_success_keys_are_for_environments(trained_run):

@@ -89,5 +89,6 @@ def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
         try:
             found[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))
         except ValueError:
-            found[name] = value
+            plain = value.removeprefix("-").replace(".", "", 1)  # 15. and .5 are numbers too, which JSON does not know
+            found[name] = float(value) if "." in value and plain.isdecimal() else value
     return found
