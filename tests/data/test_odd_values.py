@@ -167,3 +167,4 @@ def test_recordings_without_labels_in_a_smaller_unit_or_with_sensors_off(share, 
     found = list(unlabelled_warnings(frames, known, called, ["x", "y", "p", "q"]))
     where = "'p', 'q' move less than a tenth as far as in labelled trajectories in 2 of 6 without labels (take 8, take"
     assert [where in said for said in found] == [True] * told
+    assert all(said.endswith("leave recordings out, not the columns") for said in found)

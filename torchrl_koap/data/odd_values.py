@@ -229,7 +229,7 @@ def unlabelled_warnings(
         (
             rests,
             "move less than a tenth as far as in labelled trajectories",
-            "another unit, or sensors that were off? bring them to one unit; leave out what was not measured",
+            "another unit, or sensors that were off? bring them to one unit; leave recordings out, not the columns",
         ),
     ):
         found = np.flatnonzero(odd.mean(0) > AFAR)
