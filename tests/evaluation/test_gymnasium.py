@@ -5,10 +5,11 @@ import json
 import sys
 from dataclasses import replace
 
+import gymnasium
 import pytest
 from offline_runs import record
 from tiny_runs import koap
-from toy_gym import NAMES, Reach
+from toy_gym import NAMES
 
 from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, save_demonstrations, train
 from torchrl_koap.evaluation import InspectConfig, closed_loop, inspect
@@ -72,8 +73,9 @@ def test_step_limit_success_and_arguments_are_said(arm_run, capsys):
 
 
 def test_rollouts_that_do_not_leave_their_start_are_told(arm_run, monkeypatch):
-    own = Reach.step
-    monkeypatch.setattr(Reach, "step", lambda env, action: own(env, 0 * action))
+    made = type(gymnasium.make("toy_gym:ToyReach-v0").unwrapped)  # another test may have imported it anew
+    own = made.step
+    monkeypatch.setattr(made, "step", lambda env, action: own(env, 0 * action))
     asked = EvalConfig(episodes=2, env="toy_gym:ToyReach-v0", env_kwargs=("length=40", "count=99"), threads=1)
     found = evaluate(arm_run, asked)
     said = "2 of 2 failed rollouts get less than 0.2 times as far from their start as demonstrations; cut pauses"
@@ -82,11 +84,12 @@ def test_rollouts_that_do_not_leave_their_start_are_told(arm_run, monkeypatch):
 
 def test_rollouts_that_start_elsewhere_are_told(arm_run, monkeypatch):
     """A sensor whose zero has drifted, or columns in another order, and the policy is not to blame."""
-    own = Reach._observe
+    made = type(gymnasium.make("toy_gym:ToyReach-v0").unwrapped)
+    own = made._observe
     elsewhere = "rollouts start where no recording does: q2 at "
     asked = {"episodes": 5, "env": "toy_gym:ToyReach-v0", "env_kwargs": ("count=99",), "threads": 1}
     for shift, told in ((0.0, 0), (40.0, 1)):
-        monkeypatch.setattr(Reach, "_observe", lambda env, shift=shift: own(env) + [0, shift, 0, 0])
+        monkeypatch.setattr(made, "_observe", lambda env, shift=shift: own(env) + [0, shift, 0, 0])
         for found in (evaluate(arm_run, EvalConfig(**asked)), inspect(arm_run, InspectConfig(**asked))):
             assert sum(fault.startswith(elsewhere) for fault in found.get("faults", ())) == told
 

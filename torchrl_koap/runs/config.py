@@ -172,6 +172,9 @@ class TrainConfig:
         controller: its variant and training (default: the method's).
         execution: how plans become actions (default: the task's).
         run: seed, machine, log.
+
+    Raises:
+        TypeError: for a section that is not of its class, such as a dictionary.
     """
 
     dataset: str | None = None
