@@ -6,7 +6,7 @@ import json
 import pytest
 
 from torchrl_koap import ControllerConfig, ExecutionConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
-from torchrl_koap.runs.config_files import changed_options, from_json, to_json, version_of
+from torchrl_koap.runs.config_files import changed_options, code_checksum, from_json, to_json, version_of
 from torchrl_koap.runs.run_directory import RunDirectoryError
 
 
@@ -68,3 +68,11 @@ def test_changes_are_named_with_their_section():
 
 def test_a_package_without_metadata_has_no_version():
     assert version_of("no_such_package") == "MISSING"
+
+
+def test_the_checksum_of_the_code_is_that_of_names_and_contents(tmp_path):
+    for number, (name, text) in enumerate((("a.py", "x = 1"), ("a.py", "x = 1"), ("a.py", "x = 2"), ("b.py", "x = 1"))):
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / name).write_text(text)
+    one, same, changed, renamed = (code_checksum(tmp_path / str(number)) for number in range(4))
+    assert one == same and len({one, changed, renamed, code_checksum()}) == 4

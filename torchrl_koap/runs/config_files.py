@@ -57,9 +57,9 @@ def versions() -> dict[str, str]:
 
 
 @functools.cache
-def code_checksum() -> str:
+def code_checksum(root: Path = Path(__file__).parents[1]) -> str:
     """Computes the checksum of the modules of this package, which change in a checkout without another version."""
-    digest, root = hashlib.sha256(), Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
         digest.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
     return digest.hexdigest()[:12]
