@@ -103,8 +103,8 @@ print("largest eigenvalues of K:", [round(value, 3) for value in radii[:4].tolis
 planner = fit(data, task, method="linear", planner={"steps": 600}, progress=False).planner
 policy = make_policy(planner, model.eval(), state_of=task.state_columns)
 env = PolicyEnv(AvoidingEnv(num_envs=8, max_steps=task.max_steps), policy)
+env.set_seed(0)  # before the collector, which begins the first episodes
 collector = Collector(env, policy, frames_per_batch=8 * 100, total_frames=8 * 100)
-collector.set_seed(0)
 batch = next(iter(collector))
 collector.shutdown()
 xy = batch["observation"][..., task.observation["measured_xy"]]  # [8, 100, 2]

@@ -111,8 +111,9 @@ def policy_transforms(
 class PolicyEnv(TransformedEnv):
     """An environment that also returns what a policy reads: the last observations, and start noise.
 
-    ``set_seed`` fixes the whole rollout; without it the noise is another in every environment. With the same seed
-    an :class:`~torchrl_koap.modules.Agent` gives the same actions in the first episode. It may stand inside of
+    ``set_seed`` fixes the whole rollout; without it the noise is another in every environment. Call it before a
+    collector is made, which begins the first episodes at once. With the same seed an
+    :class:`~torchrl_koap.modules.Agent` gives the same actions in the first episode. It may stand inside of
     :class:`torchrl.envs.SerialEnv`, :class:`torchrl.envs.ParallelEnv` and collectors, or around a
     :class:`torchrl.envs.SerialEnv`.
 
