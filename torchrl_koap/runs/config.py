@@ -25,6 +25,7 @@ COLUMNS = ("robot", "all", "related")
 _POSITIVE, _COUNT, _FROM_0 = ("> 0", lambda v: v > 0), (">= 1", lambda v: v >= 1), (">= 0", lambda v: v >= 0)
 _FRAMES = (f">= 1 and <= {HISTORY}", lambda v: 1 <= v <= HISTORY)
 _SHARE, _PART = ("> 0 and <= 1", lambda v: 0 < v <= 1), (">= 0 and < 1", lambda v: 0 <= v < 1)
+_WHOLE = (_COUNT, _FROM_0, _FRAMES)
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,7 @@ def _check(section: str, config: object, **wanted: tuple[str, Callable[[float], 
             raise ValueError(f"{section}.{name} must be a number {words}, got {value!r}")
         if not (math.isfinite(value) and fits(value)):
             raise ValueError(f"{section}.{name} must be {words}, got {value}")
-        if words not in (_POSITIVE[0], _SHARE[0], _PART[0]):  # 1e4, or a number of NumPy: torch takes neither
+        if (words, fits) in _WHOLE:  # torch takes neither 1e4 nor NumPy's numbers
             if value % 1:
                 raise ValueError(f"{section}.{name} must be a whole number, got {value}")
             object.__setattr__(config, name, int(value))
