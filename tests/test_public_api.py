@@ -14,8 +14,10 @@ from torchrl_koap import (
     PlannerConfig,
     TrainConfig,
     evaluate,
+    run_study,
     train,
 )
+from torchrl_koap.evaluation import inspect, suggest
 
 PLAIN = {
     "labels": LabelConfig(count=2),
@@ -32,6 +34,21 @@ def test_every_name_is_there():
 def test_an_unknown_name_is_named():
     with pytest.raises(AttributeError, match="module 'torchrl_koap' has no attribute 'trian'"):
         torchrl_koap.trian  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("call", "kind"),
+    [
+        (lambda given: train(given), "TrainConfig"),
+        (lambda given: evaluate("runs/none", given), "EvalConfig"),
+        (lambda given: inspect("runs/none", given), "InspectConfig"),
+        (lambda given: suggest("runs/none", given), "SuggestConfig"),
+        (lambda given: run_study(given), "Study"),
+    ],
+)
+def test_options_of_another_kind_are_refused(call, kind):
+    with pytest.raises(TypeError, match=rf"options must be {kind}\(...\), got int 3"):
+        call(3)
 
 
 def test_python_trains_and_evaluates_what_the_shell_does(trained_run, demonstrations, tmp_path):

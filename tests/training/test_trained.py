@@ -70,6 +70,9 @@ def test_an_unfinished_training_is_told_from_a_damaged_one(trained_run, tmp_path
 def test_a_policy_follows_plans_as_it_was_trained_for_unless_asked(own):
     assert own.policy().execution == own.execution == Execution(replan_interval=3, blend=0.5)
     assert own.policy(Execution("open_loop", blend=0.0)).execution == Execution("open_loop", blend=0.0)
+    assert own.policy(ExecutionConfig(blend=0.0)).execution == Execution(replan_interval=3, blend=0.0)
+    with pytest.raises(TypeError, match=r"options must be ExecutionConfig\(...\), got int 3"):
+        own.policy(3)
     with pytest.raises(ValueError, match="unknown option of an execution 'temprature'; did you mean 'temperature'?"):
         load_policy(own, temprature=0.1)
     assert load_policy(own, blend=0.1).execution == Execution(replan_interval=3, blend=0.1)

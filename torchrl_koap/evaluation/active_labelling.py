@@ -21,6 +21,7 @@ from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.files import some
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.runs.config import given_options
 from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
@@ -183,7 +184,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
         >>> from torchrl_koap.evaluation import SuggestConfig, suggest
         >>> suggest("runs/koap", SuggestConfig(count=3))["suggestions"]  # doctest: +SKIP
     """
-    config = SuggestConfig() if config is None else config
+    config = given_options(config, SuggestConfig)
     set_up_torch(1, "cpu")
     trained = Trained.load(run, plugins=config.plugins)
     controller = trained.controller

@@ -24,6 +24,7 @@ from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval
 from torchrl_koap.files import read_json
+from torchrl_koap.runs.config import given_options
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import PluginError, load_plugins
@@ -68,7 +69,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         >>> result["rates"]["success"]["episodes"]
         2
     """
-    config = EvalConfig() if config is None else config
+    config = given_options(config, EvalConfig)
     set_up_torch(config.threads, config.device)
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task

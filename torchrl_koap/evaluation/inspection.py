@@ -30,6 +30,7 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.runs.config import given_options
 from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
@@ -75,7 +76,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         >>> from torchrl_koap.evaluation import InspectConfig, inspect
         >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
     """
-    config = InspectConfig() if config is None else config
+    config = given_options(config, InspectConfig)
     set_up_torch(config.threads, config.device)
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,8 @@ _POSITIVE, _COUNT, _FROM_0 = ("> 0", lambda v: v > 0), (">= 1", lambda v: v >= 1
 _FRAMES = (f">= 1 and <= {HISTORY}", lambda v: 1 <= v <= HISTORY)
 _SHARE, _PART = ("> 0 and <= 1", lambda v: 0 < v <= 1), (">= 0 and < 1", lambda v: 0 <= v < 1)
 _WHOLE = (_COUNT, _FROM_0, _FRAMES)
+
+_Options = TypeVar("_Options")
 
 
 @dataclass(frozen=True)
@@ -211,3 +213,16 @@ def _check(section: str, config: object, **wanted: tuple[str, Callable[[float], 
             if value % 1:
                 raise ValueError(f"{section}.{name} must be a whole number, got {value}")
             object.__setattr__(config, name, int(value))
+
+
+def given_options(given: Any, kind: type[_Options]) -> _Options:
+    """Returns the options that a function was given, or the defaults of their kind where it was given None.
+
+    Raises:
+        TypeError: for anything else, such as a number or a folder; the message names the kind.
+    """
+    if given is None:
+        return kind()
+    if not isinstance(given, kind):
+        raise TypeError(f"options must be {kind.__name__}(...), got {type(given).__name__} {given!r}")
+    return given

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data import flatten_trajectories, open_dataset
 from torchrl_koap.data.label_budget import subsample_trajectories
+from torchrl_koap.runs.config import given_options
 from torchrl_koap.runs.config_files import changed_options, from_json, to_json, versions
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.resume import check_data
@@ -68,7 +69,7 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         ...
         ValueError: unknown method 'kaop'; did you mean 'koap'?
     """
-    before = _read_study(study.out)
+    before = _read_study(given_options(study, Study).out)
     study = complete(study, () if before is None else before.run.plugins)
     cells, root = check_study(study), RunDirectory(study.out)
     _check_folder(study)

@@ -18,7 +18,7 @@ from torchrl_koap.data.quality import plan_coverage
 from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.modules import StatePlanner
-from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config import TrainConfig, given_options
 from torchrl_koap.runs.config_files import to_json, versions
 from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import load_plugins
@@ -81,7 +81,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         >>> trained.results["labels"]["labelled_transitions"], trained.results["labels"]["total_transitions"]
         (58, 174)
     """
-    run = RunDirectory(config.out)
+    run = RunDirectory(given_options(config, TrainConfig).out)
     with ExitStack() as held:
         mine = (run.path / ".lock").exists()  # a new folder is not made before the options are known to do
         if mine:

@@ -17,9 +17,9 @@ from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.data.ted import source_names
 from torchrl_koap.files import some
-from torchrl_koap.modules import Execution, PlanningPolicy, StatePlanner, make_policy
+from torchrl_koap.modules import Execution, ExecutionConfig, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.modules.execution.followers import Follower
-from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config import TrainConfig, given_options
 from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryError, find_run, no_data
@@ -186,11 +186,14 @@ class Trained:
         """Default options of how its plans become actions."""
         return self.config.execution.on(Execution())
 
-    def policy(self, execution: Execution | None = None, *, follower: Follower | None = None) -> PlanningPolicy:
+    def policy(
+        self, execution: Execution | ExecutionConfig | None = None, *, follower: Follower | None = None
+    ) -> PlanningPolicy:
         """Makes a policy of the networks: observations in, an action per control step out.
 
         Args:
-            execution (Execution, optional): how plans become actions. Default: as it was trained for.
+            execution (Execution or ExecutionConfig, optional): how plans become actions; what is None, as it was
+                trained for.
 
         Keyword Args:
             follower (Follower, optional): follows plans in place of the controller.
@@ -203,7 +206,8 @@ class Trained:
             ValueError: as :func:`~torchrl_koap.modules.make_policy`, for a strategy of plans where actions are sampled,
                 or where a planner or a controller was trained alone.
         """
-        execution = self.execution if execution is None else execution
+        if not isinstance(execution, Execution):
+            execution = given_options(execution, ExecutionConfig).on(self.execution)
         missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
         if self.method.plans and missing:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
