@@ -25,6 +25,8 @@ ASKED, FOUND = "cell.json", "result.json"
 # evaluation seeds of a training seed lie so far from the next one's: rollouts that differ in nothing but the training
 # would count as 180 where they are hardly more than 60
 NOISE_STEP = 1000
+Result = tuple[dict[str, Any], dict[tuple[int, int], float]]
+"""A row, and outcomes as :data:`~torchrl_koap.studies.paired_comparison.Outcome`."""
 _MAY_CHANGE = ("dataset", "out", "planner.source", "run.plugins")  # a folder may be moved, plugins may be added
 
 
@@ -91,11 +93,10 @@ def run_cell(folder: str | Path) -> None:
     run.write_json(FOUND, {"row": _found_in(summary, result) | seconds, "outcomes": _outcomes_of(result)})
 
 
-def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int], float]] | None:
+def read_result(folder: str | Path) -> Result | None:
     """Reads what a cell found, None if it is not finished; a damaged ``result.json`` is refused.
 
-    These are columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`, and outcomes as
-    :data:`~torchrl_koap.studies.paired_comparison.Outcome`.
+    The row has columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`.
     """
     path = Path(folder) / FOUND
     if not path.exists():
@@ -113,9 +114,7 @@ def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int
     return row, outcomes
 
 
-def cell_row(
-    root: Path, cell: Cell, *, label_unit: str, reason: str | None = None
-) -> tuple[dict[str, Any], dict[tuple[int, int], float]]:
+def cell_row(root: Path, cell: Cell, *, label_unit: str, reason: str | None = None) -> Result:
     """Reads a cell of a study's folder as a row of ``cells.csv``, and its outcomes, which are empty unless it is done.
 
     ``reason`` says why it failed, if it did.

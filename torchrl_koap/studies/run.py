@@ -20,7 +20,7 @@ from torchrl_koap.runs.config_files import changed_options, from_json, to_json, 
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.resume import check_data
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
+from torchrl_koap.studies.cells import Cell, Result, cell_row, prepare_cell, read_result, run_cell
 from torchrl_koap.studies.launchers import Job, Machines, launch
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
@@ -93,12 +93,12 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         asked = set(cells)
         folders = {cell: study.out / cell.folder for cell in whole.cells() if cell not in asked}
         earlier = [cell for cell, folder in folders.items() if (folder / "log.txt").exists() or folder.is_file()]
-        table = _Table(study, [*cells, *earlier])
-        _work(study, cells, table, machines or Machines())
-        table.write()
-        rows, tasks = list(table.rows.values()), whole.tasks
+        results = {cell: cell_row(study.out, cell, label_unit=study.label_unit) for cell in [*cells, *earlier]}
+        _work(study, cells, results, machines or Machines())
+        rows, tasks = _write_rows(study, results), whole.tasks
+        outcomes = {row["run"]: found for row, found in results.values() if found}
         title = f"Label efficiency on {tasks[0] if len(tasks) == 1 else f'{len(tasks)} tasks'}"
-        report = write_study_report(study.out, rows, table.outcomes, title=title, options=_given(to_json(whole)))
+        report = write_study_report(study.out, rows, outcomes, title=title, options=_given(to_json(whole)))
     return StudyResult(rows, {status: sum(row["status"] == status for row in rows) for status in STATUSES}, report)
 
 
@@ -156,9 +156,8 @@ def _given(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def _first_look(study: Study, task: Task) -> TensorDictBase | None:
     """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
-    folder = study.dataset_folder(task.name)
-    if study.given_dataset(task.name) is not None or (folder / "ted").exists():
-        return open_dataset(folder, task=task)[0]
+    if study.has_data(task.name):
+        return open_dataset(study.dataset_folder(task.name), task=task)[0]
     if task.env is None:
         raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name --datasets")
     if study.label_unit != "trajectory":
@@ -169,7 +168,7 @@ def _first_look(study: Study, task: Task) -> TensorDictBase | None:
 
 def _record(study: Study, cells: Sequence[Cell], name: str) -> None:
     folder, task = study.dataset_folder(name), study.task(name)
-    if study.given_dataset(name) is not None or (folder / "ted").exists():
+    if study.has_data(name):
         return
     from torchrl_koap.envs.experts.demonstrations import record_to_folder  # needs a simulator
 
@@ -190,34 +189,19 @@ def _check_labels(study: Study, cells: Sequence[Cell], task: str, data: TensorDi
         subsample_trajectories(labelled, cell.demonstrations)
 
 
-class _Table:
-    """``cells.csv`` while cells come in: every finished cell is read once, not again after each other one."""
-
-    def __init__(self, study: Study, cells: Sequence[Cell]):
-        self.study = study
-        self.rows: dict[Cell, dict[str, Any]] = {}
-        self.outcomes: dict[str, Mapping[tuple[int, int], float]] = {}
-        for cell in cells:
-            self.read(cell)
-
-    def read(self, cell: Cell, reason: str | None = None) -> None:
-        """Reads a cell, and why it failed, if it did."""
-        row, outcomes = cell_row(self.study.out, cell, label_unit=self.study.label_unit, reason=reason)
-        self.rows[cell] = row
-        if outcomes:
-            self.outcomes[cell.folder] = outcomes
-
-    def write(self) -> None:
-        """Writes the file."""
-        write_csv(self.study.out / "cells.csv", CELL_COLUMNS, list(self.rows.values()))
+def _write_rows(study: Study, results: Mapping[Cell, Result]) -> list[dict[str, Any]]:
+    """Writes ``cells.csv`` and returns its rows."""
+    rows = [row for row, _ in results.values()]
+    write_csv(study.out / "cells.csv", CELL_COLUMNS, rows)
+    return rows
 
 
-def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines) -> None:
-    """Does the cells that are not done, and the planners that they share before."""
+def _work(study: Study, cells: Sequence[Cell], results: dict[Cell, Result], machines: Machines) -> None:
+    """Does the cells that are not done, and the planners that they share before; reads each once, when it has ended."""
     first: list[Job] = []
     jobs: dict[Path, Job] = {}
     for cell in cells:
-        if table.rows[cell]["status"] == "done":
+        if results[cell][0]["status"] == "done":
             continue
         planner, needs = study.planner_folder(cell), None
         if planner is not None and study.given_planner(cell.task) is None and not _is_trained(planner):
@@ -239,8 +223,9 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
                 bar.update()
                 bar.set_postfix_str(job.folder.name + (" FAILED" if reason else ""))
                 if job.folder in places:
-                    table.read(places[job.folder], reason)
-                    table.write()
+                    cell = places[job.folder]
+                    results[cell] = cell_row(study.out, cell, label_unit=study.label_unit, reason=reason)
+                    _write_rows(study, results)
 
 
 def _is_trained(folder: Path) -> bool:

@@ -159,6 +159,10 @@ class Study:
         """The folder of a task's demonstrations."""
         return Path(self.given_dataset(task) or self.out / "demonstrations" / task)
 
+    def has_data(self, task: str) -> bool:
+        """Whether the demonstrations of a task were named, or are recorded already."""
+        return self.given_dataset(task) is not None or (self.dataset_folder(task) / "ted").exists()
+
     def planner_folder(self, cell: Cell) -> Path | None:
         """The run whose planner a cell takes over, None for a method without one."""
         if not get_method(cell.method).plans:
