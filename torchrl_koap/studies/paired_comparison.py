@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import permutation_test
 
 from torchrl_koap.evaluation.offline import KIND
-from torchrl_koap.studies.table import group_of
+from torchrl_koap.studies.table import cells_by_place
 
 Outcome = Mapping[tuple[int, int], float]
 """Successes of a cell by (context, evaluation seed); errors of one without an environment by (trajectory, 0)."""
@@ -147,27 +147,21 @@ def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outc
     the other's (or error, trajectory by trajectory in place of contexts); ``p_holm`` is corrected over all rows; what
     cannot be compared is None. Cells that are not done take no part.
     """
-    groups: dict[tuple, dict[str, dict[int, Outcome]]] = {}
-    offline = set()
-    for row in rows:
-        key = (row["task"], *group_of(row))
-        found = groups.setdefault(key, {}).setdefault(row["method"], {})
-        if row["status"] == "done" and row.get("run") in outcomes:
-            found[row["seed"]] = outcomes[row["run"]]
-            if row.get("kind") == KIND:
-                offline.add(key)
     compared = []
-    for key, methods in groups.items():
+    for place, methods in cells_by_place(rows).items():
+        found: dict[str, dict[int, Outcome]] = {method: {} for method in methods}
+        offline = False
+        for row in (row for cells in methods.values() for row in cells.values()):
+            if row["status"] == "done" and row.get("run") in outcomes:
+                found[row["method"]][row["seed"]] = outcomes[row["run"]]
+                offline = offline or row.get("kind") == KIND
         for method in methods:
             if REFERENCE in methods and method != REFERENCE:
-                result = compare(methods[REFERENCE], methods[method], errors=key in offline)
-                known = dict(zip(COMPARISON_COLUMNS, (*key, REFERENCE, method), strict=False))
+                result = compare(found[REFERENCE], found[method], errors=offline)
+                known = dict(zip(COMPARISON_COLUMNS, (*place, REFERENCE, method), strict=False))
                 known |= {"n": 0} if result is None else asdict(result)
                 values = {name: known.get(name) for name in COMPARISON_COLUMNS}
                 compared.append({name: None if value != value else value for name, value in values.items()})  # NaN
     for row, adjusted in zip(compared, holm([row["p"] for row in compared]), strict=True):
         row["p_holm"] = adjusted
-    order = list(dict.fromkeys(row["method"] for row in rows))
-    tasks = list(dict.fromkeys(row["task"] for row in rows))
-    compared.sort(key=lambda row: (tasks.index(row["task"]), *list(row.values())[1:4], order.index(row["method"])))
     return compared

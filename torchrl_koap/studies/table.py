@@ -29,6 +29,10 @@ _MEASURES = (
 )
 
 
+Place = tuple[str, str, float, float]
+"""Task, unit of the labels, share of the demonstrations and share of the labels."""
+
+
 @dataclass(frozen=True)
 class Measure:
     """A mean with its ends: of ``"success"`` the Wilson 95 % interval, of all others the least and greatest seed."""
@@ -100,27 +104,31 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
 
     Cells have at least task, method, labels, seed and status; one that occurs twice is an error.
     """
-    groups: dict[tuple, dict[int, Mapping[str, Any]]] = {}
+    places = cells_by_place(rows).items()
+    return [_summary(*place, method, cells) for place, methods in places for method, cells in methods.items()]
+
+
+def cells_by_place(rows: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, dict[int, Mapping[str, Any]]]]:
+    """Sorts cells by place, method and seed, in the order of :func:`summarise`; one that occurs twice is an error."""
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
-    for row in rows:
-        cells = groups.setdefault((tasks.index(row["task"]), *group_of(row), methods.index(row["method"])), {})
+
+    def place_of(row: Mapping[str, Any]) -> Place:
+        share = row.get("demonstrations")
+        return row["task"], row.get("label_unit") or "", 1.0 if share is None else share, row["labels"]
+
+    def order(row: Mapping[str, Any]) -> tuple:
+        return tasks.index(row["task"]), *place_of(row)[1:], methods.index(row["method"])
+
+    places: dict[Place, dict[str, dict[int, Mapping[str, Any]]]] = {}
+    for row in sorted(rows, key=order):
+        cells = places.setdefault(place_of(row), {}).setdefault(row["method"], {})
         if row["seed"] in cells:
             raise ValueError(f"the cell {cell_name(row)} occurs twice")
         cells[row["seed"]] = row
-    return [
-        _summary(tasks[task], methods[method], labels, demonstrations, unit, groups[key])
-        for key in sorted(groups)
-        for task, unit, demonstrations, labels, method in [key]
-    ]
+    return places
 
 
-def group_of(row: Mapping[str, Any]) -> tuple[str, float, float]:
-    """Unit of the labels, share of the demonstrations and share of the labels of a cell."""
-    demonstrations = row.get("demonstrations")
-    return row.get("label_unit") or "", 1.0 if demonstrations is None else demonstrations, row["labels"]
-
-
-def _summary(task: str, method: str, labels: float, demonstrations: float, unit: str, cells: Mapping) -> Summary:
+def _summary(task: str, unit: str, demonstrations: float, labels: float, method: str, cells: Mapping) -> Summary:
     seeds = {status: tuple(sorted(s for s, row in cells.items() if row["status"] == status)) for status in STATUSES}
     done = [cells[seed] for seed in seeds["done"]]
     rolled_out = [row for row in done if row.get("episodes")]
