@@ -36,6 +36,7 @@ MEASURES = {  # label of the vertical axis, title, factor
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 _DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
+_HOLLOW = "\nhollow, dashed: the paper, whose demonstrations are others"  # in titles
 _BANDS = 3  # more bands than these hide each other: whiskers instead
 _ASIDE = 0.025  # inches between those of two methods
 
@@ -89,8 +90,7 @@ def plot_measure(
     panels = {name: lines for name, lines in panels.items() if lines}
     for line in panels.get("labels", ()) if paper else ():
         line.paper = [(share, 100 * success) for share, success in paper.get(line.name, ())]
-    if paper:
-        title += "\nhollow, dashed: the paper, whose demonstrations are others"
+    title += _HOLLOW if paper else ""
     figure = Figure(figsize=(1.9 + 4.1 * len(panels), 4.1), layout="constrained")
     for place, (axes, (name, lines)) in enumerate(
         zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True)
@@ -135,8 +135,7 @@ def plot_average(
     axes.set(xlabel="label level (1: fewest labels)", ylabel="success (%)")
     _scale_shares(axes, 100)
     title = f"success, 95 % interval: {tasks[0]}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks, 95 % interval"
-    hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
-    tidy(axes, title + hollow, grid=True)
+    tidy(axes, title + (_HOLLOW if any(line.paper for line in lines) else ""), grid=True)
     _name_lines(figure, lines)
     save_figure(figure, path)
 

@@ -134,35 +134,36 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
         known = [kind for kind in wanted if any(kind in item.measures for item in main)]
         if error in known and min(item.measures[error].low for item in main if error in item.measures) <= 0:
             known.remove(error)
+        used = f" All with {percent(shares[-1])} of the demonstrations." if shares[-1] != 1 else ""
+        hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
+        mixed = _MIXED if len({compared for item in main for compared in item.action_errors_on}) > 1 else ""
+        more = {"success": used + hollow, "relative_action_error": mixed}
+        counted = plural_of(label_unit) if label_unit else ""
         for kind in known:
-            path = folder / FOLDER / f"{name}_{kind}.png"
-            counted = plural_of(label_unit) if label_unit else ""
-            plot_measure(main, path, kind, methods=methods, label_unit=counted, **wanted[kind])
-            kinds = {compared for item in main for compared in item.action_errors_on}
-            mixed = kind == "relative_action_error" and len(kinds) > 1
-            used = f" All with {percent(shares[-1])} of the demonstrations." if shares[-1] != 1 else ""
-            hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
-            figures.append(_figure(name, kind, task, used + hollow if kind == "success" else _MIXED if mixed else ""))
+            options = {"methods": methods, "label_unit": counted, **wanted[kind]}
+            figures.append(_figure(folder, name, kind, main, more.get(kind, ""), **options))
         if len(shares) > 1 and "success" in known:
-            plot_measure(items, folder / FOLDER / f"{name}_demonstrations.png", by=("demonstrations",), methods=methods)
-            figures.append(_figure(name, "demonstrations", task))
+            figures.append(_figure(folder, name, "demonstrations", items, by=("demonstrations",), methods=methods))
     return figures
 
 
-def _figure(name: str, kind: str, task: str, more: str = "") -> dict[str, Any]:
-    head, caption = _CAPTIONS[kind]
+def _figure(
+    folder: Path, name: str, kind: str, items: Sequence[Summary], more: str = "", **options: Any
+) -> dict[str, Any]:
+    """Draws a picture; what the page needs to show it."""
+    source, (head, caption) = f"{FOLDER}/{name}_{kind}.png", _CAPTIONS[kind]
+    plot_measure(items, folder / source, "success" if kind == "demonstrations" else kind, **options)
     wide = kind == "success"  # two panels need the width of the page
-    source = f"{FOLDER}/{name}_{kind}.png"
-    return {"title": f"{head}, {task}", "caption": caption + more, "source": source, "beside": not wide}
+    return {"title": f"{head}, {items[0].task}", "caption": caption + more, "source": source, "beside": not wide}
 
 
 def _comparison_rows(compared: Sequence[Mapping[str, Any]], *, offline: bool) -> list[dict[str, str]]:
-    factor, form, head, unit = 100, "+.1f", "difference (points)", "contexts"
+    factor, digits, head, unit = 100, 1, "difference (points)", "contexts"
     if offline:
-        factor, form, head, unit = 1, "+.3f", "difference of the relative action error", "trajectories"
+        factor, digits, head, unit = 1, 3, "difference of the relative action error", "trajectories"
 
     def text(difference: float) -> str:
-        return format(round(factor * difference, 1 if factor == 100 else 3) + 0.0, form)  # the sum turns -0.0 into 0.0
+        return f"{round(factor * difference, digits) + 0.0:+.{digits}f}"  # the sum turns -0.0 into 0.0
 
     several = {name: len({row[name] for row in compared}) > 1 for name in ("task", "demonstrations")}
     return [
