@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from torchrl_koap.evaluation.findings import EXPERIMENTS, GOOD
-from torchrl_koap.reports.run_facts import RunFacts, mapping, number
+from torchrl_koap.reports.run_facts import RunFacts, number
 
 APART = 0.2  # success rates that differ by more than chance of a few dozen rollouts
 WIDE = 0.25  # width of a 95 % interval that hardly tells two methods apart
@@ -31,7 +31,7 @@ class Advice:
 
 def advice(run: RunFacts) -> Iterator[Advice]:
     """Yields all advice about a run, the most important first."""
-    success, policy = run.success(), number(run.summary.get("planner_parameters")) == 0  # a policy has no planner
+    success, policy = run.success(), number(run.summary, "planner_parameters") == 0  # a policy has no planner
     planner, controller, both = (run.experiment(name) for name in EXPERIMENTS)
     if run.evaluation.get("env") and not run.evaluation.get("success_key") and not success:
         success = None  # nobody says what it is: a walker's or another endless task
@@ -62,7 +62,7 @@ def advice(run: RunFacts) -> Iterator[Advice]:
         if run.evaluation.get("env"):  # which cannot start where a recording did
             apart = ("compare their errors on recordings", "koap eval {run} --out {run}_recorded")
         yield Advice(f"success is {_percent(success)}; whether planner or controller fails is not known", *apart)
-    labels = number(mapping(run.summary.get("labels")).get("labelled_transitions"))
+    labels = number(run.summary, "labels", "labelled_transitions")
     if fails and not planner_fails and labels is not None and labels < FEW_LABELS and str(method).startswith("koap"):
         yield Advice(
             f"{labels:,.0f} transitions are labelled",
@@ -85,8 +85,8 @@ def advice(run: RunFacts) -> Iterator[Advice]:
                 " (--steps)",
                 "koap inspect {run}",
             )
-    errors = mapping(run.action_errors.get(run.evaluation.get("action_errors_on")))
-    own, ridge = (number(errors.get(name)) for name in ("relative", "ridge_relative"))
+    split = run.evaluation.get("action_errors_on")
+    own, ridge = (number(run.action_errors, split, name) for name in ("relative", "ridge_relative"))
     if own is not None and ridge is not None and own >= ridge and method not in CONTROLS:
         yield Advice(
             f"actions of {method} err {own:.3g} times as much as their mean would, a plain ridge's {ridge:.3g} times",

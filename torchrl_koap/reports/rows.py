@@ -47,12 +47,11 @@ def evaluation_rows(run: RunFacts) -> list[Row]:
 
 def _labels(run: RunFacts) -> Row | None:
     names = ("labelled_transitions", "total_transitions", "trajectories_touched", "total_trajectories")
-    found = mapping(run.summary.get("labels"))
-    seen, steps, touched, recordings = (number(found.get(name)) for name in names)
+    seen, steps, touched, recordings = (number(run.summary, "labels", name) for name in names)
     if seen is None or steps is None:
         return None
     where = [] if touched is None or recordings is None else [f"in {touched:,} of {recordings:,} recordings"]
-    there = number(found.get("available_transitions"))
+    there = number(run.summary, "labels", "available_transitions")
     if there is not None and seen < there < steps:
         where.append(f"the data have {there:,} labels")
     return Row("labels", f"{seen:,} of {steps:,} steps", "; ".join(where))
@@ -60,19 +59,20 @@ def _labels(run: RunFacts) -> Row | None:
 
 def _planner(run: RunFacts) -> list[Row]:
     """How the planner was trained, and why that ended; nothing for a method that has none."""
-    found, asked = mapping(run.summary.get("planner")), mapping(run.config.get("planner"))
-    if not asked or not number(run.summary.get("planner_parameters")):
+    asked = mapping(run.config.get("planner"))
+    if not asked or not number(run.summary, "planner_parameters"):
         return []
     if asked.get("source") is not None:
         return [Row("planner", f"that of {asked['source']}", "not trained here")]
-    updates, kept, score = (number(found.get(name)) for name in ("updates", "kept_update", "best_held_out_score"))
+    names = ("updates", "kept_update", "best_held_out_score")
+    updates, kept, score = (number(run.summary, "planner", name) for name in names)
     if updates is None:
         return []
     value = f"{updates:,.0f} updates{_seconds(run, 'planner')}"
     if kept is None or score is None:
         return [Row("planner", value, "no recording was held out")]
     note = f"kept update {kept:,.0f}, with plan score {score:.3g} on held-out recordings (smaller is better)"
-    return [Row("planner", value, note), Row("training ended", *_ending(updates, kept, number(asked.get("steps"))))]
+    return [Row("planner", value, note), Row("training ended", *_ending(updates, kept, number(asked, "steps")))]
 
 
 def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
@@ -84,16 +84,16 @@ def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
 
 
 def _controller(run: RunFacts) -> Row | None:
-    method, updates = run.config.get("method"), number(run.summary.get("controller_updates"))
+    method, updates = run.config.get("method"), number(run.summary, "controller_updates")
     if not isinstance(method, str) or updates is None:
         return None
-    labels = number(mapping(run.summary.get("decoder_fit")).get("labels_used"))
+    labels = number(run.summary, "decoder_fit", "labels_used")
     trained = f"{method}, {updates:,} updates{_seconds(run, 'controller')}"
     return Row("controller", trained, "" if labels is None else f"fitted to {labels:,} labels")
 
 
 def _seconds(run: RunFacts, part: str) -> str:
-    seconds = number(mapping(run.summary.get("train_seconds")).get(part))
+    seconds = number(run.summary, "train_seconds", part)
     return "" if seconds is None or seconds < 1 else f" in {seconds:.0f} s"  # a finished part takes none when resumed
 
 
@@ -151,7 +151,7 @@ def _loop(run: RunFacts) -> Row | None:
 def _rates(run: RunFacts) -> list[Row]:
     contexts, found = run.evaluated("contexts"), []
     for name, values in run.rates.items():
-        rate, low, high, total = (number(values.get(key)) for key in ("rate", "low", "high", "episodes"))
+        rate, low, high, total = (number(values, key) for key in ("rate", "low", "high", "episodes"))
         if rate is None:
             continue
         notes, interval = [], None
@@ -188,7 +188,7 @@ def _environment(run: RunFacts) -> Row | None:
         return None
     success = f"success: info[{made['success_key']!r}]" if made.get("success_key") else made.get("success")
     limit = f"at most {made['step_limit']}" if made.get("step_limit") else None
-    total = number(made.get("mean_return"))
+    total = run.evaluated("mean_return")
     left = run.evaluated("left_out_of_return")
     notes = [f"{left:g} rollouts that an error ended are left out"] if left else []
     low, high = made.get("mean_return_interval") or (None, None)

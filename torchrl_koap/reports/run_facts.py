@@ -15,16 +15,18 @@ from torchrl_koap.tasks import Modes, Task
 from torchrl_koap.tasks.registry import task_from
 
 
-def number(value: Any) -> float | int | None:
-    """Returns the value if it is a finite number, else None."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        return None
-    return value
-
-
 def mapping(value: Any) -> Mapping[str, Any]:
     """Returns the value if it is a mapping, else an empty one: files may be damaged."""
     return value if isinstance(value, Mapping) else {}
+
+
+def number(value: Any, *keys: str) -> float | int | None:
+    """Returns the value, or the entry of an entry that some keys lead to in it, if it is a finite number, else None."""
+    for key in keys:
+        value = mapping(value).get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        return None
+    return value
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class RunFacts:
 
     def success(self, entry: str = "rate") -> float | None:
         """Returns the success rate, an end of its interval or the number of rollouts; None if it is not there."""
-        return number(self.rates.get("success", {}).get(entry))
+        return number(self.evaluation, "rates", "success", entry)
 
     @property
     def successes(self) -> int:
@@ -106,14 +108,14 @@ class RunFacts:
 
     def evaluated(self, name: str) -> float | None:
         """Returns a number of the evaluation, None if it is not there."""
-        return number(self.evaluation.get(name))
+        return number(self.evaluation, name)
 
     def experiment(self, name: str) -> float | None:
         """Returns the success of an experiment of ``koap inspect``, None if it was not made.
 
         Where things are pushed or grasped, the controller alone succeeds where it stays near a recorded tool path.
         """
-        left, episodes = (number(mapping(self.inspection.get("recordings_left")).get(n)) for n in ("count", "episodes"))
+        left, episodes = (number(self.inspection, "recordings_left", entry) for entry in ("count", "episodes"))
         if name == "controller_alone" and left is not None and episodes:
             return 1 - left / episodes
-        return number(mapping(self.inspection.get(name)).get("rate"))
+        return number(self.inspection, name, "rate")
