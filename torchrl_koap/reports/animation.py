@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from torchrl_koap.reports.pictures import Film, NotFilmed, NothingToDraw, picture
-from torchrl_koap.reports.rollout_plots import color_of_mode, mode_colors
+from torchrl_koap.reports.rollout_plots import episode_colors
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.scenes import bodies_of, body_paths, draw_scene, keep_inside, read_episodes
 from torchrl_koap.reports.style import FAILURE_MARKS, INK, SUCCESS, entry, set_title
@@ -44,37 +44,25 @@ def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     """
     if run.offline:
         raise NothingToDraw("nobody knows which columns lie in a plane")
-    paths, mode, outcome = read_episodes(rollouts)
-    longest = max(map(len, paths), default=0)
+    longest = max(map(len, read_episodes(rollouts)[0]), default=0)
     if not longest:
         raise NothingToDraw("there are no rollouts")
     stride = max(2, -(-longest // MOST_FRAMES))
     steps = list(range(0, longest, stride))
     steps += [longest - 1] * (steps[-1] != longest - 1)
-    return Film(_frames(rollouts, paths, mode, outcome, steps, run), stride / (run.control_hz or CONTROL_HZ))
+    return Film(_frames(rollouts, run, steps), stride / (run.control_hz or CONTROL_HZ))
 
 
-def _frames(
-    rollouts: Mapping[str, Any],
-    paths: list[np.ndarray],
-    mode: np.ndarray,
-    outcome: np.ndarray,
-    steps: list[int],
-    run: RunFacts,
-) -> Iterator[np.ndarray]:
+def _frames(rollouts: Mapping[str, Any], run: RunFacts, steps: list[int]) -> Iterator[np.ndarray]:
     """Draws the scene once, adds each new piece of path to it, and lays dots and plans over it for one frame."""
-    moving = body_paths(rollouts)
+    paths, mode, outcome = read_episodes(rollouts)
+    moving, colors = body_paths(rollouts), episode_colors(mode, outcome, run.modes)
     bodies = bodies_of(run.task, moving[0].shape[1]) if moving else ()
     pales = [tuple(0.45 * np.array(to_rgb(body.color)) + 0.55) for body in bodies]
     plan, plan_step = np.zeros((len(paths), 0, 0, 2)), np.zeros((len(paths), 0))
     if "plan" in rollouts and "plan_step" in rollouts:
         plan = entry(rollouts, "plan", [len(paths), None, None, 2])
         plan_step = entry(rollouts, "plan_step", plan.shape[:2])
-    palette = mode_colors(run.modes)
-    colors = [
-        color_of_mode(number, palette) if kind == SUCCESS else INK for number, kind in zip(mode, outcome, strict=True)
-    ]
-
     figure = Figure(figsize=(4.2, 5.2), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = draw_scene(figure.add_subplot(), run.task)

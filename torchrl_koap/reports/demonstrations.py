@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from torchrl_koap.reports.pictures import picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.scenes import bodies_of, body_handles, draw_bodies, draw_scene, keep_inside
-from torchrl_koap.reports.style import BLUE, GREY, entry, set_title, tidy
+from torchrl_koap.reports.style import BLUE, GREY, entry, set_title, tidy, with_unit
 from torchrl_koap.tasks import Task
 
 _MOST_COLUMNS = 12  # panels of single state columns
@@ -87,8 +87,7 @@ def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, t
             continue
         _draw_lines(axes, np.column_stack([time, state[:, index]]), borders, along, (0.6, 1.3))
         axes.autoscale_view()
-        name, unit = columns[index]
-        set_title(axes, f"{name} ({unit})" if unit else name)
+        set_title(axes, with_unit(*columns[index]))
         if index + across >= len(drawn):
             axes.set_xlabel("time (s)")
         tidy(axes)

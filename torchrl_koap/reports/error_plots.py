@@ -24,9 +24,11 @@ from torchrl_koap.reports.style import (
     RED,
     WARNING,
     entry,
+    panels,
     put_legend,
     set_title,
     tidy,
+    with_unit,
 )
 from torchrl_koap.tasks.columns import thousandths
 
@@ -77,11 +79,8 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
     if not columns:
         raise ValueError(f"metrics hold no value of any loss_* column, got the columns {', '.join(map(str, rows[0]))}")
 
-    across = min(len(columns), 2)
-    down = math.ceil(len(columns) / across)
-    figure = Figure(figsize=(4.2 * across, 2.7 * down), layout="constrained")
-    for index, (name, values) in enumerate(columns.items()):
-        axes = figure.add_subplot(down, across, index + 1)
+    figure, drawn = panels(len(columns), 2, (4.2, 2.7))
+    for axes, (name, values) in zip(drawn, columns.items(), strict=True):
         set_title(axes, TERMS.get(name, name.removeprefix("loss_").replace("_", " ")))
         axes.set_xlabel("update")
         here = np.isfinite(values)
@@ -151,15 +150,12 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     shown, factor = zip(*map(thousandths, units), strict=True)
     true, predicted = true[there] * factor, predicted[there] * factor
     error = predicted - true
-    across = width if width < 5 else -(-width // 2)
-    down = -(-width // across)
-    figure = Figure(figsize=(3.2 * across + 0.6, 3.4 * down + 0.35), layout="constrained")
-    for index, name in enumerate(names):
-        axes = figure.add_subplot(down, across, index + 1)
+    figure, drawn = panels(width, width if width < 5 else -(-width // 2), (3.2, 3.4), (0.6, 0.35))
+    for index, (axes, name) in enumerate(zip(drawn, names, strict=True)):
         _scatter(axes, true[:, index], predicted[:, index])
         each = " ".join(filter(None, (shown[index], "" if name in absolute else "per step")))
-        axes.set_xlabel(f"recorded {name} ({each})" if each else f"recorded {name}")
-        axes.set_ylabel(f"predicted {name} ({each})" if each else f"predicted {name}")
+        axes.set_xlabel(with_unit(f"recorded {name}", each))
+        axes.set_ylabel(with_unit(f"predicted {name}", each))
         set_title(axes, f"{name}: RMSE {np.sqrt(np.square(error[:, index]).mean()):.3g} {shown[index]}".rstrip())
     title = f"{len(true):,} steps of demonstrations outside the label budget, for evaluation only"
     figure.suptitle(title, fontsize=10, color=WARNING, x=0.01, ha="left")
@@ -197,8 +193,8 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
         raise NothingToDraw("no plan was evaluated on recorded data")
     rows = plan["unit"]
     figure = Figure(figsize=(8.8, 0.9 + 2.9 * len(rows)), layout="constrained")
-    panels = figure.subplots(len(rows), 2, squeeze=False, sharex=True, sharey="row")
-    for row, pair in zip(rows, panels, strict=True):
+    grid = figure.subplots(len(rows), 2, squeeze=False, sharex=True, sharey="row")
+    for row, pair in zip(rows, grid, strict=True):
         shown, factor = thousandths(row["unit"])
         for kind, axes in zip(("energy_score", "best_of"), pair, strict=True):
             for name, (label, color, dash) in _PLANS.items():
@@ -212,9 +208,9 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
         set_title(pair[0], f"energy score\n{_list_names(row['columns'])}")
         set_title(pair[1], f"nearest of {plan['samples']} plans\n")
     each = f", {1e3 / run.control_hz:.0f} ms each" if run.control_hz else ""
-    for axes in panels[-1]:
+    for axes in grid[-1]:
         axes.set_xlabel(f"planned step{each}")
-    put_legend(panels[0, 1])
+    put_legend(grid[0, 1])
     return figure
 
 
@@ -237,8 +233,8 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
         raise NothingToDraw("no action was evaluated on recorded data")
     count = len(parts[0][1]["column"])
     figure = Figure(figsize=(4.8 + 0.8 * count, 0.8 + 2.9 * len(parts)), layout="constrained")
-    panels = figure.subplots(len(parts), squeeze=False)[:, 0]
-    for (name, part), axes in zip(parts, panels, strict=True):
+    rows = figure.subplots(len(parts), squeeze=False)[:, 0]
+    for (name, part), axes in zip(parts, rows, strict=True):
         _draw_shares(axes, part["column"])
         judged = f"{part['labels']:,} labels of {part['trajectories']} recordings"
         set_title(axes, f"{_SPLITS.get(name, name)}\n{judged}")
@@ -246,7 +242,7 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
         handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
     handles.append(Line2D([], [], color=MUTED, linestyle="dashed", label="always the mean action"))
-    put_legend(panels[0], handles=handles)
+    put_legend(rows[0], handles=handles)
     return figure
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,9 +38,11 @@ from torchrl_koap.reports.style import (
     OUTCOMES,
     SUCCESS,
     entry,
+    panels,
     put_legend,
     set_title,
     tidy,
+    with_unit,
 )
 from torchrl_koap.tasks import Modes
 from torchrl_koap.tasks.columns import thousandths
@@ -144,9 +145,10 @@ def mode_colors(modes: Modes) -> np.ndarray:
     return 1 - (1 - pure) * np.clip(2 - lightness, 0, 1)[:, None]
 
 
-def color_of_mode(mode: int, colors: np.ndarray) -> Any:
-    """Returns the colour of a mode, grey for -1: it is not decided."""
-    return colors[mode] if 0 <= mode < len(colors) else GREY
+def episode_colors(mode: np.ndarray, outcome: np.ndarray, modes: Modes) -> list[Any]:
+    """Returns the colour of each episode by mode and outcome ``[E]``: failures are black, undecided ones (-1) grey."""
+    known = dict(enumerate(mode_colors(modes)))
+    return [known.get(int(one), GREY) if kind == SUCCESS else INK for one, kind in zip(mode, outcome, strict=True)]
 
 
 def _rollouts_caption(run: RunFacts) -> str:
@@ -171,7 +173,7 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     if run.offline:
         raise NothingToDraw("nobody knows which columns lie in a plane")
     paths, mode, outcome = read_episodes(rollouts)
-    bodies, colors = body_paths(rollouts), mode_colors(run.modes)
+    bodies, colors = body_paths(rollouts), episode_colors(mode, outcome, run.modes)
     good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
     figure = Figure(figsize=(9.4 if bodies else 6.2, 5.9), layout="constrained")
     axes, *beside = figure.subplots(1, 2 if bodies else 1, squeeze=False)[0]
@@ -179,14 +181,14 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     axes.add_collection(
         LineCollection(
             [paths[index] for index in np.flatnonzero(good)],
-            colors=[color_of_mode(mode[index], colors) for index in np.flatnonzero(good)],
+            colors=[colors[index] for index in np.flatnonzero(good)],
             linewidths=0.6 if crowded else 1.1,
             alpha=0.55 if crowded else 0.85,
             zorder=2,
         )
     )
     for index in np.flatnonzero(~good):
-        axes.plot(*paths[index].T, color=INK, linewidth=1.2, zorder=4)
+        axes.plot(*paths[index].T, color=colors[index], linewidth=1.2, zorder=4)
         draw_failure_end(axes, paths[index], outcome[index])
     keep_inside(axes, paths)
     ends = [kind for kind in FAILURE_MARKS if (outcome == kind).any()]
@@ -244,19 +246,16 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     if not plan.shape[1]:
         raise NothingToDraw("the rollouts hold no plans of positions")
     plan_step = entry(rollouts, "plan_step", plan.shape[:2])
-    colors, bodies = mode_colors(run.modes), body_paths(rollouts)
+    colors, bodies = episode_colors(mode, outcome, run.modes), body_paths(rollouts)
     episodes = choose_episodes(mode, outcome, 6)
-    across = min(len(episodes), 3)
-    down = math.ceil(len(episodes) / max(across, 1))
-    figure = Figure(figsize=(4.4 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
-    for panel, index in enumerate(episodes, 1):
-        axes, path = draw_scene(figure.add_subplot(down, across, panel), run.task), paths[index]
-        won = outcome[index] == SUCCESS
+    figure, drawn = panels(len(episodes), 3, (4.4, 4.25), (0.3, 0.3))
+    for axes, index in zip(drawn, episodes, strict=True):
+        path, won = paths[index], outcome[index] == SUCCESS
+        draw_scene(axes, run.task)
         if bodies:
             context = rollouts["context"][index : index + 1] if "context" in rollouts else None
             draw_bodies(axes, bodies[index : index + 1], run.task, [won], context)
-        color = color_of_mode(mode[index], colors) if won else INK
-        axes.plot(*path.T, color=color, linewidth=5, alpha=0.4, zorder=2, solid_capstyle="round")
+        axes.plot(*path.T, color=colors[index], linewidth=5, alpha=0.4, zorder=2, solid_capstyle="round")
         made = np.flatnonzero(plan_step[index] >= 0)
         lines = [points[np.isfinite(points).all(1)] for points in plan[index, made]]
         axes.add_collection(LineCollection(lines, colors=[INK], linewidths=0.6, zorder=3))
@@ -290,8 +289,8 @@ def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     plan_step = entry(rollouts, "plan_step", plan.shape[:2])
     episodes = choose_episodes(np.full(len(length), -1), outcome, 3)
     figure = Figure(figsize=(3.8 * len(episodes) + 0.3, 1.9 * len(columns) + 0.5), layout="constrained")
-    panels = figure.subplots(len(columns), len(episodes), squeeze=False, sharex="col", sharey="row")
-    for index, down in zip(episodes, panels.T, strict=True):
+    grid = figure.subplots(len(columns), len(episodes), squeeze=False, sharex="col", sharey="row")
+    for index, down in zip(episodes, grid.T, strict=True):
         made = np.flatnonzero((plan_step[index] >= 0) & (plan_step[index] < length[index]))
         steps = plan_step[index, made, None] + 1 + np.arange(plan.shape[2])
         for place, (axes, column) in enumerate(zip(down, columns, strict=True)):
@@ -300,9 +299,8 @@ def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
             color = BLUE if outcome[index] == SUCCESS else MUTED
             axes.plot(state[index, : length[index] + 1, place], color=color, linewidth=4, alpha=0.5, zorder=2)
             axes.autoscale_view()
-            unit = run.task.state_units[column]
             if index == episodes[0]:
-                axes.set_ylabel(run.task.state_names[column] + (f" ({unit})" if unit else ""))
+                axes.set_ylabel(with_unit(run.task.state_names[column], run.task.state_units[column]))
             tidy(axes)
         set_title(down[0], f"episode {index}: {OUTCOMES[outcome[index]]}")
         down[-1].set_xlabel("control step")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from torchrl_koap.evaluation.statistics import OUTCOMES as _OUTCOMES
 
@@ -28,6 +29,22 @@ def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise ValueError(f"{key!r} must have shape [{wanted}], got {list(value.shape)}")
     return value
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Returns a name and, in brackets, its unit if it has one."""
+    return f"{name} ({unit})" if unit else name
+
+
+def panels(
+    count: int, across: int, size: tuple[float, float], room: tuple[float, float] = (0, 0)
+) -> tuple[Figure, list[Axes]]:
+    """Returns a figure with panels of a size (inches) in rows of at most ``across``; ``room`` is for what is around."""
+    across = max(min(count, across), 1)
+    down = -(-count // across)
+    width, height = size[0] * across + room[0], size[1] * down + room[1]
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, [figure.add_subplot(down, across, index + 1) for index in range(count)]
 
 
 def tidy(axes: Axes, title: str | None = None, *, grid: bool = False) -> Axes:

@@ -18,7 +18,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 from matplotlib.transforms import ScaledTranslation
 
 from torchrl_koap.reports.pictures import save_figure
-from torchrl_koap.reports.style import INK, set_title, tidy
+from torchrl_koap.reports.style import INK, set_title, tidy, with_unit
 from torchrl_koap.studies.table import Summary, percent
 
 AXES = {
@@ -96,10 +96,10 @@ def plot_measure(
         zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True)
     ):
         _draw_lines(axes, lines)
-        axes.set_xlabel(AXES[name] + (f" ({label_unit})" if label_unit and name == "labels" else ""))
+        axes.set_xlabel(with_unit(AXES[name], label_unit if name == "labels" else ""))
         _log_x(axes, lines, ticks=name != "labelled_transitions")
         if place == 0:
-            axes.set_ylabel(f"{head} ({unit})" if unit else head)
+            axes.set_ylabel(with_unit(head, unit))
         set_title(axes, title if place == 0 else "")
         if measure.endswith("error"):
             _scale_errors(axes, lines)
