@@ -30,7 +30,7 @@ from torchrl_koap.evaluation.diagnosis import (
 from torchrl_koap.modules import Execution, ExecutionConfig, MLPDenoiser, StatePlanner, make_policy
 from torchrl_koap.reports.inspection_plots import draw_experiments
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, Task, get_task
 from torchrl_koap.training import Trained
 
 AVOIDING = get_task("avoiding")
@@ -105,6 +105,19 @@ def test_distance_from_plan_to_execution_by_hand():
     assert tracking_errors(AVOIDING, [brief, stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
     episodes = [brief, stands, episode(0.4), episode(0.5)]
     assert [left_recordings(AVOIDING, episodes, 4, beyond=limit) for limit in (0.2, 0.35, 0.6)] == [3, 2, 0]
+
+
+def test_units_of_a_part_are_not_pooled():
+    parts, units = {"tool": ("x", "y", "turn"), "q": 1}, ("m", "m", "rad", "rad")
+    actions = {"dx": Action("m")}
+    arm = Task(name="arm", actions=actions, observation_parts=parts, observation_units=units, position="tool")
+    steps = torch.zeros(8, 4)
+    plan = torch.tensor([0.3, 0.4, 2.0, 1.0]).expand(8, 14, 4)
+    follows = TensorDict({"observation": steps, "next": {"observation": steps}, "plan": plan}, [8])
+    errors = tracking_errors(arm, [follows], 4)
+    wanted = {"tool (m)": 0.5, "tool (rad)": 2.0, "q": 1.0}
+    assert errors == {name: pytest.approx([value] * 4) for name, value in wanted.items()}
+    assert [left_recordings(arm, [follows], 4, beyond=limit) for limit in (0.4, 0.6)] == [1, 0]
 
 
 def test_states_beside_the_demonstrations_are_far():

@@ -72,6 +72,17 @@ def test_page_says_what_was_run_and_what_was_not(folder):
         assert wanted in text
 
 
+def test_contexts_do_not_recur_in_an_environment_of_gymnasium(tmp_path):
+    rows = make_cells(outcomes := {})
+    own, other = (
+        Page(write_study_report(tmp_path, rows, outcomes, title="t", options={"evaluation": options})).text
+        for options in ({"episodes": 20}, {"env": "mine:Reach-v0"})
+    )
+    words = ("rolled out on fixed evaluation contexts", "contexts recur", "met the same contexts")
+    assert all(word in own and word not in other for word in words)
+    assert "rolled out in mine:Reach-v0. " in other and "an episode stands in place of a context below. The" in other
+
+
 def test_the_paper_stands_beside_labelled_windows(tmp_path):
     rows = make_cells(outcomes := {}, labels=(0.02, 0.1), label_unit="window")
     text = Page(write_study_report(tmp_path, rows, outcomes, title="t")).text

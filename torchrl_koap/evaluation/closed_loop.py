@@ -21,7 +21,7 @@ from torchrl_koap.evaluation.loop_on_labels import limited_commands, standing_fa
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
-from torchrl_koap.evaluation.scores import score, task_scores
+from torchrl_koap.evaluation.scores import outcome_of, score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval
 from torchrl_koap.files import read_json
 from torchrl_koap.runs.config import given_options
@@ -116,11 +116,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         result["left_out_of_return"] = len(episodes) - len(returns)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
         if data is not None:
-            pairs = zip(episodes, rows, strict=True)
-            sound = [(episode, row["outcome"]) for episode, row in pairs if row["outcome"] != "error"]
-            failed = [episode for episode, outcome in sound if outcome != "success"]
+            sound = [episode for episode in episodes if outcome_of(episode) != "error"]
+            failed = [episode for episode in sound if outcome_of(episode) != "success"]
             result["faults"] += standing_faults(failed, data)
-            result["faults"] += start_faults([episode for episode, _ in sound], data, task) if failed else []
+            result["faults"] += start_faults(sound, data, task) if failed else []
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
                 "no episode ended with a reward of its own, and info does not say at the first step what success is:"

@@ -9,7 +9,7 @@ planner were perfect. Both together are the closed loop.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -18,10 +18,11 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torchrl_koap.data.trajectories import labelled_episodes, trajectory_lengths
-from torchrl_koap.evaluation.rollouts import device_of, roll_out
+from torchrl_koap.evaluation.rollouts import device_of, observations_of, roll_out
 from torchrl_koap.keys import EPISODE, OBSERVATION, PLAN, STATE
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.columns import unit_groups
 
 _MOST_STATES = 4000  # whose distances are measured
 RECORDED_FUTURE = "recorded_future"
@@ -128,21 +129,41 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
     """Measures how far executed states lie from the current plan, per part of the state, in its units.
 
     These are root mean square distances per step ``1 .. interval`` after a plan; none of rollouts ``[T]`` without the
-    entry ``plan``. Of rollouts that follow a recording the steps count that it has, not the standing at its end.
+    entry ``plan``. A part whose columns have several units has an entry for each, such as ``"arm (rad)"``. Of rollouts
+    that follow a recording the steps count that it has, not the standing at its end.
     """
-    errors: dict[str, list[Tensor]] = {name: [] for name in task.state_slices}
+    columns_of = _columns_by_unit(task)
+    errors: dict[str, list[Tensor]] = {name: [] for name in columns_of}
     for episode in episodes:
         if PLAN not in episode.keys():
             return {}
         if RECORDED in episode.keys():
             episode = episode[episode[RECORDED].squeeze(-1)]
-        states = task.state_of(torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]))
+        states = task.state_of(observations_of(episode))
         made = torch.arange(0, max(len(episode) - interval + 1, 0), interval)
         steps = torch.arange(1, interval + 1)
         gap = states[made[:, None] + steps] - episode[PLAN][made, :interval]
-        for name, columns in task.state_slices.items():
+        for name, columns in columns_of.items():
             errors[name].append(gap[..., columns].square().sum(-1))
     return {name: torch.cat(parts).mean(0).sqrt().tolist() for name, parts in errors.items() if parts}
+
+
+def _columns_by_unit(task: Task) -> dict[str, slice | list[int]]:
+    """Columns of the state by its parts, those of one with several units apart."""
+    found: dict[str, slice | list[int]] = {}
+    for name, columns in task.state_slices.items():
+        units = unit_groups(task.state_units[columns])
+        if len(units) == 1:
+            found[name] = columns
+        else:
+            for unit, places in units.items():
+                found[f"{name} ({unit or 'no unit'})"] = [columns.start + place for place in places]
+    return found
+
+
+def of_position(task: Task, errors: Mapping[str, list[float]]) -> list[float] | None:
+    """Returns those of :func:`tracking_errors` that are of the tool's position, None where the state shows none."""
+    return errors.get(task.position, errors.get(f"{task.position} (m)"))
 
 
 def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *, beyond: float) -> int:
@@ -150,8 +171,8 @@ def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *
 
     Looked at is the step ``interval`` after each plan, in rollouts of :func:`follow_recordings`.
     """
-    errors = [tracking_errors(task, [episode], interval) for episode in episodes]
-    return sum(error[task.position][-1] > beyond for error in errors if task.position in error)
+    errors = [of_position(task, tracking_errors(task, [episode], interval)) for episode in episodes]
+    return sum(error[-1] > beyond for error in errors if error)
 
 
 def distance_to_demonstrations(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:

@@ -18,6 +18,7 @@ from torchrl_koap.evaluation.diagnosis import (
     distance_to_demonstrations,
     follow_recordings,
     left_recordings,
+    of_position,
     planner_rollout,
     tracking_errors,
 )
@@ -127,7 +128,7 @@ def _experiments(
         if config.env is None:  # the controller alone follows recordings from where they started
             followed = follow_recordings(policy, task, data, where.make_env, episodes=config.episodes)
             tracked = tracking_errors(task, followed, interval)
-            if task.objects and task.position in tracked:
+            if task.objects and of_position(task, tracked):
                 left = left_recordings(task, followed, interval, beyond=NEAR)
                 found["recordings_left"] = {"count": left, "episodes": len(followed)}
             found["controller_alone"] = rate([outcome_of(episode) == "success" for episode in followed])

@@ -98,6 +98,11 @@ def device_of(module: nn.Module) -> torch.device:
     return next(itertools.chain(module.parameters(), module.buffers()), torch.empty(0)).device
 
 
+def observations_of(episode: TensorDict) -> Tensor:
+    """Returns what was seen in an episode ``[T]``, after its last step too: ``[T + 1, obs]``."""
+    return torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]])
+
+
 def rollouts_to_tensors(episodes: Sequence[TensorDict], task: Task, *, interval: int) -> dict[str, Tensor]:
     """Stacks what the pictures need, padded to the longest episode.
 
@@ -112,7 +117,7 @@ def rollouts_to_tensors(episodes: Sequence[TensorDict], task: Task, *, interval:
         ``state_plan`` ``[E, P, H, k]``, NaN behind the end.
     """
     pad, last = partial(pad_sequence, batch_first=True), [episode[-1]["next"] for episode in episodes]
-    frames = [torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]) for episode in episodes]
+    frames = [observations_of(episode) for episode in episodes]
     bodies = task.bodies if CONTEXT in last[0].keys() else ()  # other environments than the task's tell nothing of them
     starts = [task.observation[part].start for part in (task.position, *(body.position for body in bodies))]
     columns = [slice(start, start + 2) for start in starts]
