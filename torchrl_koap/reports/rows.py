@@ -11,8 +11,9 @@ from torchrl_koap.reports.run_facts import RunFacts, mapping, number
 from torchrl_koap.tasks.columns import thousandths
 
 _ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
-_PLAN_BASELINES = {"standing_still": "standing still", "constant_velocity": "constant velocity"}
-_ACTION_BASELINES = {"ridge": "ridge regression", "mean_action": "always the mean action"}
+# the run's own model first, then what it is to be compared with
+_PLANS = {"planner": "", "standing_still": "standing still", "constant_velocity": "constant velocity"}
+_ACTIONS = {"controller": "", "ridge": "ridge regression", "mean_action": "always the mean action"}
 _LABELS = {"outside_budget": "outside the budget", "left_out": "of recordings left out of the fit"}
 _LATE = 0.8  # share of the updates from which on the best plans say that more may be better
 _NOT_MEASURED = "not measured"
@@ -100,36 +101,29 @@ def _seconds(run: RunFacts, part: str) -> str:
 def _plan_errors(run: RunFacts) -> list[Row]:
     plan, found = run.evaluation.get("plan_errors", {}), []
     for row in plan.get("unit", ()):
-        shown, factor = thousandths(row["unit"])
-        values = {name: factor * row[name]["energy_score"]["overall"] for name in ("planner", *_PLAN_BASELINES)}
-        others = ", ".join(f"{words} {values[name]:.4g}" for name, words in _PLAN_BASELINES.items())
-        value = f"{values['planner']:.4g} {shown}".rstrip()
-        found.append(Row(f"plan error, {_columns(row)}", value, f"energy score{_plain(shown)}; {others}"))
+        errors = {words: row[name]["energy_score"]["overall"] for name, words in _PLANS.items()}
+        found.append(_error_row("plan error", row, errors, "energy score"))
     return [*found, *([Row("plan error", _NOT_MEASURED, plan["note"])] if "note" in plan else [])]
 
 
 def _action_errors(run: RunFacts) -> list[Row]:
     split, found = run.evaluation.get("action_errors_on"), []
-    errors = run.action_errors[split] if split else {}
-    for row in errors.get("unit", ()):
-        shown, factor = thousandths(row["unit"])
-        others = ", ".join(f"{words} {factor * row[name]:.4g}" for name, words in _ACTION_BASELINES.items())
-        value = f"{factor * row['controller']:.4g} {shown}".rstrip()
-        labels = f"{errors['labels']:,} labels {_LABELS[split]}"
-        found.append(
-            Row(f"action error, {_columns(row)}", value, f"root mean square{_plain(shown)}; {others}; {labels}")
-        )
+    judged = run.action_errors[split] if split else {}
+    for row in judged.get("unit", ()):
+        errors = {words: row[name] for name, words in _ACTIONS.items()}
+        labels = f"{judged['labels']:,} labels {_LABELS[split]}"
+        found.append(_error_row("action error", row, errors, "root mean square", labels))
     notes = [part["note"] for part in run.action_errors.values() if "note" in part] if run.offline else []
     return found or ([Row("action error", _NOT_MEASURED, "; ".join(notes))] if notes else [])
 
 
-def _plain(unit: str) -> str:
-    return "" if unit else " in units of the data"
-
-
-def _columns(row: Mapping[str, Any]) -> str:
-    names = row["columns"]
-    return names[0] if len(names) == 1 else f"{len(names)} columns"
+def _error_row(name: str, row: Mapping[str, Any], errors: Mapping[str, float], kind: str, *more: str) -> Row:
+    """Errors of the models, by what they are called, over the columns of one unit."""
+    (shown, factor), columns = thousandths(row["unit"]), row["columns"]
+    own, *others = (f"{words} {factor * error:.4g}".lstrip() for words, error in errors.items())
+    which = columns[0] if len(columns) == 1 else f"{len(columns)} columns"
+    note = "; ".join((kind if shown else f"{kind} in units of the data", ", ".join(others), *more))
+    return Row(f"{name}, {which}", f"{own} {shown}".rstrip(), note)
 
 
 def _loop(run: RunFacts) -> Row | None:

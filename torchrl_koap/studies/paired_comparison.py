@@ -147,7 +147,7 @@ def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outc
     the other's (or error, trajectory by trajectory in place of contexts); ``p_holm`` is corrected over all rows; what
     cannot be compared is None. Cells that are not done take no part.
     """
-    compared = []
+    compared: list[dict[str, Any]] = []
     for place, methods in cells_by_place(rows).items():
         found: dict[str, dict[int, Outcome]] = {method: {} for method in methods}
         offline = False
