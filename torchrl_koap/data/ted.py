@@ -29,6 +29,7 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 
 FORMAT = 2
+CAMERAS = "cameras"  # folder of what frames are embedded by, beside a data set and in a run
 _ABOUT, _STEPS = "about.json", "steps.safetensors"
 
 

@@ -13,7 +13,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.data.ted import CAMERAS, stored_folder
 from torchrl_koap.files import (
     DataError,
     LockedError,
@@ -26,9 +26,8 @@ from torchrl_koap.files import (
 from torchrl_koap.lookup import lookup
 
 PREFIX = "pretrained:"
-# what a run is made of; evaluations, reports and checkpoints are made from it
-CAMERAS = "cameras"  # folder of what frames are embedded by
 _NETWORKS = ("planner.safetensors", "controller.safetensors")
+# what a run is made of; evaluations, reports and checkpoints are made from it
 FILES = ("config.json", "summary.json", "metrics.csv", "demonstrations.safetensors", *_NETWORKS)
 
 

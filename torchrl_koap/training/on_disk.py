@@ -16,6 +16,7 @@ from torchrl_koap.data import open_dataset
 from torchrl_koap.data.label_budget import LabelReport, subsample_trajectories
 from torchrl_koap.data.quality import plan_coverage
 from torchrl_koap.data.sources import find_task_of
+from torchrl_koap.data.ted import CAMERAS
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import TrainConfig, given_options
@@ -24,7 +25,7 @@ from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, progress_bar
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
-from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from

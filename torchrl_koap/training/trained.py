@@ -15,14 +15,14 @@ from torch import nn
 from torchrl_koap.data import open_dataset
 from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.label_budget import LabelReport
-from torchrl_koap.data.ted import source_names
+from torchrl_koap.data.ted import CAMERAS, source_names
 from torchrl_koap.files import some
 from torchrl_koap.modules import Execution, ExecutionConfig, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.modules.execution.followers import Follower
 from torchrl_koap.runs.config import TrainConfig, given_options
 from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
 from torchrl_koap.runs.plugins import load_plugins
-from torchrl_koap.runs.run_directory import CAMERAS, RunDirectory, RunDirectoryError, find_run, no_data
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, find_run, no_data
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from

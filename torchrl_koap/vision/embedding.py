@@ -20,12 +20,13 @@ from torch import Tensor
 
 from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted
 from torchrl_koap.data.formats import Recordings
-from torchrl_koap.data.ted import stored_folder, stored_task
+from torchrl_koap.data.ted import CAMERAS, stored_folder, stored_task
 from torchrl_koap.files import DataError, option, replacing_file, some
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task
 from torchrl_koap.vision.backbones import load_backbone
-from torchrl_koap.vision.encoder import BATCH, CAMERAS, FrozenImageEncoder, Projection, load_encoder
+from torchrl_koap.vision.encoder import BATCH, FrozenImageEncoder, Projection, load_encoder
+from torchrl_koap.vision.observer import part_widths
 
 MOST = 4000  # frames that components are fitted to
 HELD_OUT = 10  # one trajectory in so many judges them
@@ -131,12 +132,11 @@ def embed_recordings(
                 " if they are wrong, take these recordings out of the source and convert again",
                 stacklevel=2,
             )
-        width = task.observation[name].stop - task.observation[name].start if name in task.observation else components
         fitted = projection
         if fitted is None:
+            width = part_widths(task).get(name, components)
             fitted = Projection.fit(film.sample(held_out=False), width, encoder.identity)
-        fitted.save(out / CAMERAS / f"{name}.safetensors")
-        fitted = Projection.load(out / CAMERAS / f"{name}.safetensors")  # as it is used
+        fitted = Projection.load(fitted.save(out / CAMERAS / f"{name}.safetensors"))  # as it is used
         embedded[name] = [fitted(features) for features in film.features()]
         reports[name] = film.report(fitted)
     task, states = _with_columns(task, recordings, embedded)
@@ -168,7 +168,7 @@ def _with_columns(
             robot=task.robot or tuple(range(task.state_dim)),
             defaults=replace(task.defaults, recovery=0.0),  # pictures show the robot where it was
         )
-    own = {name: part.stop - part.start for name, part in task.observation.items() if name not in embedded}
+    own = {name: width for name, width in part_widths(task).items() if name not in embedded}
     if sum(own.values()) != recordings.states[0].shape[1]:
         raise DataError(
             f"task {task.name!r}",

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import ObservationTransform
 
-from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.data.ted import CAMERAS, stored_folder
 from torchrl_koap.files import check_file, option, replacing_file
 from torchrl_koap.keys import read_entry
 from torchrl_koap.lookup import absolute
@@ -150,7 +150,6 @@ def pool_moments(maps: Tensor) -> Tensor:
     return torch.cat(pooled, 1)
 
 
-CAMERAS = "cameras"  # folder of projections beside a data set, and in a run
 SCOOPING = Path(__file__).with_name("scooping.safetensors")
 
 
@@ -203,6 +202,15 @@ class Projection(nn.Module):
     def dim(self) -> int:
         """Number of components."""
         return self.components.shape[1]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the frames that it was fitted to, by its description; a ValueError refuses another."""
+        try:
+            height, width = (int(side) for side in self.about["size"].split("x"))
+        except ValueError as error:
+            raise ValueError(f"the description of the projection cannot be used, size: {error}") from error
+        return height, width
 
     @classmethod
     def load(cls, path: str | Path) -> Projection:
@@ -294,15 +302,11 @@ def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | 
         FileNotFoundError: no projection: there is no file nowhere.safetensors
     """
     fitted = projection if isinstance(projection, Projection) else Projection.load(projection)
-    about = fitted.about
-    try:
-        height, width = (int(side) for side in about["size"].split("x"))
-    except ValueError as error:
-        raise ValueError(f"the description of the projection cannot be used, size: {error}") from error
+    about, size = fitted.about, fitted.size
     backbone = load_backbone(network or about["network"])
     if backbone.digest != about["weights"]:
         raise WeightsError(
             f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"
             f" {backbone.digest[:12]} of {backbone.name}: fit one for them, or pass the network it belongs to"
         )
-    return FrozenImageEncoder(backbone, projection=fitted, size=(height, width))
+    return FrozenImageEncoder(backbone, projection=fitted, size=size)

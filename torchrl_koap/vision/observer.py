@@ -19,6 +19,11 @@ from torchrl_koap.vision.encoder import FrozenImageEncoder, Projection, load_enc
 STATE = "state"
 
 
+def part_widths(task: Task) -> dict[str, int]:
+    """Number of columns of every part of a task's observation."""
+    return {name: part.stop - part.start for name, part in task.observation.items()}
+
+
 class Observer:
     """Concatenates the numbers of a robot and the embeddings of its frames in the order of the task's columns.
 
@@ -40,7 +45,7 @@ class Observer:
 
     def __init__(self, task: Task, cameras: Mapping[str, Projection]):
         self.cameras = dict(cameras)
-        widths = {name: part.stop - part.start for name, part in task.observation.items()}
+        widths = part_widths(task)
         for name, projection in cameras.items():
             if widths.get(name) != projection.dim:
                 raise ValueError(
@@ -60,8 +65,7 @@ class Observer:
 
     def example(self) -> dict[str, np.ndarray]:
         """Zeros and black frames, as a robot gives them."""
-        sides = {name: [int(side) for side in each.about["size"].split("x")] for name, each in self.cameras.items()}
-        black = {name: np.zeros((*size, 3), np.uint8) for name, size in sides.items()}
+        black = {name: np.zeros((*each.size, 3), np.uint8) for name, each in self.cameras.items()}
         return {STATE: np.zeros(self.state_dim, np.float32), **black}
 
     def __call__(self, given: Mapping[str, Any]) -> Tensor:
