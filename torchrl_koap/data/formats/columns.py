@@ -29,6 +29,8 @@ class Piece:
     actions: dict[str, np.ndarray] | None = None  # columns [T] or [T - 1]; None where there are none
     unclear: tuple[str, ...] = ()  # columns among the states of which the user has to say what they are
     cameras: dict[str, Clip] = field(default_factory=dict)  # where the frames lie, one per row
+    declared_hz: float | None = None  # frames per second, where it says so itself
+    unread: tuple[str, ...] = ()  # what is in it that was left out
 
     @property
     def frames(self) -> int:
@@ -60,6 +62,7 @@ def assemble(
     if not pieces:
         raise DataError(source, "there are no trajectories")
     seen = dict.fromkeys(name for piece in pieces for name in piece.states)
+    skipped = [*(name for piece in pieces for name in piece.unread), *skipped]
     every = dict.fromkeys(name for piece in pieces for name in (*piece.states, *(piece.actions or ()), *piece.cameras))
     problems = unknown(state_columns, [*seen], f"column in {option('state_columns')}:")
     problems += unknown(drop_columns, [*every], f"column in {option('drop_columns')}:")
@@ -94,22 +97,19 @@ def assemble(
     usable = [name for name in names if kind_of(name)[0] is None and name not in even]
     observed = [name for name in state_columns or usable if name not in drop_columns]
     about = dict.fromkeys(even, " (it rises evenly: a clock)")
-    (clock, *others), rate, times = _clocks(pieces) or [None], control_hz, None
-    if control_hz is None and clock is not None:
-        times = clock.times
-        rate = find_rate(clock, declared_hz, problems) if resample is None else usual_rate(clock, problems)
+    clocks, rate = _clocks(pieces), control_hz
+    counting = clocks.pop(0) if clocks and control_hz is None else None
+    if counting is not None:
+        rate = find_rate(counting, declared_hz, problems) if resample is None else usual_rate(counting, problems)
     else:
         problems += gathered(_lost_frames(pieces))
-        others = [clock, *others]
-    if rate is None and clock is None:
-        rate = declared_hz
+        rate = declared_hz if rate is None else rate
         problems += [f"{no_rate}: pass {option('control_hz')}"] if rate is None else []
-    about |= {other.name: told_rate(other, rate) for other in others if other is not None and rate is not None}
-    against = about.get(clock.name, "") if clock is not None and control_hz is not None else ""
-    if against not in ("", NOT_READ):
+    about |= {clock.name: told_rate(clock, rate) for clock in clocks if rate is not None}
+    if clocks and control_hz is not None and (against := about[clocks[0].name]) not in ("", NOT_READ):
         warnings.warn(
-            f"column {clock.name!r}{against} does not count beside {option('control_hz')} {control_hz:g}: if its stamps"
-            f" are right, pass {option('resample')} {resample or control_hz:g} alone",
+            f"column {clocks[0].name!r}{against} does not count beside {option('control_hz')} {control_hz:g}: if its"
+            f" stamps are right, pass {option('resample')} {resample or control_hz:g} alone",
             stacklevel=2,
         )
     for name in (name for name in seen if "success" in name.lower() and kind_of(name)[0] == "other"):
@@ -120,9 +120,10 @@ def assemble(
     if not observed:
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
     refuse(source, problems)
-    if resample is not None and times is not None:
+    times = None
+    if resample is not None and counting is not None:
         seen_in = [np.isfinite(_stack(piece.states, observed)).all(1) | bool(piece.actions) for piece in pieces]
-        times = [at[rows] for at, rows in zip(times, seen_in, strict=True)]
+        times = [at[rows] for at, rows in zip(counting.times, seen_in, strict=True)]
         pieces = [_taken(piece, np.flatnonzero(rows)) for piece, rows in zip(pieces, seen_in, strict=True)]
         lost = sum(int((~rows).sum()) for rows in seen_in)
         left_out += [f"{lost} frames with states that are NaN"] if lost else []

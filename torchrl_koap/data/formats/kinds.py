@@ -43,12 +43,17 @@ _EXACT = 2**53  # the largest whole number up to which float64 tells all apart
 _WORDS = {"true": 1.0, "false": 0.0} | dict.fromkeys(("", "na", "n/a", "null", "none"), np.nan)
 
 
-def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a table ``[T]`` or ``[T, d]``, numbered if there are several."""
+def numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of a table ``[T]`` or ``[T, d]`` as float64, with their numbers behind the name."""
     table = np.asarray(values, dtype=np.float64)
     table = table.reshape(len(table), int(np.prod(table.shape[1:])))
-    alone = table.shape[1] == 1
-    return {name if alone else f"{name}_{index}": table[:, index] for index in range(table.shape[1])}
+    return {f"{name}_{index}": column for index, column in enumerate(table.T)}
+
+
+def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of a table ``[T]`` or ``[T, d]`` as float64, numbered if there are several."""
+    columns = numbered(name, values)
+    return {name: columns[f"{name}_0"]} if len(columns) == 1 else columns
 
 
 def kind_of(name: str) -> tuple[str | None, float]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.columns import Piece, assemble
-from torchrl_koap.data.formats.kinds import spread
+from torchrl_koap.data.formats.kinds import numbered, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, refuse
 from torchrl_koap.lookup import import_extra
@@ -32,13 +32,14 @@ def read_minari(source: str, **options: Any) -> Recordings:
             f"Minari data set {name!r} is not on this machine (here: {known}); `minari download` it"
         )
     dataset = minari.load_dataset(name, download=False)
-    pieces, skipped, faults = [], [], []
+    pieces, faults = [], []
     for episode in _episodes(dataset, source):
         states: dict[str, np.ndarray] = {}
+        unread: list[str] = []
         called = f"episode {episode.id}"
         for name, array in _leaves(episode.observations):
             if array.ndim > 2 or array.dtype.kind not in "fiub":
-                skipped.append(name or "observation")
+                unread.append(name or "observation")
             else:
                 states |= spread(name or "state", array)
         if not states:
@@ -51,14 +52,12 @@ def read_minari(source: str, **options: Any) -> Recordings:
         if steps.ndim > 2 or steps.dtype.kind != "f" and (steps.ndim < 2 or steps.dtype.kind not in "iub"):
             faults.append((called, f"actions must be [T, a], got {steps.dtype} {list(steps.shape)}"))
             continue
-        acting = {f"action_{index}": values for index, values in enumerate(steps.reshape(len(steps), -1).T)}
-        pieces.append(Piece(str(episode.id), states, acting))
+        pieces.append(Piece(str(episode.id), states, numbered("action", steps), unread=tuple(unread)))
     refuse(source, gathered(faults))
     return assemble(
         pieces,
         source,
         declared_hz=_rate(dataset),
-        skipped=skipped,
         no_rate="its environment says nothing of render_fps",
         **options,
     )

@@ -28,7 +28,7 @@ import numpy as np
 
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import MAGIC, Clip
-from torchrl_koap.data.formats.kinds import as_numbers, kind_of, spread
+from torchrl_koap.data.formats.kinds import as_numbers, kind_of, numbered, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, option, refuse
 from torchrl_koap.lookup import import_extra
@@ -130,22 +130,23 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
     states: dict[str, np.ndarray] = {}
     following = group[NEXT] if behind else {}
     for entry in chosen:
-        part, called = group["obs"].get(entry), (f"data/{name}", f"obs/{entry}")
+        part = group["obs"].get(entry)
         last = following[entry] if behind else part
         if part is None:
-            faults.append((called[0], f"obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}"))
+            said = f"obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}"
         elif not _is_table(part):
-            faults.append(
-                (called[0], f"{called[1]} is {_shape(part)}, no table of numbers: it cannot be part of the state")
-            )
+            said = f"obs/{entry} is {_shape(part)}, no table of numbers: it cannot be part of the state"
         elif _shape(last) != _shape(part):
-            faults.append((called[0], f"next_obs/{entry} is {_shape(last)}, {called[1]} is {_shape(part)}"))
+            said = f"next_obs/{entry} is {_shape(last)}, obs/{entry} is {_shape(part)}"
         elif behind and (odd := _other_frame(part[()], last[()])) is not None:
-            said = f"row {odd} of next_obs/{entry} is not row {odd + 1} of {called[1]}: are frames missing, or out of"
-            cure = f"order? if next_obs means nothing, leave it out by {option('drop_columns')} next_obs"
-            faults.append((called[0], f"{said} {cure}"))
+            said = (
+                f"row {odd} of next_obs/{entry} is not row {odd + 1} of obs/{entry}: are frames missing, or out of"
+                f" order? if next_obs means nothing, leave it out by {option('drop_columns')} next_obs"
+            )
         else:
             states |= spread(entry, np.concatenate([part, last[-1:]] if behind else [part]))
+            continue
+        faults.append((f"data/{name}", said))
     if not behind:  # time stamps, counters and ends of episodes may lie beside obs
         frames = len(next(iter(states.values()), ()))
         for entry, part in group.items():
@@ -163,8 +164,7 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
     actions = group.get("actions")
     if actions is not None and not _is_table(actions):
         faults.append((f"data/{name}", f"actions must be numbers [T, a], got {_shape(actions)}"))
-    columns = spread("action", actions).values() if _is_table(actions) else ()
-    steps = {f"action_{index}": values for index, values in enumerate(columns)}
+    steps = numbered("action", actions) if _is_table(actions) else {}
     return Piece(name, states, steps or None, cameras=cameras)
 
 

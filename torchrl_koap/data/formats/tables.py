@@ -31,7 +31,7 @@ import numpy as np
 from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import clips_beside
-from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, number_of
+from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, number_of, numbered
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
@@ -42,7 +42,6 @@ _DAMAGED = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.er
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
 _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "frame": "a count of frames"}
-_Table = tuple[Piece, "float | None", list[str]]  # columns, declared rate, and what is not read
 
 
 def table_files(folder: str | Path) -> list[Path]:
@@ -67,34 +66,31 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
             f" {' or '.join(map(repr, ACTIONS))}"
         )
     faults: list[tuple[str, str]] = []
-    tables: list[_Table] = []
+    pieces: list[Piece] = []
     for file in files:
         try:
-            piece, rate, unread = _READERS[file.suffix.lower()](file, action_columns)
-            tables.append((_with_cameras(piece, file), rate, unread))
+            pieces.append(_with_cameras(_READERS[file.suffix.lower()](file, action_columns), file))
         except (ValueError, OSError) as error:
             faults.append((str(file), str(error)))
-    refuse(folder, gathered(faults) or _lacking([piece for piece, *_ in tables], action_columns or ()))
-    counted = {name: kind_of(name) for piece, rate, _ in tables if not rate for name in piece.states}
+    refuse(folder, gathered(faults) or _lacking(pieces, action_columns or ()))
+    counted = {name: kind_of(name) for piece in pieces if not piece.declared_hz for name in piece.states}
     counted = {name: kind for name, kind in counted.items() if kind[0] in ("clock", "frame")}
     if "clock" in [kind for kind, _ in counted.values()]:  # files that say their rate beside files with time stamps
-        tables = [(_stamped(piece, rate, counted), None, names) for piece, rate, names in tables]
-    rates = [rate for _, rate, _ in tables if rate]
+        pieces = [_stamped(piece, counted) for piece in pieces]
+    rates = [piece.declared_hz for piece in pieces if piece.declared_hz]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
-        if "resample" not in options or len(rates) < len(tables):
+        if "resample" not in options or len(rates) < len(pieces):
             said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
             cure = f"pass {option('resample')} to bring them to one rate, or {option('control_hz')}"
             raise DataError(folder, f"{said}: {cure}")
-        counted = {"timestamp": ("clock", 1.0)}
-        tables = [(_stamped(piece, rate, counted), None, names) for piece, rate, names in tables]
+        pieces = [_stamped(piece, {"timestamp": ("clock", 1.0)}) for piece in pieces]
     beside = {file.with_suffix("") for file in files}
     others = [path for path in sorted(files[0].parent.iterdir()) if path not in files and path not in beside]
-    unread = [f"{path.name} (no table)" for path in others if folder.is_dir()]
     return assemble(
-        _named_alike([piece for piece, _, _ in tables]),
+        _named_alike(pieces),
         str(folder),
         declared_hz=float(np.median(rates)) if rates else None,
-        skipped=[*(name for _, _, names in tables for name in names), *unread],
+        skipped=[f"{path.name} (no table)" for path in others if folder.is_dir()],
         **options,
     )
 
@@ -117,13 +113,13 @@ def _with_cameras(piece: Piece, file: Path) -> Piece:
     return replace(piece, cameras=clips_beside(file, clock))
 
 
-def _stamped(piece: Piece, rate: float | None, counted: Mapping[str, tuple[str | None, float]]) -> Piece:
-    """A piece of known rate with the time stamps and counts of frames that others have, unless it has some."""
-    if not rate:
+def _stamped(piece: Piece, counted: Mapping[str, tuple[str | None, float]]) -> Piece:
+    """A piece that declares its rate with the time stamps and counts of frames that others have, unless it has some."""
+    if not piece.declared_hz:
         return piece
-    rows, stamps = np.arange(piece.frames), np.arange(piece.frames) / rate
+    rows, stamps = np.arange(piece.frames), np.arange(piece.frames) / piece.declared_hz
     found = {name: stamps / unit if kind == "clock" else rows for name, (kind, unit) in counted.items()}
-    return replace(piece, states=found | piece.states)
+    return replace(piece, states=found | piece.states, declared_hz=None)
 
 
 def _entries(file: Path) -> dict[str, np.ndarray]:
@@ -140,7 +136,7 @@ def _entries(file: Path) -> dict[str, np.ndarray]:
     return entries
 
 
-def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
+def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
     entries = _entries(file)
     key = next((name for name in STATES if name in entries), None)
     if key is None:
@@ -168,7 +164,8 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
         if entries[acting].ndim != 2 or entries[acting].dtype.kind not in "fiub":
             raise ValueError(f"{acting} must be numbers [T, a] or [T - 1, a], got {list(entries[acting].shape)}")
         steps = _named(entries[acting], entries.get("action_names"), "action")
-    return Piece(file.name, states, steps, tuple(unclear)), _declared(entries.get("control_hz")), unread
+    rate = _declared(entries.get("control_hz"))
+    return Piece(file.name, states, steps, tuple(unclear), declared_hz=rate, unread=tuple(unread))
 
 
 def _declared(entry: np.ndarray | None) -> float | None:
@@ -198,12 +195,11 @@ def _named_alike(pieces: list[Piece]) -> list[Piece]:
 
 
 def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, np.ndarray]:
-    width = table.shape[1]
-    made_up = [f"{kind}_{index}" for index in range(width)]
-    names = made_up if given is None else np.atleast_1d(given).astype(str).tolist()
-    if len(names) != width or len(set(names)) != width:
-        raise ValueError(f"{kind}_names must be {width} different names, got {', '.join(names)}")
-    return dict(zip(names, table.T.astype(np.float64), strict=True))
+    columns = numbered(kind, table)
+    names = [*columns] if given is None else np.atleast_1d(given).astype(str).tolist()
+    if len(names) != len(columns) or len(set(names)) != len(columns):
+        raise ValueError(f"{kind}_names must be {len(columns)} different names, got {', '.join(names)}")
+    return dict(zip(names, columns.values(), strict=True))
 
 
 def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:
@@ -238,7 +234,7 @@ def _frame_entry(name: str, values: np.ndarray, length: int) -> np.ndarray:
     return found
 
 
-def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
+def _read_csv(file: Path, action_columns: Sequence[str] | None) -> Piece:
     try:
         text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -280,7 +276,7 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
     return _split(file, columns, action_columns)
 
 
-def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
+def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> Piece:
     pyarrow = import_pyarrow()
     try:
         table = pyarrow.parquet.read_table(file)
@@ -298,15 +294,14 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
             columns[name] = as_numbers(name, values.to_numpy() if plain else np.array(values.to_pylist(), dtype=object))
             continue
         block = numbers(values.cast(kind, safe=False), name)
-        alone = not pyarrow.types.is_list(kind)
-        columns |= {name if alone else f"{name}_{index}": block[:, index] for index in range(block.shape[1])}
+        columns |= numbered(name, block) if pyarrow.types.is_list(kind) else {name: block[:, 0]}
     return _split(file, columns, action_columns)
 
 
 _READERS = {".npz": _read_npz, ".csv": _read_csv, ".parquet": _read_parquet}
 
 
-def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns: Sequence[str] | None) -> _Table:
+def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns: Sequence[str] | None) -> Piece:
     """States and actions of a table with named columns, None where they hold no numbers."""
     acting = [name for name in columns if is_action(name)]
     if action_columns is not None:
@@ -322,5 +317,5 @@ def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns:
             f"no column holds numbers: {', '.join(columns)} (fields lie between commas, semicolons or tabs)"
         )
     states = {name: values for name, values in known.items() if name not in acting}
-    said = [f"{name} (no numbers)" for name in unread]
-    return Piece(file.name, states, {name: known[name] for name in acting} or None), None, said
+    said = tuple(f"{name} (no numbers)" for name in unread)
+    return Piece(file.name, states, {name: known[name] for name in acting} or None, unread=said)
