@@ -19,7 +19,6 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -39,7 +38,6 @@ ROBOT_COLUMNS: dict[str, tuple[int, ...]] = {
 }
 OBJECT_COLUMNS = {"sim_step": (), "pos": (3,), "quat": (4,)}
 _LEAST_ROWS = 2
-_ALIGNED, _STACKED = ("push-box", "target-box"), ("red-box", "green-box", "blue-box")
 _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
 
 
@@ -51,6 +49,10 @@ class RawEpisode:
     objects: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
 
 
+Robot = Mapping[str, np.ndarray]  # entries of ``robot`` [T, ...] by name
+Poses = Sequence[tuple[np.ndarray, np.ndarray]]  # positions [T, 3] and quaternions [T, 4] of every object
+
+
 @dataclass(frozen=True)
 class Converter:
     """How the raw episodes of one task become observations and actions."""
@@ -58,69 +60,58 @@ class Converter:
     robot: tuple[str, ...]  # entries of ``robot`` that are read
     objects: tuple[str, ...]  # logged objects whose pose is read, in the order of ``Task.objects``
     folder: str  # where D3IL keeps the files, seen from its data folder
-    # from a raw episode of T rows to observations [T, obs] and actions [T - 1, act], as float64 arrays
-    convert: Callable[[RawEpisode], tuple[np.ndarray, np.ndarray]]
+    columns: Callable[[Robot, Poses], tuple[np.ndarray, np.ndarray]]  # what is read to what :meth:`convert` returns
     unread: tuple[str, ...] = ()  # objects that may be logged as well
 
-
-def _robot(episode: RawEpisode, name: str) -> np.ndarray:
-    return np.asarray(episode.robot[name], dtype=np.float64)
-
-
-def _pose(episode: RawEpisode, name: str) -> tuple[np.ndarray, np.ndarray]:
-    logged = episode.objects[name]
-    return np.asarray(logged["pos"], dtype=np.float64), np.asarray(logged["quat"], dtype=np.float64)
+    def convert(self, episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
+        """Converts a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``, float64."""
+        robot = {name: np.asarray(episode.robot[name], dtype=np.float64) for name in self.robot}
+        logged = [episode.objects[name] for name in self.objects]
+        poses = [(np.asarray(each["pos"], np.float64), np.asarray(each["quat"], np.float64)) for each in logged]
+        return self.columns(robot, poses)
 
 
-def _avoiding(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
-    desired, measured = _robot(episode, "des_c_pos")[:, :2], _robot(episode, "c_pos")[:, :2]
+def _avoiding(robot: Robot, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    desired, measured = robot["des_c_pos"][:, :2], robot["c_pos"][:, :2]
     return np.concatenate([desired, measured], axis=1), np.diff(desired, axis=0)
 
 
-def _aligning(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
-    desired = _robot(episode, "des_c_pos")
-    poses = [part for name in _ALIGNED for part in _pose(episode, name)]
-    return np.concatenate([desired, _robot(episode, "c_pos"), *poses], axis=1), np.diff(desired, axis=0)
+def _aligning(robot: Robot, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    columns = [robot["des_c_pos"], robot["c_pos"], *(part for pose in poses for part in pose)]
+    return np.concatenate(columns, axis=1), np.diff(robot["des_c_pos"], axis=0)
 
 
-def _sorting(episode: RawEpisode, boxes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    frames, actions = _avoiding(episode)
-    for name in boxes:
-        position, quat = _pose(episode, name)
-        frames = np.concatenate([frames, position[:, :2], tan_yaw(quat)[:, None]], axis=1)
-    return frames, actions
+def _sorting(robot: Robot, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    frames, actions = _avoiding(robot, ())
+    boxes = [part for position, quat in poses for part in (position[:, :2], tan_yaw(quat)[:, None])]
+    return np.concatenate([frames, *boxes], axis=1), actions
 
 
-def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
-    desired, width = _robot(episode, "des_j_pos"), _robot(episode, "gripper_width")[:, None]
-    columns = [desired, width]
-    for name in _STACKED:
-        position, quat = _pose(episode, name)
-        columns += [position, tan_yaw(quat)[:, None]]
-    columns += [_robot(episode, "j_pos"), width, _robot(episode, "c_pos")]
+def _stacking(robot: Robot, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    desired, width = robot["des_j_pos"], robot["gripper_width"][:, None]
+    boxes = [part for position, quat in poses for part in (position, tan_yaw(quat)[:, None])]
     number = gripper_command(torch.tensor(width[:, 0])).numpy()[:, None]
     actions = np.concatenate([np.diff(desired, axis=0), number], axis=1)
-    return np.concatenate(columns, axis=1), actions
+    return np.concatenate([desired, width, *boxes, robot["j_pos"], width, robot["c_pos"]], axis=1), actions
 
 
 def _sorting_converter(num_boxes: int) -> Converter:
     boxes = tuple(f"{colour}-box{index + 1}" for colour in ("red", "blue") for index in range(num_boxes // 2))
-    folder = f"sorting/{num_boxes}_boxes/state"
-    return Converter(("des_c_pos", "c_pos"), boxes, folder, partial(_sorting, boxes=boxes))
+    return Converter(_HAND, boxes, f"sorting/{num_boxes}_boxes/state", _sorting)
 
 
 _HAND = ("des_c_pos", "c_pos")
 CONVERTERS = {
     "avoiding": Converter(_HAND, (), "avoiding/data", _avoiding),
-    "aligning": Converter(_HAND, _ALIGNED, "aligning/all_data/state", _aligning),
+    "aligning": Converter(_HAND, ("push-box", "target-box"), "aligning/all_data/state", _aligning),
     "sorting_2": _sorting_converter(2),
     "sorting": _sorting_converter(4),
     "sorting_6": _sorting_converter(6),
     "stacking": Converter(
         robot=("des_j_pos", "j_pos", "gripper_width", "c_pos"),
-        objects=_STACKED,
+        objects=("red-box", "green-box", "blue-box"),
         folder="stacking/all_data",
-        convert=_stacking,
+        columns=_stacking,
         unread=("target-box",),  # it never moves
     ),
 }
