@@ -109,13 +109,10 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
 
 def command_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     """Finds command columns of flat data ``[N]`` that no action follows, neither their values nor their changes."""
-    labelled = data.get(keys.HAS_ACTION).squeeze(-1).nonzero().squeeze(-1)
-    if task.command_columns is None or len(labelled) < FEW:
+    steps = _labelled_steps(data)
+    if task.command_columns is None or steps is None:
         return
-    rows = data[labelled[:: 1 + len(labelled) // MANY]]
-    before, after, actions = (
-        rows.get(key).double().cpu().numpy() for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION, keys.ACTION)
-    )
+    before, after, actions = steps
     for column in range(*task.command_columns.indices(task.observation_dim)):
         read = [values for values in (after[:, column], (after - before)[:, column]) if np.ptp(values)]
         most = max([_correlation(values, actions).max() for values in read], default=1.0)
@@ -139,14 +136,22 @@ def describe_likely(likely: dict[str, LikelyKind]) -> str:
     )
 
 
-def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
+def _labelled_steps(data: TensorDictBase) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Observations before and after labelled steps ``[n, obs]``, and their actions ``[n, a]``; None where few are."""
     labelled = data.get(keys.HAS_ACTION).squeeze(-1).nonzero().squeeze(-1)
     if len(labelled) < FEW:
         return None
     rows = data[labelled[:: 1 + len(labelled) // MANY]]
-    before, after, actions = (
-        rows.get(key).double().cpu().numpy() for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION, keys.ACTION)
-    )
+    read = (keys.OBSERVATION, keys.NEXT_OBSERVATION, keys.ACTION)
+    before, after, actions = (rows.get(key).double().cpu().numpy() for key in read)
+    return before, after, actions
+
+
+def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
+    steps = _labelled_steps(data)
+    if steps is None:
+        return None
+    before, after, actions = steps
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))
     seen = list(task.state_columns)
     names = [task.observation_names[column] for column in seen]

@@ -28,13 +28,14 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
     starts = quaternion_starts(trajectories)
     leaps = [(np.abs(np.diff(frames, axis=0)) > bound) & ~sign_flips(frames, starts) for frames in trajectories]
     for column, name in enumerate(names):
-        where = [np.flatnonzero(leap[:, column]) for leap in leaps]
-        number = sum(map(len, where))
-        if not number:
+        steps = [
+            (frames, source, at)
+            for frames, source, leap in zip(trajectories, called, leaps, strict=True)
+            for at in np.flatnonzero(leap[:, column])
+        ]
+        if not steps:
             continue
-        trajectory = next(index for index, at in enumerate(where) if len(at))
-        at = int(where[trajectory][0])
-        frames = trajectories[trajectory]
+        frames, source, at = steps[0]
         before, after = frames[at : at + 2]
         leaping = (np.abs(after - before) > bound).mean()
         flipped = (np.abs(after + before) < UNUSUAL * usual) & (np.abs(after - before) > UNUSUAL * usual)
@@ -42,18 +43,18 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
         reach = (high - low)[column]
         wraps = bool((np.abs(ends) < 0.05 * reach).all()) and spread[column] > FILLS * reach  # else a spike
         near = UNUSUAL * usual[column]
-        known = list(zip(trajectories, where, strict=True))
-        start, end = (np.concatenate([path[leap + late] for path, leap in known]) for late in (0, 1))
+        start, end = (np.stack([path[step + late] for path, _, step in steps]) for late in (0, 1))
         if _turns_over(start, end, column):
             why = "a rotation vector, which turns over at pi? give quaternions or 6-D rotations; do not unwrap it"
         else:
             why = _cause(frames[at : at + 3, column], near, flipped.sum() > 1, leaping > 0.5, wraps)
-        more = f" and {number - 1} times more" if number > 1 else ""
-        found.setdefault(why, []).append(
-            f"{name!r} from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of"
-            f" {called[trajectory]}{more})"
-        )
+        said = f"from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of {source}"
+        found.setdefault(why, []).append(f"{name!r} {said}{_more(steps)})")
     return [f"columns leap: {some(which)}: {why}" for why, which in found.items()]
+
+
+def _more(found: Sequence[object]) -> str:
+    return f" and {len(found) - 1} times more" if len(found) > 1 else ""
 
 
 def _turns_over(before: np.ndarray, after: np.ndarray, column: int) -> bool:
@@ -190,10 +191,9 @@ def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: 
             at = np.flatnonzero(out & (change[:-1] * change[1:] < 0)) + 1
             found += [f"{steps[step, column]:.3g} in label {step} of {source}" for step in at]
         if found:
-            more = f" and {len(found) - 1} times more" if len(found) > 1 else ""
             yield (
-                f"action {name!r} is {found[0]}{more} and far from that before and behind: the difference of wrapped"
-                " angles, or a command that was not logged? mend it, or make it NaN"
+                f"action {name!r} is {found[0]}{_more(found)} and far from that before and behind: the difference of"
+                " wrapped angles, or a command that was not logged? mend it, or make it NaN"
             )
 
 
