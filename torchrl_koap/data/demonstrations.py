@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
 from torchrl_koap.data.formats.kinds import kind_of
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings, wrong_rate
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each, wrong_rate
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
 from torchrl_koap.data.quality import constant_columns, find_warnings
 from torchrl_koap.data.ted import save_ted
@@ -191,12 +191,12 @@ def make_demonstrations(
         problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
     if not others:
         problems.append("every column is a command: nothing is left to plan and act on")
-    kinds = [ACTION_KINDS[kind] for kind in _each(action_kind, len(acting), "action_kind", problems)]
+    kinds = [ACTION_KINDS[kind] for kind in one_each(action_kind, len(acting), "action_kind", problems)]
     reached = _targets(kinds, targets, own, names, problems)
     if targets is not None:
         problems += [f"column {names[column]!r} is a target and a command" for column in reached if column in commanded]
-    units = _each(action_units, len(acting), "action_units", problems)
-    own_units = _each(state_units, len(names), "state_units", problems)
+    units = one_each(action_units, len(acting), "action_units", problems)
+    own_units = one_each(state_units, len(names), "state_units", problems)
     origin = _origin(np.concatenate(recordings.states), names, "state", problems)
     problems += [
         f"command column {names[column]!r} is at {origin[column]:.3g}: subtract that from it, here and on the robot"
@@ -333,11 +333,3 @@ def _origin(rows: np.ndarray, names: Sequence[str], kind: str, problems: list[st
     ]
     kept = np.spacing(np.minimum(top, _LARGEST).astype(np.float32))
     return np.where((kept > _COARSE * span) & moves & ~lost, low + span / 2, 0.0)
-
-
-def _each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:
-    """What is said of every column, or once for all."""
-    said = (given,) * wide if isinstance(given, str) else tuple(given)
-    if len(said) != wide:
-        problems.append(f"{option(what)} names {len(said)} columns, there are {wide}")
-    return said

@@ -15,14 +15,14 @@ from torchrl_koap import keys
 from torchrl_koap.data.formats.frames import stored_clips
 from torchrl_koap.data.formats.lerobot import INFO, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each
 from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.data.formats.robomimic import hdf5_files, read_robomimic
 from torchrl_koap.data.formats.tables import read_tables, table_files
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
 from torchrl_koap.data.ted import load_ted, read_about, source_names, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import DataError, option, read_json
+from torchrl_koap.files import DataError, option, read_json, refuse
 from torchrl_koap.lookup import lookup
 
 __all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recordings", "write_recordings"]
@@ -62,10 +62,11 @@ def _read_stored(
     )
     if resample is None:
         return recordings
-    given = [action_kind] * task.action_dim if isinstance(action_kind, str) else list(action_kind)
-    declared = [action.kind for action in task.actions.values()]
-    kinds = ["absolute" if is_one == "absolute" else kind for is_one, kind in zip(declared, given, strict=True)]
-    return resampled(recordings, resample, kinds)
+    problems: list[str] = []
+    given = one_each(action_kind, task.action_dim, "action_kind", problems)
+    refuse(source, problems)
+    each = zip(task.actions.values(), given, strict=True)
+    return resampled(recordings, resample, ["absolute" if is_one.kind == "absolute" else kind for is_one, kind in each])
 
 
 # what folders hold that are no recordings, and what to do

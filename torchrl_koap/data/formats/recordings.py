@@ -198,6 +198,14 @@ def wrong_rate(value: Any, name: str) -> list[str]:
     return [f"{option(name)} must be a positive number of frames per second, got {value!r}"]
 
 
+def one_each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:
+    """Returns what an option says of every column, or once for all; another number of columns is a problem more."""
+    said = (given,) * wide if isinstance(given, str) else tuple(given)
+    if len(said) != wide:
+        problems.append(f"{option(what)} names {len(said)} columns, there are {wide}")
+    return said
+
+
 def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
     if getattr(values, "ndim", None) == 2:  # arrays, and data frames, which would be a list of their names
         raise DataError(source, f"{what} must be a list of recordings {wanted}, got one array {list(values.shape)}")

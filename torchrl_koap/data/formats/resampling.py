@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN
-from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
+from torchrl_koap.data.formats.recordings import Recordings, one_each, wrong_rate
 from torchrl_koap.files import DataError, option, refuse, some
 from torchrl_koap.lookup import lookup
 
@@ -45,8 +45,9 @@ def resampled(
             ``"delta"``, which does not tell what becomes of them, no trajectory of two new frames.
         ValueError: for an unknown kind of action.
     """
-    known, wide = recordings.control_hz, len(recordings.action_names)
-    kinds = [action_kind] * wide if isinstance(action_kind, str) else list(action_kind)
+    known = recordings.control_hz
+    unfit: list[str] = []
+    kinds = one_each(action_kind, len(recordings.action_names), "action_kind", unfit)
     summing = [lookup(ADDS_UP, kind, "kind of action") for kind in kinds]
     problems = wrong_rate(control_hz, "resample")
     if times is None and known is None:
@@ -65,9 +66,8 @@ def resampled(
             f"{control_hz:g} Hz is more than twice the rate of {some(dense)}: {option('resample')} may be at"
             f" most {MOST / max(usual):.4g}, else most frames would be made up"
         )
-    if len(kinds) != wide:
-        problems.append(f"{option('action_kind')} names {len(kinds)} columns, there are {wide}")
-    elif recordings.num_labels and None in summing:
+    problems += unfit
+    if not unfit and recordings.num_labels and None in summing:
         problems.append(
             "actions of kind 'delta' may be changes over one frame, which add up over a longer step, or velocities,"
             f" which hold on: pass {option('action_kind')} 'change' or 'velocity', or 'raw' for torques"
