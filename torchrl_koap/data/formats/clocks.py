@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,11 @@ class Clock:
     def usual(self) -> float:
         """The median step in seconds."""
         return float(np.median(np.concatenate(self.steps)))
+
+
+def declared_rate(value: Any) -> float | None:
+    """Frames per second that a source declares; None where what it says is no positive number."""
+    return float(value) if isinstance(value, (int, float)) and value > 0 else None
 
 
 def usual_rate(clock: Clock, problems: list[str]) -> float | None:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.formats.clocks import declared_rate
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import lerobot_clips
 from torchrl_koap.data.formats.kinds import kind_of
@@ -99,7 +100,7 @@ def read_lerobot(
     return assemble(
         pieces,
         str(root),
-        declared_hz=_rate(info),
+        declared_hz=declared_rate(info.get("fps")),
         action_names=acting,
         skipped=[*absent, *unread],
         no_rate="info.json holds no fps",
@@ -242,8 +243,3 @@ def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
     if isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given):
         return given if name != SURROUNDINGS else [f"{short}_{label}" for label in given]
     return [short] if width == 1 else [f"{short}_{index}" for index in range(width)]
-
-
-def _rate(info: Mapping[str, Any]) -> float | None:
-    fps = info.get("fps")
-    return float(fps) if isinstance(fps, (int, float)) and fps > 0 else None

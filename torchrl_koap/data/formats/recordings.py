@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,11 @@ class Recordings:
         """Which state columns change within a recording, as goals do not: bool ``[d]``."""
         return np.any([(frames[1:] != frames[:-1]).any(0) for frames in self.states], axis=0)
 
+    def filmed(self, spans: Iterable[tuple[int, Sequence[int] | np.ndarray]]) -> dict[str, list[Clip]]:
+        """Where the frames of trajectories, by their numbers, lie in some of their rows."""
+        chosen = list(spans)
+        return {name: [clips[number].take(rows) for number, rows in chosen] for name, clips in self.cameras.items()}
+
     def cut(self, spans: Sequence[tuple[int, int, int]], skipped: Sequence[str]) -> Recordings:
         """Keeps of trajectories, by their numbers, the frames from one to the one behind the last."""
         return replace(
@@ -63,10 +68,7 @@ class Recordings:
             states=[self.states[number][start:end] for number, start, end in spans],
             actions=[self.actions[number][start : end - 1] for number, start, end in spans],
             sources=tuple(self.sources[number] for number, *_ in spans),
-            cameras={
-                name: [clips[number].take(range(start, end)) for number, start, end in spans]
-                for name, clips in self.cameras.items()
-            },
+            cameras=self.filmed((number, range(start, end)) for number, start, end in spans),
             skipped=(*self.skipped, *skipped),
         )
 

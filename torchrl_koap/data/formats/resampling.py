@@ -106,10 +106,7 @@ def resampled(
         actions=list(actions),
         sources=names,
         control_hz=float(control_hz),
-        cameras={
-            name: [clips[number].take(rows) for number, rows in zip(numbers, nearest, strict=True)]
-            for name, clips in recordings.cameras.items()
-        },
+        cameras=recordings.filmed(zip(numbers, nearest, strict=True)),
         skipped=(*recordings.skipped, *notes),
     )
 

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.formats.clocks import declared_rate
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import MAGIC, Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, numbered, spread
@@ -201,7 +202,6 @@ def _is_compressed(entry: Any) -> bool:
 
 def _control_frequency(text: Any) -> float | None:
     try:
-        value = json.loads(text)["env_kwargs"]["control_freq"]
+        return declared_rate(json.loads(text)["env_kwargs"]["control_freq"])
     except (TypeError, ValueError, KeyError):
         return None
-    return float(value) if isinstance(value, (int, float)) and value > 0 else None
