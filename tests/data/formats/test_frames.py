@@ -188,6 +188,15 @@ def test_frames_of_a_video(version, tmp_path):
         read(recordings, "front", 1)
 
 
+def test_frames_of_a_video_are_not_found_without_a_rate(tmp_path):
+    write_videos(tmp_path, "v3.0")
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    del info["fps"]
+    (tmp_path / "meta/info.json").write_text(json.dumps(info))
+    recordings = read_recordings(tmp_path, control_hz=10)
+    assert not recordings.cameras and "front (info.json holds no fps, by which its frames" in recordings.skipped[0]
+
+
 def test_a_video_with_fewer_frames_than_rows(tmp_path):
     write_videos(tmp_path, "v2.1")
     clip = read_recordings(tmp_path).cameras["front"][1]

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.formats.clocks import declared_rate
 from torchrl_koap.data.formats.parquet import import_pyarrow
 from torchrl_koap.files import read_bytes, some
 from torchrl_koap.lookup import import_extra
@@ -254,10 +255,11 @@ def lerobot_clips(
 ) -> dict[int, dict[str, Clip]]:
     """Says of every episode of a LeRobot data set where the frames of its cameras lie.
 
-    A camera whose videos are nowhere is left out. ``rows`` are of every episode its ``file``, its ``frame_index``
-    ``[T]`` and perhaps ``timestamp`` ``[T, 1]``.
+    A camera whose videos are nowhere, or have no rate, is left out. ``rows`` are of every episode its ``file``, its
+    ``frame_index`` ``[T]`` and perhaps ``timestamp`` ``[T, 1]``.
     """
     found: dict[int, dict[str, Clip]] = {number: {} for number in rows}
+    fps = declared_rate(info.get("fps"))
     for camera in cameras:
         name, video = camera.split(".")[-1], info["features"][camera].get("dtype") == "video"
         begins = _video_starts(Path(root), camera) if video else {}
@@ -270,8 +272,8 @@ def lerobot_clips(
             names = {"video_key": camera, "episode_index": number, "episode_chunk": number // size}
             chunk, file, start = begins.get(number, (0, 0, 0.0))
             path = Path(root) / str(info.get("video_path")).format(**names, chunk_index=chunk, file_index=file)
-            if path.is_file():
-                fps, stamps = float(info["fps"]), columns.get("timestamp", np.full((1, 1), np.nan))[:, 0]
+            if fps is not None and path.is_file():
+                stamps = columns.get("timestamp", np.full((1, 1), np.nan))[:, 0]
                 shown = stamps * fps if np.isfinite(stamps).all() else columns["frame_index"]
                 numbers = np.round(shown + start * fps).astype(int)
                 found[number][name] = Clip(str(path.resolve()), tuple(numbers.tolist()))

@@ -85,7 +85,9 @@ def read_lerobot(
     acting = _names(known.get(ACTION) or {}, ACTION, first[ACTION].shape[1] if ACTION in first else width)
     clips, pieces = lerobot_clips(root, info, cameras, rows), []
     unseen = [name for name in images if name.split(".")[-1] not in clips[min(rows)]]
-    absent = [f"{name} (its videos are not here)" if name in cameras else name for name in unseen]
+    rate = declared_rate(info.get("fps"))
+    why = "its videos are not here" if rate is not None else "info.json holds no fps, by which its frames are found"
+    absent = [f"{name} ({why})" if name in cameras else name for name in unseen]
     for number, columns in rows.items():
         states = dict(zip(names, np.concatenate([columns[name] for name in chosen], 1).T, strict=True))
         steps = dict(zip(acting, columns[ACTION].T, strict=True)) if ACTION in columns else None
@@ -100,7 +102,7 @@ def read_lerobot(
     return assemble(
         pieces,
         str(root),
-        declared_hz=declared_rate(info.get("fps")),
+        declared_hz=rate,
         action_names=acting,
         skipped=[*absent, *unread],
         no_rate="info.json holds no fps",
