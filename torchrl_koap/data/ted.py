@@ -68,7 +68,7 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     strange = [name for name, value in entries.items() if not isinstance(value, torch.Tensor)]
     if strange:
         raise TypeError(f"only tensors can be saved, {strange} are none")
-    if folder.exists() and not (folder.is_dir() and (is_ted(folder) or not any(folder.iterdir()))):
+    if folder.exists() and not (folder.is_dir() and ((folder / _ABOUT).is_file() or not any(folder.iterdir()))):
         raise FileExistsError(f"{folder} exists and holds no data set; it is left as it is")
     lengths = trajectory_lengths(data).tolist()
     about = {
@@ -89,17 +89,12 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     return folder
 
 
-def is_ted(folder: str | Path) -> bool:
-    """Whether a folder holds a data set of this library."""
-    return (Path(folder) / _ABOUT).is_file()
-
-
 def stored_folder(folder: str | Path) -> Path | None:
     """Where a folder holds a data set of this library: in ``ted`` inside it, or itself; None if nowhere."""
-    inside = Path(folder) / "ted"
-    if inside.is_dir():
-        return inside
-    return Path(folder) if is_ted(folder) else None
+    folder = Path(folder)
+    if (folder / "ted").is_dir():
+        return folder / "ted"
+    return folder if (folder / _ABOUT).is_file() else None
 
 
 def read_about(folder: str | Path) -> dict[str, Any]:

@@ -37,6 +37,12 @@ class Piece:
         """Number of frames."""
         return len(next(iter(self.states.values()), ()))
 
+    @property
+    def clocks(self) -> dict[str, np.ndarray]:
+        """The columns of time stamps, in seconds."""
+        kinds = {name: kind_of(name) for name in self.states}
+        return {name: self.states[name] * unit for name, (kind, unit) in kinds.items() if kind == "clock"}
+
 
 def assemble(
     pieces: Sequence[Piece],
@@ -153,11 +159,9 @@ def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarra
 def _clocks(pieces: Sequence[Piece]) -> list[Clock]:
     """The columns of time stamps, in seconds from the first frame of every piece."""
     found: dict[str, list[np.ndarray]] = {}
-    for name in pieces[0].states:
-        kind, unit = kind_of(name)
-        if kind != "clock":
-            continue
-        times = [piece.states[name] * unit for piece in pieces]
+    seconds_of = [piece.clocks for piece in pieces]
+    for name in seconds_of[0]:
+        times = [clocks[name] for clocks in seconds_of]
         whole = (other for other, seconds in found.items() if all((part == part.round()).all() for part in seconds))
         seconds = next(whole, None)
         if seconds is not None and all(((part >= 0) & (part < 1)).all() for part in times):  # ROS: s and ns

@@ -69,7 +69,8 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     pieces: list[Piece] = []
     for file in files:
         try:
-            pieces.append(_with_cameras(_READERS[file.suffix.lower()](file, action_columns), file))
+            piece = _READERS[file.suffix.lower()](file, action_columns)
+            pieces.append(replace(piece, cameras=clips_beside(file, next(iter(piece.clocks.values()), None))))
         except (ValueError, OSError) as error:
             faults.append((str(file), str(error)))
     refuse(folder, gathered(faults) or _lacking(pieces, action_columns or ()))
@@ -104,13 +105,6 @@ def _lacking(pieces: Sequence[Piece], action_columns: Sequence[str]) -> list[str
         if piece.actions and (missing := [name for name in action_columns if name not in piece.actions])
     ]
     return unknown(action_columns, [*every], f"column in {option('action_columns')}:") or gathered(lacking)
-
-
-def _with_cameras(piece: Piece, file: Path) -> Piece:
-    """A table and what cameras saw beside it, by its clock where it has one."""
-    clocks = [(name, kind_of(name)[1]) for name in piece.states if kind_of(name)[0] == "clock"]
-    clock = piece.states[clocks[0][0]] * clocks[0][1] if clocks else None
-    return replace(piece, cameras=clips_beside(file, clock))
 
 
 def _stamped(piece: Piece, counted: Mapping[str, tuple[str | None, float]]) -> Piece:
