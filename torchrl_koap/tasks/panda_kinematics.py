@@ -17,7 +17,7 @@ LINKS = (
     ((0.0, 0.0, 0.0), 1),
     ((0.088, 0.0, 0.0), 1),
 )
-_FLANGE_TO_TOOL = 0.212  # m along the last joint's axis
+FLANGE_TO_TOOL = 0.212  # m along the last joint's axis
 
 
 def tool_position(joints: Tensor) -> Tensor:
@@ -32,4 +32,4 @@ def tool_position(joints: Tensor) -> Tensor:
             y, z = turn * z, -turn * y
         cosine, sine = joints[..., index : index + 1].cos(), joints[..., index : index + 1].sin()
         x, y = cosine * x + sine * y, cosine * y - sine * x
-    return position + _FLANGE_TO_TOOL * z
+    return position + FLANGE_TO_TOOL * z

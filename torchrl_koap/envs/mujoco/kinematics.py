@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from torchrl_koap.tasks.panda_kinematics import LINKS
+from torchrl_koap.tasks.panda_kinematics import FLANGE_TO_TOOL, LINKS
 
 TIMESTEP = 0.001
 # Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973.
@@ -24,55 +24,24 @@ EIGENVALUE_MIN, EIGENVALUE_MAX = 0.01, 100.0
 
 
 @njit(cache=True)
-def _next_frame(axes, index, turn):
-    """Writes frame ``index`` of the chain into ``axes`` (columns x, y, z) up to the joint's own rotation.
-
-    ``turn`` is +1, -1 or 0: the fixed rotation about x by +90, -90 or 0 deg.
-    """
-    for k in range(3):
-        x, y, z = axes[index - 1, 0, k], axes[index - 1, 1, k], axes[index - 1, 2, k]
-        axes[index, 0, k] = x
-        if turn > 0:
-            axes[index, 1, k], axes[index, 2, k] = z, -y
-        elif turn < 0:
-            axes[index, 1, k], axes[index, 2, k] = -z, y
-        else:
-            axes[index, 1, k], axes[index, 2, k] = y, z
-
-
-@njit(cache=True)
-def _rotate(axes, index, angle):
-    c, s = np.cos(angle), np.sin(angle)
-    for k in range(3):
-        x, y = axes[index, 0, k], axes[index, 1, k]
-        axes[index, 0, k] = c * x + s * y
-        axes[index, 1, k] = c * y - s * x
-
-
-@njit(cache=True)
 def forward_kinematics(q, axes, origins, tcp, quat):
     """Computes the frames of the arm's joints ``q`` [7] (rad) and the pose of the TCP, in the frame of its base.
 
     Written are the axes x, y, z of the joints' frames into rows 1-7 of ``axes`` [8, 3, 3] (row 0 ends as the hand's),
     their ``origins`` [8, 3] (m), the TCP's position ``tcp`` [3] (m) and its quaternion ``quat`` [4] (w, x, y, z).
     """
-    for i in range(3):
-        for k in range(3):
-            axes[0, i, k] = 1.0 if i == k else 0.0
-    origins[0, 0], origins[0, 1], origins[0, 2] = 0.0, 0.0, 0.0
+    axes[0], origins[0] = np.eye(3), 0.0
     for index in range(1, 8):
         along_x, along_y, along_z = _OFFSETS[index - 1]
+        turn, c, s = _TURNS[index - 1], np.cos(q[index - 1]), np.sin(q[index - 1])
         for k in range(3):
-            origins[index, k] = (
-                origins[index - 1, k]
-                + axes[index - 1, 0, k] * along_x
-                + axes[index - 1, 1, k] * along_y
-                + axes[index - 1, 2, k] * along_z
-            )
-        _next_frame(axes, index, _TURNS[index - 1])
-        _rotate(axes, index, q[index - 1])
+            x, y, z = axes[index - 1, 0, k], axes[index - 1, 1, k], axes[index - 1, 2, k]
+            origins[index, k] = origins[index - 1, k] + x * along_x + y * along_y + z * along_z
+            if turn:  # a quarter about x
+                y, z = turn * z, -turn * y
+            axes[index, 0, k], axes[index, 1, k], axes[index, 2, k] = c * x + s * y, c * y - s * x, z
     for k in range(3):
-        tcp[k] = origins[7, k] + 0.212 * axes[7, 2, k]
+        tcp[k] = origins[7, k] + FLANGE_TO_TOOL * axes[7, 2, k]
         # the hand is turned by exactly -45 deg about z
         axes[0, 0, k] = _COS45 * (axes[7, 0, k] - axes[7, 1, k])
         axes[0, 1, k] = _COS45 * (axes[7, 0, k] + axes[7, 1, k])
