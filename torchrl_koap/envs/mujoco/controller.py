@@ -71,23 +71,28 @@ def _array(address, length):
 
 
 @njit(cache=True)
-def _finger_forces(position, velocity, width, grasping, ctrl):
-    mean = 0.5 * (position[7] + position[8])
-    for i in range(7, 9):
+def _substep(step, model, data, pointers, q, speed, width, grasping, log, logged):
+    """One physics step of one simulation in which the joints are pulled to ``q`` [7] (rad) at ``speed`` [7] (rad/s).
+
+    Where it is ``logged``, D3IL's recorder notes the joints after the step and the TCP position at its beginning.
+    """
+    qpos, qvel = _array(pointers[QPOS], 9), _array(pointers[QVEL], 9)
+    ctrl, bias = _array(pointers[CTRL], 9), _array(pointers[BIAS], 9)
+    for j in range(7):
+        ctrl[j] = KP[j] * (q[j] - qpos[j]) + KD[j] * (speed[j] - qvel[j]) + bias[j]
+    mean = 0.5 * (qpos[7] + qpos[8])
+    for j in range(7, 9):
         if mean - width > 0.005:
-            hold = -20.0 if grasping else 10.0 * (-0.2 - velocity[i])
+            hold = -20.0 if grasping else 10.0 * (-0.2 - qvel[j])
         else:
-            hold = clip(500.0 * (width - position[i]) - 10.0 * velocity[i], -5.0, 5.0)
-        ctrl[i] = 500.0 * (mean - position[i]) + hold
-
-
-@njit(cache=True)
-def _write_log(row, pointers, qpos, q_des):
-    """Log row of D3IL's recorder: joints after the substep, TCP position at its beginning."""
-    row[:7], row[7:14] = qpos[:7], q_des
-    row[14:17] = _array(pointers[TCP_POS], 3)
-    row[17] = qpos[7] + qpos[8]
-    row[LOG_WIDTH:] = _array(pointers[OBJECTS], len(row) - LOG_WIDTH)
+            hold = clip(500.0 * (width - qpos[j]) - 10.0 * qvel[j], -5.0, 5.0)
+        ctrl[j] = 500.0 * (mean - qpos[j]) + hold
+    _step_physics(step, model, data)
+    if logged:
+        log[:7], log[7:14] = qpos[:7], q
+        log[14:17] = _array(pointers[TCP_POS], 3)
+        log[17] = qpos[7] + qpos[8]
+        log[LOG_WIDTH:] = _array(pointers[OBJECTS], len(log) - LOG_WIDTH)
 
 
 @njit(nogil=True, cache=True)
@@ -102,39 +107,27 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
     """
     target, q = np.empty(7), np.empty(7)
     for row in rows:
-        qpos, qvel = _array(pointers[row, QPOS], 9), _array(pointers[row, QVEL], 9)
-        ctrl, bias = _array(pointers[row, CTRL], 9), _array(pointers[row, BIAS], 9)
         norm = 0.0
         for k in range(3, 7):
             norm += commands[row, k] ** 2
         norm = np.sqrt(norm)
         for k in range(7):
             target[k] = commands[row, k] if k < 3 else commands[row, k] / norm
-        q[:] = targets[row] if started[row] else qpos[:7]
+        q[:] = targets[row] if started[row] else _array(pointers[row, QPOS], 7)
         started[row] = True
+        fixed, hand = (step, model, data[row], pointers[row]), (widths[row], grasping[row], log[row])
         for substep in range(substeps):
             targets[row] = q
             inverse_kinematics(target, q)
-            for j in range(7):
-                speed = (q[j] - targets[row, j]) / TIMESTEP
-                ctrl[j] = KP[j] * (q[j] - qpos[j]) + KD[j] * (speed - qvel[j]) + bias[j]
-            _finger_forces(qpos, qvel, widths[row], grasping[row], ctrl)
-            _step_physics(step, model, data[row])
-            if substep == 0:
-                _write_log(log[row], pointers[row], qpos, q)
+            _substep(*fixed, q, (q - targets[row]) / TIMESTEP, *hand, substep == 0)
         targets[row] = q
 
 
 @njit(nogil=True, cache=True)
 def track_joints(step, model, data, pointers, rows, commands, widths, grasping, substeps, log):
     """Holds joints at ``commands`` [n, 7] (rad) for ``substeps`` physics steps; as :func:`track_pose` else."""
+    still = np.zeros(7)
     for row in rows:
-        qpos, qvel = _array(pointers[row, QPOS], 9), _array(pointers[row, QVEL], 9)
-        ctrl, bias = _array(pointers[row, CTRL], 9), _array(pointers[row, BIAS], 9)
+        fixed, hand = (step, model, data[row], pointers[row]), (widths[row], grasping[row], log[row])
         for substep in range(substeps):
-            for j in range(7):
-                ctrl[j] = KP[j] * (commands[row, j] - qpos[j]) - KD[j] * qvel[j] + bias[j]
-            _finger_forces(qpos, qvel, widths[row], grasping[row], ctrl)
-            _step_physics(step, model, data[row])
-            if substep == 0:
-                _write_log(log[row], pointers[row], qpos, commands[row])
+            _substep(*fixed, commands[row], still, *hand, substep == 0)
