@@ -34,12 +34,13 @@ def test_stacking_without_joints_shows_and_commands_what_the_paper_does():
 def test_actions_say_what_they_move():
     moving = {"x": Action("m", column=1), "y": Action("m", column=0)}
     task = Task(**(TOY | {"actions": moving, "robot": (3, 4)}))
-    assert task.moved_columns() == task.moved_columns(or_robot=True) == (1, 0)
+    assert task.moved_columns() == (1, 0) and task.moves == {0: 1, 1: 0}
     assert task.action_rule is None and task.delta_actions == (0, 1)
     silent = Task(**(TOY | {"robot": (3, 4, 0)}))
-    assert silent.moved_columns() == () and silent.moved_columns(or_robot=True) == (3, 4)
+    assert silent.moved_columns() == () and silent.moves == {0: 3, 1: 4}
+    assert Task(**(TOY | {"robot": (3,)})).moves == {}
     reached = Task(**(TOY | {"actions": {name: Action("m", "absolute", column=2) for name in "xy"}, "robot": (3, 4)}))
-    assert reached.targets == {0: 2, 1: 2} and reached.moved_columns() == () and reached.delta_actions == ()
+    assert reached.targets == reached.moves == {0: 2, 1: 2} and reached.moved_columns() == () and reached.delta_actions == ()
     states = torch.arange(5.0).expand(1, 3, 5)
     assert reached.action_rule(states, torch.ones(1, 3, 2)).tolist() == [[[3.0, 3.0]] * 3]
     mixed = Task(**(TOY | {"actions": {"a": Action("rad"), "grip": Action("m", "gripper", column=4)}}))

@@ -42,8 +42,8 @@ class OracleFollower(Follower):
             raise ValueError(f"task {task.name!r} has no environment, whose simulation the strategy 'oracle' reads")
         self.task, self.blend = task, blend
         self._rule = task.action_rule if task.gripper is not None else None
-        self._changes, self._moved = list(task.delta_actions), list(task.moved_columns(or_robot=True))
-        if not self._changes or len(self._moved) != len(self._changes):
+        self._changes, self._moved = list(task.moves), list(task.moves.values())
+        if not task.moves or task.targets:
             raise ValueError(f"task {task.name!r} does not say which state columns its actions move (Action.column)")
         units = task.action_units
         self._pushes = np.array([_PUSH.get(units[i], 0.01) for i in self._changes])

@@ -161,16 +161,25 @@ class Task(Columns):
         return {index: column for index, column in absolute.items() if column is not None}
 
     @cached_property
+    def moves(self) -> dict[int, int]:
+        """Action column of each command and the state column that it moves; empty where that is not known.
+
+        These are the ``targets``, else the changes of a command: they move the columns that the actions name, or where
+        some name none the first ones of the robot.
+        """
+        if self.targets:
+            return self.targets
+        moved = self.moved_columns() or self.robot[: len(self.delta_actions)]
+        known = len(moved) == len(self.delta_actions)
+        return dict(zip(self.delta_actions, moved, strict=True)) if known else {}
+
+    @cached_property
     def distances(self) -> tuple[tuple[int, int], ...]:
         """Action column and state column of the actions that controllers learn as the distance from the state.
 
         These are absolute actions with targets, and commands that move a known column.
         """
-        if self.targets:
-            return tuple(self.targets.items())
-        moved = self.moved_columns(or_robot=True)
-        known = self.defaults.commands and len(moved) == len(self.delta_actions)
-        return tuple(zip(self.delta_actions, moved, strict=True)) if known else ()
+        return tuple(self.moves.items()) if self.targets or self.defaults.commands else ()
 
     @property
     def origins(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
@@ -188,15 +197,10 @@ class Task(Columns):
                 return index, action.column
         return None
 
-    def moved_columns(self, *, or_robot: bool = False) -> tuple[int, ...]:
-        """Returns the state column that each action moves; empty where one of them names none.
-
-        With ``or_robot`` these are then the first columns of the robot, one for each change of a command.
-        """
+    def moved_columns(self) -> tuple[int, ...]:
+        """Returns the state column that each action moves; empty where one of them names none, or is its target."""
         columns = [action.column for action in self.actions.values() if action.column is not None]
-        if len(columns) == self.action_dim and not self.targets:
-            return tuple(columns)
-        return self.robot[: len(self.delta_actions)] if or_robot else ()
+        return tuple(columns) if len(columns) == self.action_dim and not self.targets else ()
 
     @property
     def action_rule(self) -> ActionRule | None:
@@ -231,8 +235,7 @@ class Task(Columns):
         """State columns of a tool position that follows the joints, None where the tool itself is commanded."""
         if self.tool_kinematics is None:
             return None
-        part = self.state_slices[self.position]
-        return tuple(range(part.start, part.stop))
+        return tuple(range(self.state_dim)[self.state_slices[self.position]])
 
     @property
     def plans_position(self) -> bool:
@@ -251,19 +254,12 @@ class Task(Columns):
 
     def interchangeable_columns(self) -> list[list[list[int]]]:
         """Returns the state columns of the bodies that may be permuted, by group and body."""
-        return [
-            [
-                [
-                    column
-                    for part, place in self.state_slices.items()
-                    if part.startswith(f"{name}_")
-                    for column in range(place.start, place.stop)
-                ]
-                for name in group
-            ]
-            for group in self.interchangeable
-            if len(group) > 1
-        ]
+
+        def columns_of(name: str) -> list[int]:
+            parts = [part for part in self.state_slices if part.startswith(f"{name}_")]
+            return [column for part in parts for column in range(self.state_dim)[self.state_slices[part]]]
+
+        return [[columns_of(name) for name in group] for group in self.interchangeable if len(group) > 1]
 
     def planar_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Returns the state columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` that move together."""

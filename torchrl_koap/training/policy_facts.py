@@ -46,22 +46,21 @@ def commanded_columns(task: Task) -> dict[str, list[int]] | None:
 
     None where the observation does not repeat the command, or it is not known what it moves.
     """
-    actions = list(task.targets or task.delta_actions)
-    moved = list(task.targets.values() or task.moved_columns(or_robot=True))
-    if task.command is None:
+    if task.command is None or not task.moves:
         return None
-    commands = list(range(task.observation_dim))[task.command_columns][: len(actions)]
-    if not actions or not len(actions) == len(moved) == len(commands):
-        return None
-    return {"states": moved, "commands": commands, "actions": actions}
+    columns = {"states": list(task.moves.values()), **_commands_of(task, tuple(task.moves))}
+    return columns if len(columns["commands"]) == len(task.moves) else None
 
 
 def decoded_commands(task: Task) -> dict[str, list[int]] | None:
     """The columns of action and observation (``"commands"``) of the commands that controllers decode; None if none."""
-    if not task.defaults.commands:
-        return None
-    actions = list(task.delta_actions)
-    return {"actions": actions, "commands": list(range(task.observation_dim))[task.command_columns][: len(actions)]}
+    return _commands_of(task, task.delta_actions) if task.defaults.commands else None
+
+
+def _commands_of(task: Task, actions: Sequence[int]) -> dict[str, list[int]]:
+    """Action columns, and the observation columns that repeat their commands."""
+    commands = range(task.observation_dim)[task.command_columns][: len(actions)]
+    return {"commands": list(commands), "actions": list(actions)}
 
 
 def tells_commands(task: Task, method: Method) -> bool:
