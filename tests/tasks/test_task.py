@@ -40,7 +40,8 @@ def test_actions_say_what_they_move():
     assert silent.moved_columns() == () and silent.moves == {0: 3, 1: 4}
     assert Task(**(TOY | {"robot": (3,)})).moves == {}
     reached = Task(**(TOY | {"actions": {name: Action("m", "absolute", column=2) for name in "xy"}, "robot": (3, 4)}))
-    assert reached.targets == reached.moves == {0: 2, 1: 2} and reached.moved_columns() == () and reached.delta_actions == ()
+    assert reached.targets == reached.moves == {0: 2, 1: 2}
+    assert reached.moved_columns() == () and reached.delta_actions == ()
     states = torch.arange(5.0).expand(1, 3, 5)
     assert reached.action_rule(states, torch.ones(1, 3, 2)).tolist() == [[[3.0, 3.0]] * 3]
     mixed = Task(**(TOY | {"actions": {"a": Action("rad"), "grip": Action("m", "gripper", column=4)}}))
