@@ -16,15 +16,15 @@ from torchrl_koap.tasks.sorting import (
     BIN_X,
     BIN_Y,
     BOX_HALF,
+    COLOURS,
     PLATFORM_X,
     box_colours,
     in_bins,
     sorting_task,
 )
 
-RED, BLUE = 0, 1
 PLATFORM_TOP = 0.1  # (m)
-_COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
+_RGB = ((1, 0, 0), (0, 0, 1))  # of the colours
 
 
 class SortingEnv(ManipulationEnv):
@@ -115,15 +115,15 @@ class SortingEnv(ManipulationEnv):
     def _scene(self) -> Any:
         root = scene()
         for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
-            add_free_box(root, name, (BOX_HALF,) * 3, _COLOURS[colour])
+            add_free_box(root, name, (BOX_HALF,) * 3, (*_RGB[colour], 1))
         root.attach(panda(link_collisions=True))
         # bodies of their own, after the boxes: contacts are listed in the order of bodies, as in the original
         platform = root.worldbody.add("body", name="platform", pos=((PLATFORM_X[0] + PLATFORM_X[1]) / 2, -0.1, 0))
         size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)
         platform.add("geom", type="box", size=size, friction=friction, priority=1, rgba=(0.5, 0.5, 0.5, 0.5))
-        for colour, name in ((RED, "red"), (BLUE, "blue")):
-            bin_ = root.worldbody.add("body", name=f"{name}_bin", pos=(BIN_X[colour], BIN_Y, 0))
+        for name, x, rgb in zip(COLOURS, BIN_X, _RGB, strict=True):
+            bin_ = root.worldbody.add("body", name=f"{name}_bin", pos=(x, BIN_Y, 0))
             for across, along, width, depth in BIN_WALLS:  # far, left, right, near
-                wall = {"pos": (across, along, 0), "size": (width, depth, 0.1), "rgba": (*_COLOURS[colour][:3], 0.5)}
+                wall = {"pos": (across, along, 0), "size": (width, depth, 0.1), "rgba": (*rgb, 0.5)}
                 bin_.add("geom", type="box", **wall)
         return root
