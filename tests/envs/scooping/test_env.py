@@ -14,7 +14,7 @@ from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.registry import make_env
-from torchrl_koap.envs.scooping.expert import ScoopingExpert, SpoonKinematics, start_joints
+from torchrl_koap.envs.scooping.expert import ScoopingExpert, SpoonKinematics, start_episodes
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, settled_layouts
 from torchrl_koap.tasks import get_task
@@ -44,8 +44,7 @@ def context_at(bowl, start="near"):
 def play(embodiment, context=NEAR, targets=None):
     """An episode of the expert, or of given targets; the targets and the simulation."""
     sims = ScoopingSimulations(embodiment, 1)
-    bowls = context[None, 1, :2] if len(context) > 1 else None
-    sims.reset(ONE, start_joints(context, embodiment, SpoonKinematics())[None], context[:1, 2], bowls)
+    start_episodes(sims, ONE, context[None], SpoonKinematics())
     if targets is not None:
         for target in targets:
             sims.advance(ONE, target[None])
@@ -122,7 +121,7 @@ def test_scores_tell_the_starts_apart():
 def test_the_camera_sees_the_embodiments_differ(embodiment, graphics):
     renderer = Renderer(ScoopingSimulations(embodiment, 1).model, 96, 96, shadows=False)
     sims = ScoopingSimulations(embodiment, 1)
-    sims.reset(np.arange(1), start_joints(NEAR, embodiment, SpoonKinematics())[None], [0.0])
+    start_episodes(sims, ONE, NEAR[None], SpoonKinematics())
     picture = renderer.render(sims.data[0], "third_person").astype(int)
     renderer.close()
     assert picture.shape == (96, 96, 3)

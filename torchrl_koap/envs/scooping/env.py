@@ -12,7 +12,7 @@ from torchrl.data import Unbounded
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.scooping.expert import SpoonKinematics, start_joints
+from torchrl_koap.envs.scooping.expert import SpoonKinematics, start_episodes
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import CAMERA, EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
@@ -83,7 +83,6 @@ class ScoopingEnv(ManipulationEnv):
                 raise ValueError(f"the encoder's projection must have {EMBEDDING_DIM} components, got {dim}")
         super().__init__(*args, task=get_task(task), **options)
         self._encoder = chosen
-        self._bowl_moves = "bowl" in self.task.observation
         self._pixels = np.zeros((*self.batch_size, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         self._hand_out = pixels
         self._camera: Renderer | None = None
@@ -101,9 +100,7 @@ class ScoopingEnv(ManipulationEnv):
         return ScoopingSimulations("robot", num_envs, num_threads)
 
     def _start(self, rows: np.ndarray) -> None:
-        joints = np.stack([start_joints(context, "robot", self._arm) for context in self._contexts[rows]])
-        bowls = self._contexts[rows, 1, :2] if self._bowl_moves else None
-        self.sims.reset(rows, joints, self._contexts[rows, 0, 2], bowls)
+        start_episodes(self.sims, rows, self._contexts[rows], self._arm)
 
     def _begin(self, rows: np.ndarray) -> None:
         self._commands[rows] = self.sims.commands[rows]
@@ -122,10 +119,8 @@ class ScoopingEnv(ManipulationEnv):
             self._pixels[rows] = [self._camera.render(self.sims.data[row], CAMERA) for row in rows]
             if self._encoder is not None:
                 embedding = self._encoder.embed(torch.from_numpy(self._pixels[rows])).double().numpy()
-        seen = [embedding, self.sims.spoon_position[rows]]
-        if self._bowl_moves:
-            seen.append(self.sims.bowl_positions[rows])
-        return np.concatenate(seen, axis=1)
+        seen = (embedding, self.sims.spoon_position[rows], self.sims.bowl_positions[rows])
+        return np.concatenate(seen, axis=1)[:, : self.task.observation_dim]  # the bowl only where it moves
 
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.sims.success[rows], np.zeros(len(rows), dtype=bool)

@@ -172,12 +172,15 @@ class ScoopingExpert:
         return True
 
 
-def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics) -> np.ndarray:
-    """Returns the joints with which an episode begins: ``[7]`` (rad), of the hand ``[6]`` (m, rad).
+def start_episodes(sims: ScoopingSimulations, rows: np.ndarray, contexts: np.ndarray, arm: SpoonKinematics) -> None:
+    """Starts episodes where contexts ``[len(rows), bodies, 3]`` say.
 
-    The first row of a context ``[bodies, 3]`` says where the spoon is, x, y (m).
+    The first row of a context says where the spoon is, x, y (m), and how the pieces lie (rad); the second one, if there
+    is one, where the bowl stands.
     """
-    position = np.array([context[0, 0], context[0, 1], START_HEIGHT])
-    if embodiment == "hand":
-        return np.array([*position, 0.0, 0.0, 0.0])
-    return arm.solve(position, np.eye(3), iterations=80)
+    positions = [np.array([x, y, START_HEIGHT]) for x, y in contexts[:, 0, :2]]
+    if sims.embodiment == "hand":
+        joints = [np.array([*position, 0.0, 0.0, 0.0]) for position in positions]
+    else:
+        joints = [arm.solve(position, np.eye(3), iterations=80) for position in positions]
+    sims.reset(rows, np.stack(joints), contexts[:, 0, 2], contexts[:, 1, :2] if contexts.shape[1] > 1 else None)

@@ -13,7 +13,7 @@ import numpy as np
 from torchrl_koap.data.formats.writers import LeRobotWriter
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.scooping.expert import HABITS, ScoopingExpert, SpoonKinematics, start_joints
+from torchrl_koap.envs.scooping.expert import HABITS, ScoopingExpert, SpoonKinematics, start_episodes
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.tasks.scooping import CAMERA, EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE, STARTS, start_of
@@ -105,8 +105,7 @@ def record_videos(
             for attempt in range(MAX_ATTEMPTS):
                 own = (seed, stream, number, attempt)
                 context = _context_at(task, number % len(STARTS), np.random.default_rng((*own, 1)))
-                bowls = context[None, 1, :2] if len(context) > 1 else None
-                sims.reset(np.array([0]), start_joints(context, embodiment, arm)[None], [context[0, 2]], bowls)
+                start_episodes(sims, np.array([0]), context[None], arm)
                 expert = ScoopingExpert(sims, 0, start_of(context), own)
                 episode = _play(sims, expert, renderer, len(columns))
                 attempts += 1

@@ -201,7 +201,6 @@ class ScoopingSimulations(Simulations):
         self.held = np.zeros(num_sims, dtype=np.int64)
         self._episode = {"commands": self.commands, "rim": self.rim, "held": self.held}
         self._site = self.model.site("spoon").id
-        self._pieces = 7 * NUM_PIECES  # numbers that make up the pieces' poses
 
     @property
     def spoon_position(self) -> np.ndarray:
@@ -211,7 +210,7 @@ class ScoopingSimulations(Simulations):
     @property
     def piece_positions(self) -> np.ndarray:
         """Positions of the pieces ``[n, pieces, 3]`` (m)."""
-        return np.stack([_positions(data) for data in self.data])
+        return np.stack([_poses(data)[:, :3] for data in self.data])
 
     @property
     def bowl_positions(self) -> np.ndarray:
@@ -226,7 +225,7 @@ class ScoopingSimulations(Simulations):
     def pieces_on_spoon(self, row: int) -> int:
         """Counts the pieces that lie on the spoon of one simulation."""
         data = self.data[row]
-        local = (_positions(data) - data.site_xpos[self._site]) @ data.site_xmat[self._site].reshape(3, 3)
+        local = (_poses(data)[:, :3] - data.site_xpos[self._site]) @ data.site_xmat[self._site].reshape(3, 3)
         inside = (np.abs(local[:, :2]) < np.array(SPOON_HALF) + 0.002).all(1)
         return int((inside & (local[:, 2] > 0) & (local[:, 2] < 4 * PIECE_RADIUS)).sum())
 
@@ -244,14 +243,12 @@ class ScoopingSimulations(Simulations):
             share = (turn + math.pi) / (2 * math.pi)
             layout = bank[min(int(share * _LAYOUTS), _LAYOUTS - 1)]
             angle = 2 * math.pi / _SIDES * int(share * _LAYOUTS * _SIDES % _SIDES)
-            poses = data.qpos[: self._pieces].reshape(NUM_PIECES, 7)
+            poses = _poses(data)
             poses[:, :3] = _turned(layout, angle)
             poses[:, :2] += bowl - BOWL
             data.mocap_pos[0, :2] = bowl
-            data.qpos[self._pieces :] = own
-            data.ctrl[:] = own
+            data.qpos[-len(own) :] = data.ctrl[:] = self.commands[row] = own
             mujoco.mj_forward(self.model, data)
-            self.commands[row] = own
         self.rim[rows] = False
         self.held[rows] = 0
 
@@ -280,8 +277,9 @@ class ScoopingSimulations(Simulations):
             self.held[row] = self.held[row] + 1 if left and self.pieces_on_spoon(row) else 0
 
 
-def _positions(data: mujoco.MjData) -> np.ndarray:
-    return data.qpos[: 7 * NUM_PIECES].reshape(NUM_PIECES, 7)[:, :3]
+def _poses(data: mujoco.MjData) -> np.ndarray:
+    """Poses of the pieces ``[pieces, 7]``, which can be written."""
+    return data.qpos[: 7 * NUM_PIECES].reshape(NUM_PIECES, 7)
 
 
 def _turned(layout: np.ndarray, angle: float) -> np.ndarray:
@@ -300,11 +298,11 @@ def settled_layouts() -> np.ndarray:
         generator = np.random.default_rng(seed)
         mujoco.mj_resetData(model, data)
         data.qpos[-6:] = data.ctrl[:] = (0.0, 0.0, 0.5, 0.0, 0.0, 0.0)
-        poses = data.qpos[: 7 * NUM_PIECES].reshape(NUM_PIECES, 7)
+        poses = _poses(data)
         radius, angle = 0.05 * np.sqrt(generator.random(NUM_PIECES)), generator.uniform(0, 2 * math.pi, NUM_PIECES)
         poses[:, 0], poses[:, 1] = BOWL[0] + radius * np.cos(angle), BOWL[1] + radius * np.sin(angle)
         poses[:, 2] = 0.02 + 0.006 * np.arange(NUM_PIECES)
         mujoco.mj_step(model, data, 360)
         data.qvel[:] = 0
-        layouts.append(_positions(data).copy())
+        layouts.append(poses[:, :3].copy())
     return np.stack(layouts)
