@@ -7,6 +7,7 @@ The Panda that holds the spoon moves by inverse kinematics.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -101,13 +102,12 @@ class ScoopingExpert:
         self._start, self.attempts, self._wander = start, 0, np.zeros(3)
         self._bowl = sims.bowl_positions[row]
         self._pose = np.array([*sims.spoon_position[row], 0.0, 0.0, 0.0])  # x, y, z, yaw, pitch, roll
-        self._queue: list[tuple[np.ndarray, float]] = []
-        self._segment: tuple[np.ndarray, np.ndarray, int, int] | None = None
+        self._way = self._frames()
         self._tilt = self.habits.tilt * self._generator.standard_normal()
         self._hurry = math.exp(0.12 * self._generator.standard_normal())
         self.finished = False
 
-    def _plan(self) -> None:
+    def _plan(self) -> list[tuple[np.ndarray, float]]:
         """Way points of one attempt, each with the speed of the way to it (m/s)."""
         draw, habits = self._generator, self.habits
         heading = habits.headings[self._start] + habits.heading_sigma * draw.standard_normal()
@@ -128,7 +128,8 @@ class ScoopingExpert:
         reach = _STROKE[1] - 0.3 * abs(offset) + 0.003 * draw.standard_normal()
         above = habits.above + 0.008 * draw.standard_normal()
         leave = self._bowl + 0.5 * (np.array(list(STARTS.values())[self._start]) - self._bowl)
-        self._queue = [
+        self.attempts += 1
+        return [
             (at(_STROKE[0], above, _NOSE_DOWN), habits.speed),
             (at(_STROKE[0], _FLOOR, _NOSE_DOWN), 0.8 * habits.speed),
             (at(reach, _FLOOR, 0.6 * _NOSE_DOWN), habits.drag),
@@ -136,18 +137,25 @@ class ScoopingExpert:
             (at(0.2 * reach, 0.14, _NOSE_UP), 0.5 * habits.speed),
             (np.array([*leave, START_HEIGHT, 0.7 * heading, _NOSE_UP, self._tilt]), habits.speed),
         ]
-        self.attempts += 1
+
+    def _frames(self) -> Iterator[bool]:
+        """Moves the spoon's pose by a frame, again and again, along the way points of attempt after attempt."""
+        while not self.attempts or (self.attempts < 4 and not self.sims.success[self.row]):
+            way = self._plan()
+            for end, speed in way:
+                if end is way[-1][0] and self.attempts < 4 and not self.sims.pieces_on_spoon(self.row):
+                    break  # empty: once more
+                begin = self._pose
+                length = np.linalg.norm(end[:3] - begin[:3]) + 0.06 * np.abs(end[3:] - begin[3:]).max()
+                steps = max(round(1.5 * length / (speed * self._hurry) * FRAME_HZ), 2)
+                for frame in range(1, steps + 1):
+                    share = frame / steps
+                    self._pose = begin + (end - begin) * share**3 * (10 - 15 * share + 6 * share**2)
+                    yield True
 
     def target(self) -> np.ndarray:
         """Decides the targets of the next frame ``[nu]``: joints (rad), or place (m) and angles (rad) of the hand."""
-        if self._segment is None and not self._next():
-            self.finished = True
-        if self._segment is not None:
-            begin, end, steps, done = self._segment
-            done += 1
-            share = done / steps
-            self._pose = begin + (end - begin) * share**3 * (10 - 15 * share + 6 * share**2)
-            self._segment = None if done == steps else (begin, end, steps, done)
+        self.finished = not next(self._way, False)
         self._wander = 0.85 * self._wander + 0.53 * self.habits.wander * self._generator.standard_normal(3)
         pose = self._pose.copy()
         free = np.clip((pose[2] - 0.03) / 0.1, 0, 1)  # careful in the bowl
@@ -155,21 +163,6 @@ class ScoopingExpert:
         if self._arm is None:
             return pose
         return self._arm.solve(pose[:3], rotation_of(*pose[3:]), self.sims.commands[self.row], iterations=12)
-
-    def _next(self) -> bool:
-        """Begins the way to the next way point; False where there is none left."""
-        lifted = len(self._queue) == 1 and self.attempts < 4
-        if lifted and not self.sims.pieces_on_spoon(self.row):
-            self._queue = []  # empty: once more
-        if not self._queue:
-            if self.attempts and (self.sims.success[self.row] or self.attempts >= 4):
-                return False
-            self._plan()
-        end, speed = self._queue.pop(0)
-        way = np.linalg.norm(end[:3] - self._pose[:3]) + 0.06 * np.abs(end[3:] - self._pose[3:]).max()
-        steps = max(round(1.5 * way / (speed * self._hurry) * FRAME_HZ), 2)
-        self._segment = (self._pose.copy(), end, steps, 0)
-        return True
 
 
 def start_episodes(sims: ScoopingSimulations, rows: np.ndarray, contexts: np.ndarray, arm: SpoonKinematics) -> None:
