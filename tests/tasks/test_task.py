@@ -13,6 +13,7 @@ import torch
 from toy_task import TOY
 
 from torchrl_koap.tasks import TASKS, Action, Task, avoiding, get_task, sorting
+from torchrl_koap.tasks.modes import note_arrivals
 
 
 def test_stacking_without_joints_shows_and_commands_what_the_paper_does():
@@ -177,3 +178,10 @@ def test_stacking():
 def test_states_of_another_size_are_refused():
     with pytest.raises(ValueError, match="a state of task 'aligning' has 11 columns, got 2"):
         get_task("aligning").goal_reached(torch.zeros(1, 2))
+
+
+def test_the_nearest_body_that_is_not_noted_arrives_if_it_is_inside():
+    orders = np.array([[-1, -1, -1], [2, -1, -1], [0, -1, -1], [2, 0, 1]])
+    inside = np.array([[True, True, True], [True, True, True], [True, True, False], [True, True, True]])
+    note_arrivals(orders, np.array([[0.3, 0.1, 0.2], [0.1, 0.2, 0.0], [0.0, 0.2, 0.1], [0.1, 0.1, 0.1]]), inside)
+    assert orders.tolist() == [[1, -1, -1], [2, 0, -1], [0, -1, -1], [2, 0, 1]]

@@ -11,6 +11,7 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
 from torchrl_koap.tasks.columns import tan_yaw
+from torchrl_koap.tasks.modes import note_arrivals
 from torchrl_koap.tasks.sorting import (
     BIN_WALLS,
     BIN_X,
@@ -101,16 +102,9 @@ class SortingEnv(ManipulationEnv):
         xy = self.sims.object_poses[rows, :, :2]
         centres = np.stack([np.take(BIN_X, self._colours), np.full(len(self._colours), BIN_Y)], axis=-1)
         distance = np.linalg.norm(xy - centres, axis=-1)
-        for index, inside in enumerate(self._inside(rows)):
-            noted = self._noted[rows[index]]
-            count = int((noted >= 0).sum())
-            if count == len(noted):
-                continue
-            distance[index, noted[:count]] = np.inf
-            nearest = int(distance[index].argmin())
-            if inside[nearest]:
-                noted[count] = nearest
-                self._mode[rows[index], count] = self._colours[nearest]
+        orders = self._noted[rows]
+        note_arrivals(orders, distance, self._inside(rows))
+        self._noted[rows], self._mode[rows] = orders, np.where(orders < 0, -1, self._colours[orders])
 
     def _scene(self) -> Any:
         root = scene()

@@ -14,6 +14,7 @@ from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.action_rules import OPEN, OPEN_ABOVE
 from torchrl_koap.tasks.columns import tan_yaw
+from torchrl_koap.tasks.modes import note_arrivals
 from torchrl_koap.tasks.stacking import BOXES, TARGET, TARGET_HALF, ZONE_RADIUS, piled
 
 COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
@@ -103,12 +104,9 @@ class StackingEnv(ManipulationEnv):
 
     def _update_mode(self, rows: np.ndarray) -> None:
         distance = np.linalg.norm(self.sims.object_poses[rows, :, :2] - TARGET, axis=-1)
-        for letter in range(3):
-            distance[(self._mode[rows] == letter).any(1), letter] = np.inf
-        nearest = distance.argmin(1)
-        arrived = distance[np.arange(len(rows)), nearest] <= ZONE_RADIUS
-        place = (self._mode[rows] >= 0).sum(1)
-        self._mode[rows[arrived], place[arrived]] = nearest[arrived]
+        orders = self._mode[rows]
+        note_arrivals(orders, distance, distance <= ZONE_RADIUS)
+        self._mode[rows] = orders
 
     def _scene(self) -> Any:
         root = scene()

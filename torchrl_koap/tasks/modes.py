@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -64,3 +65,15 @@ class Modes:
             raise ValueError(f"mode must have {entries} entries on the last axis, got shape {list(leaf.shape)}")
         same = (leaf[..., None, :entries] == leaves).all(-1)
         return torch.where(same.any(-1), same.to(torch.int64).argmax(-1), -1)
+
+
+def note_arrivals(orders: np.ndarray, distance: np.ndarray, inside: np.ndarray) -> None:
+    """Notes which bodies have arrived, as D3IL does: at most one per call, the nearest that is not noted yet.
+
+    ``orders`` ``[n, bodies]`` get their numbers in the order of arrival, -1 behind the last; ``distance`` (m) and
+    ``inside``, bool, say how far from its goal each body is and whether it is there. One that leaves stays noted.
+    """
+    noted = (orders[:, :, None] == np.arange(orders.shape[1])).any(1)
+    nearest = np.where(noted, np.inf, distance).argmin(1)
+    rows = np.flatnonzero(inside[np.arange(len(orders)), nearest] & ~noted.all(1))
+    orders[rows, noted.sum(1)[rows]] = nearest[rows]
