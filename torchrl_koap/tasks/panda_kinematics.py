@@ -17,6 +17,9 @@ LINKS = (
     ((0.0, 0.0, 0.0), 1),
     ((0.088, 0.0, 0.0), 1),
 )
+JOINT_LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # rad
+JOINT_HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
+FLANGE = 0.107  # m along the last joint's axis
 FLANGE_TO_TOOL = 0.212  # m along the last joint's axis
 
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from torchrl_koap.tasks.panda_kinematics import FLANGE_TO_TOOL, LINKS
+from torchrl_koap.tasks.panda_kinematics import FLANGE_TO_TOOL, JOINT_HIGH, JOINT_LOW, LINKS
 
 TIMESTEP = 0.001
 # Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973.
-Q_MIN = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
-Q_MAX = np.array([2.8973, 1.7628, 2.0, -0.0698, 2.8973, 3.7525, 2.8973])
+Q_MIN, Q_MAX = np.array(JOINT_LOW), np.array([*JOINT_HIGH[:2], 2.0, *JOINT_HIGH[3:]])
 Q_REST = np.array([0.0, 0.174, 0.0, -0.872, 0.0, 1.222, 0.785])
 
 IK_ITERATIONS = 3

@@ -19,7 +19,7 @@ import mujoco  # it reads MUJOCO_GL for itself, so before the variable is hidden
 
 from torchrl_koap.envs.mujoco.kinematics import TIMESTEP
 from torchrl_koap.graphics import no_graphics
-from torchrl_koap.tasks.panda_kinematics import LINKS
+from torchrl_koap.tasks.panda_kinematics import FLANGE, LINKS
 
 if importlib.util.find_spec("dm_control") is None:
     raise RuntimeError(
@@ -43,7 +43,6 @@ _STIFF = {"solref": (0.002, 1), "solimp": (0.999, 0.999, 0.001), "contype": 7, "
 _DRAWN = {"contype": 0, "conaffinity": 0}
 
 TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
-FLANGE_OFFSET = 0.107  # link8 along the z axis of link7
 HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z
 
 _TURN = 0.5**0.5
@@ -124,7 +123,7 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3
         wrist = {"solimp": (1.998, 1.999, 0.0)} if index == 7 else {}
         body.add("geom", name=f"link{index}", type="mesh", mesh=f"link{index}", rgba=colour, **hull, **wrist)
 
-    flange = body.add("body", name="link8", pos=(0, 0, FLANGE_OFFSET))
+    flange = body.add("body", name="link8", pos=(0, 0, FLANGE))
     flange.add("inertial", mass=0.1, pos=(0, 0, 0), diaginertia=(0.1, 0.1, 0.1))
     hand = flange.add("body", name="hand", quat=HAND_QUAT)
     hand.add(
@@ -163,8 +162,7 @@ def _add_rod(hand: mjcf.Element) -> None:
     tip = rod.add("body", name="rod_tip")
     mass = density * 4 / 3 * math.pi * radius**3
     tip.add("inertial", mass=mass, pos=(0, 0, 0.225), diaginertia=(0.4 * mass * radius**2,) * 3)
-    drawn = {"contype": 0, "conaffinity": 0, "rgba": (0.2, 0.4, 0.8, 1)}
-    tip.add("geom", name="rod_tip", type="sphere", size=(0.01,), pos=(0, 0, 0.225), **drawn)
+    tip.add("geom", name="rod_tip", type="sphere", size=(0.01,), pos=(0, 0, 0.225), rgba=(0.2, 0.4, 0.8, 1), **_DRAWN)
 
 
 def _add_finger(hand: mjcf.Element, side: float, name: str, colour: tuple) -> None:

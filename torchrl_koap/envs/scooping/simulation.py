@@ -15,7 +15,7 @@ import numpy as np
 
 from torchrl_koap.envs.mujoco.simulation import Simulations
 from torchrl_koap.lookup import lookup
-from torchrl_koap.tasks.panda_kinematics import LINKS
+from torchrl_koap.tasks.panda_kinematics import FLANGE, JOINT_HIGH, JOINT_LOW, LINKS
 from torchrl_koap.tasks.scooping import (
     BOWL,
     BOWL_RADIUS,
@@ -128,23 +128,21 @@ _CAPSULES: tuple[tuple[tuple, ...], ...] = (
     (((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)),
     (((0, 0, 0.0), (0, 0, 0.08), 0.045, False),),
 )
-_LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
-_HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
 # joints: stiffness (N m / rad) and damping; with the armature a servo of some 50 ms
 _ARM_SERVO = ((1200, 80),) * 4 + ((500, 34),) * 3
 _HAND_SERVO = ((900, 60),) * 3 + ((12, 0.8),) * 3
-FLANGE = 0.107  # m, along the last joint's axis
 
 
 def _arm() -> str:
     xml, closing = '<geom type="capsule" size="0.07" fromto="-0.06 0 0.06 0 0 0.06" rgba="0.93 0.93 0.93 1"/>', ""
-    for index, ((offset, turn), capsules) in enumerate(zip(LINKS, _CAPSULES, strict=True), 1):
+    links = zip(LINKS, _CAPSULES, JOINT_LOW, JOINT_HIGH, strict=True)
+    for index, ((offset, turn), capsules, low, high) in enumerate(links, 1):
         quat = {0: "1 0 0 0", -1: "0.707107 -0.707107 0 0", 1: "0.707107 0.707107 0 0"}[turn]
         place = " ".join(str(v) for v in offset)
         armature = 0.6 if index <= 4 else 0.25
         xml += (
             f'<body name="link{index}" pos="{place}" quat="{quat}" gravcomp="1">'
-            f'<joint name="j{index}" axis="0 0 1" range="{_LOW[index - 1]} {_HIGH[index - 1]}" armature="{armature}"/>'
+            f'<joint name="j{index}" axis="0 0 1" range="{low} {high}" armature="{armature}"/>'
         )
         for start, end, radius, dark in capsules:
             span = " ".join(f"{v:.4f}" for v in (*start, *end))
