@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data import cut_windows, make_window_buffer
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import WindowTable, spread_evenly
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
@@ -24,7 +24,7 @@ from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
-from torchrl_koap.training.planner import MOST_WINDOWS, augmentation
+from torchrl_koap.training.planner import augmentation, planned_windows
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, state_reader, with_commands
 from torchrl_koap.training.pseudo_labels import relabel
 
@@ -141,12 +141,10 @@ def _train_sampler(
 ) -> tuple[nn.Module, dict[str, float]]:
     """A network that samples actions, with the updates that a planner would have."""
     (phase,) = method.phases
-    sampler, section = method.build(task, config.planner), config.planner
-    seen = data[torch.isin(data[EPISODE], labelled_episodes(data))]
-    extended = extrapolate_ends(seen, HORIZON - 1)
-    states = cut_windows(extended, WINDOW, select=[STATE], pad_before=1, most=MOST_WINDOWS)[STATE]
+    section = config.planner
+    sampler = method.build(task, section).to(config.run.device)
+    _, states = planned_windows(data[torch.isin(data[EPISODE], labelled_episodes(data))])
     sampler.fit_normalizers(states, data[ACTION][data[HAS_ACTION].squeeze(-1)])
-    sampler.to(config.run.device)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(
         data,

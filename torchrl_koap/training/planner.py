@@ -29,7 +29,7 @@ from torchrl_koap.modules.planning.energy_score import relative_distance, relati
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.config import PlannerConfig, TrainConfig
 from torchrl_koap.runs.device import DTYPES
-from torchrl_koap.tasks import HISTORY, Task
+from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import Phases, moving_average
@@ -63,17 +63,14 @@ def learn_planner(
             stacklevel=2,
         )
     planner = build_planner(task, section).to(config.run.device)
-    # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
-    length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
-    extended = extrapolate_ends(data, planner.horizon - 1)
-    windows = cut_windows(extended, length, select=[STATE], pad_before=1, most=MOST_WINDOWS)[STATE]
+    unseen = HISTORY - planner.history
+    extended, windows = planned_windows(data)
     planner.fit_normalizers(windows[:, unseen:])
-    planner.to(config.run.device)
     augment = augmentation(task, windows)
     score = None if held_out is None else plan_score(planner, held_out, spread_evenly(windows, RECORDED), task)
     del windows  # may be larger than the data
-    buffer = make_window_buffer(extended, length, section.batch_size, select=[STATE], pad_before=1)
+    buffer = make_window_buffer(extended, WINDOW, section.batch_size, select=[STATE], pad_before=1)
 
     weights = column_weights(task)
     loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision], weights=weights).to(config.run.device)
@@ -94,6 +91,15 @@ def learn_planner(
         planner.load_state_dict(best.network.state_dict())
         values["held_out_seconds"] = best.seconds
     return planner, values
+
+
+def planned_windows(data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+    """Continues trajectories of flat data ``[N]`` behind their ends; beside them stand windows of states ``[M, T, d]``.
+
+    A plan made near the end of a demonstration needs a future, one made at its start a repeated first frame.
+    """
+    extended = extrapolate_ends(data, HORIZON - 1)
+    return extended, cut_windows(extended, WINDOW, select=[STATE], pad_before=1, most=MOST_WINDOWS)[STATE]
 
 
 def column_weights(task: Task) -> Tensor | None:
