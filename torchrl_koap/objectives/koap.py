@@ -25,14 +25,13 @@ RECONSTRUCTION, KOOPMAN, ACTION = "loss_reconstruction", "loss_koopman", "loss_a
 
 
 class _KoopmanLoss(WindowLoss):
-    """Computes those of the three terms that :attr:`terms` names, from one pass through the networks."""
+    """Computes those of the three terms that are its out-keys, from one pass through the networks."""
 
-    terms: tuple[str, ...]
     trains = (KoopmanInverseDynamics, LiftedInverseDynamics)
     network: LiftedInverseDynamics
 
     def _terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        network, wanted = self.network, self.terms
+        network, wanted = self.network, self.out_keys_source  # all, also where few are selected
         state, recorded = self._inputs(tensordict)
         found = {}
         with self.network_params.to_module(network, preserve_module_state=False):
@@ -78,7 +77,6 @@ class KoopmanReconstructionLoss(_KoopmanLoss):
         torch.Size([])
     """
 
-    terms = (RECONSTRUCTION,)
     out_keys = [RECONSTRUCTION]
 
 
@@ -94,7 +92,6 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
         ['state']
     """
 
-    terms = (KOOPMAN,)
     out_keys = [KOOPMAN]
 
 
@@ -110,7 +107,6 @@ class LatentActionLoss(_KoopmanLoss):
         ['state', 'action', 'has_action']
     """
 
-    terms = (ACTION,)
     out_keys = [ACTION]
     required = ("state", "action", "has_action")
 
@@ -141,7 +137,6 @@ class KOAPLoss(_KoopmanLoss):
         0.0
     """
 
-    terms = (RECONSTRUCTION, KOOPMAN, ACTION)
     out_keys = [RECONSTRUCTION, KOOPMAN, ACTION]
     required = ("state", "action", "has_action")
     _schedulable_buffers = frozenset({"koopman_coeff", "action_coeff"})
