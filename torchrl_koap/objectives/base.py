@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -72,6 +73,17 @@ class NetworkLoss(LossModule):
 
     def _read(self, tensordict: TensorDictBase, name: str) -> Tensor:
         return read_entry(self, tensordict, getattr(self.tensor_keys, name), f"set_keys({name}=...)")
+
+    def _read_or_draw(
+        self, tensordict: TensorDictBase, name: str, shape: torch.Size, draw: Callable[[], Tensor]
+    ) -> Tensor:
+        """Reads an optional entry, such as noise, that must have a shape; draws it where it is not there."""
+        key = getattr(self.tensor_keys, name)
+        value = tensordict.get(key, None)
+        value = draw() if value is None else value
+        if value.shape != shape:
+            raise ValueError(f"{key!r} must be {list(shape)}, got {list(value.shape)}")
+        return value
 
     def _read_mask(self, tensordict: TensorDictBase, name: str, state: Tensor) -> Tensor:
         """Reads a mask ``[*B, T]`` of the frames of windows ``[*B, T, d]``, stored with a trailing 1 or not."""

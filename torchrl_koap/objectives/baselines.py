@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from torch import Tensor
 
 from torchrl_koap.modules.baselines.latents import QuantizedInverseDynamics, VariationalInverseDynamics
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
@@ -163,14 +162,6 @@ class VariationalLoss(WindowLoss):
         super().__init__(network, reduction=reduction)
         self.register_coeff_buffer("kl_coeff", float(kl_coeff))
 
-    def _noise(self, tensordict: TensorDictBase, mean: Tensor) -> Tensor:
-        noise = tensordict.get(self.tensor_keys.noise, None)
-        if noise is None:
-            return torch.randn_like(mean)
-        if noise.shape != mean.shape:
-            raise ValueError(f"{self.tensor_keys.noise!r} must be {list(mean.shape)}, got {list(noise.shape)}")
-        return noise
-
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Computes both terms from ``state``."""
@@ -179,7 +170,8 @@ class VariationalLoss(WindowLoss):
         counts = recorded[..., span.start : span.stop]
         with self.network_params.to_module(self.network, preserve_module_state=False):
             read, mean, log_variance = self.network.posterior(state, span)
-            sample = mean + (0.5 * log_variance).exp() * self._noise(tensordict, mean)
+            noise = self._read_or_draw(tensordict, "noise", mean.shape, lambda: torch.randn_like(mean))
+            sample = mean + (0.5 * log_variance).exp() * noise
             error = (self.network.decoder(sample) - read).square().mean(-1)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
         losses = {

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -75,7 +76,7 @@ class DenoisingLoss(NetworkLoss):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the loss; the input is not changed."""
-        names, network = self.tensor_keys, self.network
+        network = self.network
         history, sequence, counts = self.read(tensordict)
         with self.network_params.to_module(network, preserve_module_state=False):
             condition = network.encode_history(history)  # with a gradient: features may be trained too
@@ -83,14 +84,10 @@ class DenoisingLoss(NetworkLoss):
                 clean = network.encode(history, sequence)
                 if counts is not None:  # before the network: masking afterwards would leave NaN in the gradient
                     clean = torch.where(counts, clean, 0.0)
-                noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
-                noise = torch.randn_like(clean) if noise is None else noise.to(clean.dtype)
-                if noise.shape != clean.shape:
-                    raise ValueError(f"{names.noise!r} must be {list(clean.shape)}, got {list(noise.shape)}")
-                time = network.schedule.sample_time(clean) if time is None else time.to(clean.dtype)
-                if time.shape != clean.shape[:-2]:
-                    raise ValueError(f"{names.time!r} must be {list(clean.shape[:-2])}, got {list(time.shape)}")
-                noisy = network.schedule.add_noise(clean, noise, time)
+                noise = self._read_or_draw(tensordict, "noise", clean.shape, lambda: torch.randn_like(clean))
+                draw_time = partial(network.schedule.sample_time, clean)
+                time = self._read_or_draw(tensordict, "time", clean.shape[:-2], draw_time).to(clean.dtype)
+                noisy = network.schedule.add_noise(clean, noise.to(clean.dtype), time)
             with torch.autocast(clean.device.type, self.dtype, enabled=self.dtype is not None):
                 predicted = network.denoiser(noisy, time, condition)
             if predicted.shape != clean.shape:  # it would be broadcast
