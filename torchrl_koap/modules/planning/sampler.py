@@ -95,20 +95,11 @@ class ConditionalSampler(TensorDictModuleBase):
 
     def check_sequence(self, sequence: Tensor) -> None:
         """Refuses sequences that are not ``[*B, H, width]``."""
-        if sequence.shape[-2:] != self.noise_shape:
-            raise ValueError(
-                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, columns),"
-                f" got {list(sequence.shape)}"
-            )
+        _check(sequence, repr(self.out_keys[0]), *self.noise_shape, "horizon, columns")
 
     def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
-        length = self.history + self.horizon
-        if window.ndim < 2 or window.shape[-2] != length or window.shape[-1] != self.state_dim:
-            raise ValueError(
-                f"windows must be [*B, {length}, {self.state_dim}] (history + horizon, state_dim),"
-                f" got {list(window.shape)}"
-            )
+        _check(window, "windows", self.history + self.horizon, self.state_dim, "history + horizon, state_dim")
         return window[..., : self.history, :], window[..., self.history :, :]
 
     def condition(self, history: Tensor) -> Tensor:
@@ -122,11 +113,7 @@ class ConditionalSampler(TensorDictModuleBase):
 
     def encode_history(self, history: Tensor) -> Tensor:
         """Maps raw histories ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d + f]``."""
-        if history.ndim < 2 or history.shape[-2:] != (self.history, self.state_dim):
-            raise ValueError(
-                f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim),"
-                f" got {list(history.shape)}"
-            )
+        _check(history, repr(self.in_keys[0]), self.history, self.state_dim, "history, state_dim")
         return self.condition_normalizer(self.condition(history))
 
     def far(self, state: Tensor) -> Tensor:
@@ -180,3 +167,9 @@ class ConditionalSampler(TensorDictModuleBase):
             )
         rest = prefix[..., -1:, :].expand(*prefix.shape[:-2], self.horizon - frames, -1)
         return self.encode(history, torch.cat([prefix, rest], -2))[..., :frames, :]
+
+
+def _check(value: Tensor, name: str, frames: int, columns: int, sizes: str) -> None:
+    """Refuses what is not ``[*B, frames, columns]``."""
+    if value.shape[-2:] != (frames, columns):
+        raise ValueError(f"{name} must be [*B, {frames}, {columns}] ({sizes}), got {list(value.shape)}")
