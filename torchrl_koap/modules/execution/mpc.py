@@ -201,9 +201,9 @@ class MPC(Follower):
         for name in ("follow_gain", "keep_gain"):
             self.register_buffer(name, None, persistent=False)
         self.refresh()
-        self.register_load_state_dict_post_hook(_refresh)
+        self.register_load_state_dict_post_hook(MPC.refresh)
 
-    def refresh(self) -> None:
+    def refresh(self, *_: Any) -> None:
         """Solves the quadratic problem once for all plans, anew for another response; loading weights does so too.
 
         The gain of the distance from the plan if the command is held is ``[(N - 1) J, N J]``, that of the last change
@@ -249,7 +249,3 @@ class MPC(Follower):
         future = missing @ self.follow_gain.to(goal).T + changes[..., -1, :] @ self.keep_gain.to(goal).T
         future = future.unflatten(-1, (self.look_ahead - 1, model.num_axes))
         return command.unsqueeze(-2) + future.cumsum(-2) if model.absolute else future
-
-
-def _refresh(follower: MPC, _: Any) -> None:  # a lambda cannot be pickled
-    follower.refresh()
