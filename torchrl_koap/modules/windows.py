@@ -156,6 +156,9 @@ class WindowReader(nn.Module):
         if self.scales is None:
             return
         read = self.gather(windows, self.valid_frames(windows.shape[-2])).flatten(0, -3)
-        spread = read.square().mean(0).sqrt() * self.scales
+        self.set_spread(read.square().mean(0).sqrt() * self.scales)
+
+    def set_spread(self, spread: Tensor) -> None:
+        """Divides steps by a spread ``[F, d]`` from now on, but for those without one."""
         spread[self.num_past] = 1.0  # the present frame stays in the normaliser's units
-        self.scales.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
+        self.scales.copy_(torch.where(spread > 1e-9, spread, 1.0))

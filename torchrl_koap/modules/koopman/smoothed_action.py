@@ -154,8 +154,7 @@ class LatentActionSmoothed(LatentActionModule):
         moving = spread > 1e-9
         # a lifting may leave coordinates at 0: those that are left count as if there were no others
         steps = steps * (moving.sum() / moving.numel()).clamp_min(1e-9).sqrt()
-        steps[self.reader.num_past] = 1.0
-        self.lifted.reader.scales.copy_(torch.where(steps > 1e-9, steps, torch.ones_like(steps)))
+        self.lifted.reader.set_spread(steps)
         self.raw.reader.fit(windows)
 
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor] | None:
