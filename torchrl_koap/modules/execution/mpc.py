@@ -201,7 +201,7 @@ class MPC(Follower):
         for name in ("follow_gain", "keep_gain"):
             self.register_buffer(name, None, persistent=False)
         self.refresh()
-        self.register_load_state_dict_post_hook(MPC.refresh)
+        self.register_load_state_dict_post_hook(type(self).refresh)
 
     def refresh(self, *_: Any) -> None:
         """Solves the quadratic problem once for all plans, anew for another response; loading weights does so too.
