@@ -43,8 +43,8 @@ def test_one_is_held_out_at_least_and_one_is_left(count, fraction, number):
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match=r"planner.held_out must be in \[0, 1\), got 1.5"):
-        choose_held_out(flat(3), 1.5)
+    with pytest.raises(ValueError, match="planner.held_out must be >= 0 and < 1, got 1.5"):
+        PlannerConfig(held_out=1.5)
     with pytest.raises(ValueError, match="all 3 trajectories that are used are held out"):
         split_held_out(flat(3), [0, 1, 2])
 

@@ -48,8 +48,6 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
     """
     if not fraction:
         return []
-    if not 0 < fraction < 1:
-        raise ValueError(f"planner.held_out must be in [0, 1), got {fraction}")
     episodes = data[EPISODE].unique_consecutive().cpu()
     total = len(episodes)
     number = min(max(math.floor(fraction * total + 0.5), 1 if total < 10 else 2), total - 1)
