@@ -122,9 +122,9 @@ def check_logger(name: str) -> None:
 def open_logger(name: str, out: Path) -> Iterator[Any | None]:
     """Yields a logger of TorchRL that writes into the run directory, and closes it at the end of the block.
 
-    For ``"csv"`` it is None. wandb stays offline unless ``WANDB_MODE`` says otherwise.
+    For ``"csv"`` it is None. wandb stays offline unless ``WANDB_MODE`` says otherwise. The name was checked before
+    any work was done (:func:`check_logger`).
     """
-    check_logger(name)
     if name == "csv":
         yield None
         return
