@@ -99,7 +99,8 @@ def test_every_picture_has_words_and_a_command():
         assert item.made_by.startswith("koap ") and "{run}" in item.made_by
 
 
-def test_drawing_needs_neither_training_nor_simulator():
+def test_drawing_needs_neither_training_nor_simulator(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)  # with it, MuJoCo is imported first
     heavy = ("torchrl", "mujoco", "numba", "matplotlib.pyplot", "torchrl_koap.training", "torchrl_koap.envs")
     code = (
         "import sys; from torchrl_koap.reports.pictures import all_pictures; all_pictures();"

@@ -81,7 +81,8 @@ def test_json_of_another_kind_is_refused():
         Task(**TOY, goal=len).to_json()
 
 
-def test_the_package_loads_no_task_and_a_task_no_simulator():
+def test_the_package_loads_no_task_and_a_task_no_simulator(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)  # with it, MuJoCo is imported first
     code = (
         "import sys, torchrl_koap; assert torchrl_koap.__version__;"
         "assert not {'torch', 'torchrl_koap.tasks'} & set(sys.modules);"
