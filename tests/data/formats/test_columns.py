@@ -206,6 +206,10 @@ def test_resampling_leaves_out_lost_frames_of_recordings_without_actions():
     assert found.sources == ("robot", "video[0]", "video[1]")  # two lost frames are filled, four split
     np.testing.assert_allclose(found.states[1][:, 0], 2 * np.arange(13) / 20)
     assert "6 frames with states that are NaN" in found.skipped
+    lost_untimed, whole_untimed = Piece("video", {"x": x}), Piece("robot", {"x": time}, {"v": time})  # a rate alone
+    for rate in ({"declared_hz": 30.0}, {"control_hz": 30.0}):
+        same = assemble([whole_untimed, lost_untimed], "data", **options, **rate)
+        assert same.sources == found.sources and "6 frames with states that are NaN" in same.skipped
     for pieces, more in (([lost] * 7, {}), ([Piece("robot", lost.states, {"v": time})], options)):
         with pytest.raises(DataError, match="states are not finite, first at frame 7 in column 'x': fill") as error:
             assemble(pieces, "data", action_dim=1, **more)
