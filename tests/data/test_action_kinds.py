@@ -61,6 +61,15 @@ def test_a_gripper_of_two_values():
         demonstrations(PATHS, opening, action_kind=["delta", "gripper"])
 
 
+def test_a_width_of_two_values_is_said_to_be_one_kind():
+    closes = np.where(np.arange(60) < 30, 0.08, 0.02)  # in every recording: a target that is near its column
+    paths = [np.column_stack([path[:, :1], np.roll(closes, 1), path[:, 2:]]) for path in PATHS]
+    steps = [np.column_stack([np.diff(path[:, 0]), path[1:, 1]]) for path in paths]
+    assert likely_kinds(*demonstrations(paths, steps))["b"].kind == "absolute"
+    (said,) = warnings(paths, steps)
+    assert said.startswith("b: an action of two values") and said.endswith("--action-kind delta raw")
+
+
 def test_targets_and_a_gripper_have_one_cure():
     steps = [np.column_stack([aims, aims[:, 0] > 0]) for aims in TARGETS]
     said = warnings(PATHS, steps, acting=("a", "b", "grip"))

@@ -77,10 +77,10 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     yield from _targets_far_away(labels, task, likely)
     kinds = {name: action.kind for name, action in task.actions.items()}
     aimed = {name for name, each in likely.items() if each.kind == "absolute"}
-    wrong = {name for name in aimed if kinds[name] == "delta"}
-    wrong |= aimed if len(aimed) == task.action_dim and set(kinds.values()) == {"raw"} else set()
     levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
     switches = [name for name, kind in kinds.items() if kind == "delta" and levels[name] == 2]
+    wrong = {name for name in aimed if kinds[name] == "delta" and name not in switches}
+    wrong |= aimed if len(aimed) == task.action_dim and set(kinds.values()) == {"raw"} else set()
     found = {name: likely[name] for name in wrong} | {name: replace(likely[name], kind="raw") for name in switches}
     if wrong:  # of the others "delta" was the default, which is worse where they are none
         found |= {name: each for name, each in likely.items() if kinds[name] == "delta" and each.kind == "raw"}
