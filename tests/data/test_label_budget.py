@@ -328,8 +328,8 @@ def test_a_smaller_share_is_part_of_every_larger_one():
     ("labelled", "fraction", "message"),
     [
         *((1, fraction, rf"must be in \(0, 1\], got {fraction}") for fraction in (0.0, 1.5, -0.1, math.nan)),
-        (3, 0.2, "0.2 keeps 2 of 10 trajectories, but 3 have labels"),
-        (None, 0.04, "0.04 keeps 0 of 10 trajectories"),
+        (3, 0.2, "share of 0.2 of the trajectories keeps 2 of 10, but 3 have labels"),
+        (None, 0.04, "share of 0.04 of the trajectories keeps 0 of 10"),
     ],
 )
 def test_a_share_that_cannot_be_kept_is_named(labelled, fraction, message):

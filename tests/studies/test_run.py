@@ -180,8 +180,8 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
         ({"labels": (0.1, 1.5)}, "labels must be shares in (0, 1], got 1.5"),
         ({"labels": ("nan",)}, "--labels must be a finite number, got nan"),
         ({"labels": (0.25, 0.01)}, "a label fraction of 0.01 selects none of the 8 trajectories"),
-        ({"demonstrations": (0.05,)}, "an observation fraction of 0.05 keeps 0 of 8 trajectories"),
-        ({"labels": (0.5,), "demonstrations": (0.25,)}, "keeps 2 of 8 trajectories, but 4 have labels"),
+        ({"demonstrations": (0.05,)}, "a share of 0.05 of the trajectories keeps 0 of 8, but"),
+        ({"labels": (0.5,), "demonstrations": (0.25,)}, "keeps 2 of 8, but 4 have labels"),
         ({"label_unit": "trajectories"}, "unknown unit of labels 'trajectories'; did you mean 'trajectory'?"),
         ({"tasks": ("avoidin",)}, "unknown task 'avoidin'; did you mean 'avoiding'?"),
         ({"datasets": ("nowhere",)}, "nowhere"),
@@ -212,7 +212,7 @@ def test_the_paper_has_two_tables(tmp_path, capsys):
 def test_windows_of_every_seed_must_lie_in_the_trajectories_used(tmp_path, demonstrations, capsys):
     """Of which a seed touches more than another: found before any work, and not by the cell."""
     options = {"label_unit": "window", "labels": (0.02,), "demonstrations": (0.25,), "seeds": 10}
-    assert "keeps 2 of 8 trajectories, but" in fails(capsys, *command_of(tmp_path / "curve", demonstrations, **options))
+    assert "keeps 2 of 8, but" in fails(capsys, *command_of(tmp_path / "curve", demonstrations, **options))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -258,13 +258,13 @@ def subsample_trajectories(data: TensorDictBase, fraction: float) -> TensorDictB
         ValueError: if the share is outside (0, 1], or smaller than that of the trajectories with labels.
     """
     if not 0 < fraction <= 1:
-        raise ValueError(f"observation fraction must be in (0, 1], got {fraction}")
+        raise ValueError(f"the share of the trajectories that are used must be in (0, 1], got {fraction}")
     episodes = data.get(keys.EPISODE).unique_consecutive()
     number = math.floor(fraction * len(episodes) + 0.5)
     labelled = torch.isin(episodes, labelled_episodes(data)).cpu()
     if number < max(int(labelled.sum()), 1):
         raise ValueError(
-            f"an observation fraction of {fraction} keeps {number} of {len(episodes)} trajectories,"
+            f"a share of {fraction} of the trajectories keeps {number} of {len(episodes)},"
             f" but {int(labelled.sum())} have labels"
         )
     if number == len(episodes):
