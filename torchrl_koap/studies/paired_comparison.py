@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import permutation_test
 
 from torchrl_koap.evaluation.offline import KIND
-from torchrl_koap.studies.table import cells_by_place
+from torchrl_koap.studies.table import group_cells
 
 Outcome = Mapping[tuple[int, int], float]
 """Successes of a cell by (context, evaluation seed); errors of one without an environment by (trajectory, 0)."""
@@ -148,7 +148,7 @@ def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outc
     cannot be compared is None. Cells that are not done take no part.
     """
     compared: list[dict[str, Any]] = []
-    for place, methods in cells_by_place(rows).items():
+    for place, methods in group_cells(rows).items():
         found: dict[str, dict[int, Outcome]] = {method: {} for method in methods}
         offline = False
         for row in (row for cells in methods.values() for row in cells.values()):

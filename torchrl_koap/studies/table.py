@@ -104,24 +104,24 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
 
     Cells have at least task, method, labels, seed and status; one that occurs twice is an error.
     """
-    places = cells_by_place(rows).items()
+    places = group_cells(rows).items()
     return [_summary(*place, method, cells) for place, methods in places for method, cells in methods.items()]
 
 
-def cells_by_place(rows: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, dict[int, Mapping[str, Any]]]]:
+def group_cells(rows: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, dict[int, Mapping[str, Any]]]]:
     """Sorts cells by place, method and seed, in the order of :func:`summarise`; one that occurs twice is an error."""
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
 
-    def place_of(row: Mapping[str, Any]) -> Place:
+    def setting_of(row: Mapping[str, Any]) -> Place:
         share = row.get("demonstrations")
         return row["task"], row.get("label_unit") or "", 1.0 if share is None else share, row["labels"]
 
     def order(row: Mapping[str, Any]) -> tuple:
-        return tasks.index(row["task"]), *place_of(row)[1:], methods.index(row["method"])
+        return tasks.index(row["task"]), *setting_of(row)[1:], methods.index(row["method"])
 
     places: dict[Place, dict[str, dict[int, Mapping[str, Any]]]] = {}
     for row in sorted(rows, key=order):
-        cells = places.setdefault(place_of(row), {}).setdefault(row["method"], {})
+        cells = places.setdefault(setting_of(row), {}).setdefault(row["method"], {})
         if row["seed"] in cells:
             raise ValueError(f"the cell {cell_name(row)} occurs twice")
         cells[row["seed"]] = row
