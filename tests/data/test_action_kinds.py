@@ -21,7 +21,7 @@ def demonstrations(states, actions, names=JOINTS, acting=("a", "b"), **described
 
 
 def warnings(*arguments, **described):
-    return list(kind_warnings(*demonstrations(*arguments, **described)))
+    return list(kind_warnings(*demonstrations(*arguments, **described), called="abcd"))
 
 
 def test_targets_that_are_declared_as_changes():
@@ -155,6 +155,14 @@ def test_targets_in_other_units_than_their_columns_are_raw():
     assert "from 'shoulder.pos', 'b' by" in said and said.endswith("convert again with --action-kind raw")
     offset = [steps + 90 for steps in TARGETS]
     assert not warnings(PATHS, offset, action_kind="absolute", targets=JOINTS[:2])
+
+
+@pytest.mark.parametrize("change", [np.degrees, np.fliplr])
+def test_targets_of_one_recording_in_another_unit_or_order(change):
+    """They say nothing of the kind of all."""
+    steps = [*TARGETS[:3], change(TARGETS[3])]
+    (said,) = warnings(PATHS, steps, action_kind="absolute", targets=JOINTS[:2])
+    assert said.startswith("absolute actions lie far from targets in d, 'a' by ") and "'b' by" in said
 
 
 def test_a_switch_beside_targets_is_raw_and_the_others_keep_theirs():

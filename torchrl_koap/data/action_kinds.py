@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from torchrl_koap.tasks.action_rules import ActionKind
 NEAR, NAMED = 0.3, 1.0  # share of a column's spread within which its targets lie; likewise if they bear its name
 NEARER = 3.0  # times as far from one reading of an action as from the other
 CLEARER = 2.0  # times as much that one reading leaves unexplained as the other
+ASTRAY = 5.0  # times as far from its target as in half of the recordings: another order or unit of columns
 FOLLOWS = 0.8  # correlation with a change that no level explains away
 UNLIKE = 0.5  # correlation with every action below which a column repeats no command
 FEW, MANY = 20, 20_000  # labels below which nothing is said, and that are looked at
@@ -44,6 +45,7 @@ class _Labels:
     change: np.ndarray
     names: list[str]  # of the columns
     turns: list[tuple[int, int, int]]  # quaternions: first action, first column of its target, labels of other sign
+    episodes: np.ndarray  # [n]: number of the recording
 
 
 def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
@@ -55,13 +57,13 @@ def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
     return {} if labels is None else _likely(labels, task)
 
 
-def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
-    """Finds actions of flat data ``[N]`` that contradict their kind.
+def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> Iterator[str]:
+    """Finds actions of flat data ``[N]`` that contradict their kind; ``called`` are the names of recordings.
 
     Quaternions of targets look wrong where their sign is not that of the state. Changes look wrong where they lie at
     the next value of a state column, or follow columns more than their changes; or have two values alone; absolute
-    targets where they lie at the change of their column, per frame or per second, or far from the column; raw actions
-    where all of them are near columns, or all follow changes.
+    targets where they lie at the change of their column, per frame or per second, or far from the column in half of the
+    recordings or in some; raw actions where all of them are near columns, or all follow changes.
     """
     labels = _labels(data, task)
     if labels is None:
@@ -74,7 +76,7 @@ def kind_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
                 f" {', '.join(labels.names[column : column + 4])} in {against} of {len(labels.actions)} labels: mend"
                 " the signs of the state first, then flip the action where the product of both is negative"
             )
-    yield from _targets_far_away(labels, task, likely)
+    yield from _targets_far_away(labels, task, likely, called)
     kinds = {name: action.kind for name, action in task.actions.items()}
     aimed = {name for name, each in likely.items() if each.kind == "absolute"}
     levels = {name: len(np.unique(steps)) for name, steps in zip(kinds, labels.actions.T, strict=True)}
@@ -112,7 +114,7 @@ def command_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     steps = _labelled_steps(data)
     if task.command_columns is None or steps is None:
         return
-    before, after, actions = steps
+    before, after, actions, _ = steps
     for column in range(*task.command_columns.indices(task.observation_dim)):
         read = [values for values in (after[:, column], (after - before)[:, column]) if np.ptp(values)]
         most = max([_correlation(values, actions).max() for values in read], default=1.0)
@@ -136,22 +138,22 @@ def describe_likely(likely: dict[str, LikelyKind]) -> str:
     )
 
 
-def _labelled_steps(data: TensorDictBase) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Observations before and after labelled steps ``[n, obs]``, and their actions ``[n, a]``; None where few are."""
+def _labelled_steps(data: TensorDictBase) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Observations around labelled steps ``[n, obs]``, actions ``[n, a]`` and recordings ``[n]``; None where few."""
     labelled = data.get(keys.HAS_ACTION).squeeze(-1).nonzero().squeeze(-1)
     if len(labelled) < FEW:
         return None
     rows = data[labelled[:: 1 + len(labelled) // MANY]]
     read = (keys.OBSERVATION, keys.NEXT_OBSERVATION, keys.ACTION)
     before, after, actions = (rows.get(key).double().cpu().numpy() for key in read)
-    return before, after, actions
+    return before, after, actions, rows.get(keys.EPISODE).flatten().cpu().numpy()
 
 
 def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
     steps = _labelled_steps(data)
     if steps is None:
         return None
-    before, after, actions = steps
+    before, after, actions, episodes = steps
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))
     seen = list(task.state_columns)
     names = [task.observation_names[column] for column in seen]
@@ -164,7 +166,7 @@ def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
             if (1 - np.abs(products)).mean() < NEAR * (1 - other).mean():
                 turns.append((start, column, int((products < 0).sum())))
                 turn *= np.where(products < 0, -1, 1)[:, None]
-    return _Labels(actions, level, (after - before)[:, seen], names, turns)
+    return _Labels(actions, level, (after - before)[:, seen], names, turns, episodes)
 
 
 def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
@@ -200,19 +202,34 @@ def _cure(task: Task, labels: _Labels, found: Mapping[str, LikelyKind]) -> str:
     return f"{asked} --targets {shlex.join([labels.names[column] for column in targets if column is not None])}"
 
 
-def _targets_far_away(labels: _Labels, task: Task, likely: Mapping[str, LikelyKind]) -> Iterator[str]:
-    """Absolute actions that are nearer to the change of their column, or farther from it than the column moves."""
+def _targets_far_away(
+    labels: _Labels, task: Task, likely: Mapping[str, LikelyKind], called: Sequence[str]
+) -> Iterator[str]:
+    """Absolute actions that are nearer to the change of their column, or farther from it than the column moves.
+
+    In half of the recordings, it is of another kind. In fewer, these have another order or unit of columns.
+    """
     far: dict[str, str] = {}
+    astray: dict[str, set[int]] = {}
+    recordings = np.unique(labels.episodes)
+    parts = [labels.episodes == number for number in recordings]
     for (name, action), steps in zip(task.actions.items(), labels.actions.T, strict=True):
         if action.kind != "absolute" or action.column is None or name not in likely:
             continue
         level, target = labels.level[:, action.column], labels.names[action.column]
-        away, *others = (np.abs(steps - there[:, action.column]).mean() for there in _readings(labels, task))
-        if NEARER * min(others) < away or min(away, (steps - level).std()) > NAMED * level.std():
-            far[name] = f"{name!r} by {away:.2g} from {target!r}"
+        distances = [np.abs(steps - there[:, action.column]) for there in _readings(labels, task)]
+        each = np.array([distances[0][part].mean() for part in parts])
+        usual, *others = (np.median([distance[part].mean() for part in parts]) for distance in distances)
+        if NEARER * min(others) < usual or min(usual, (steps - level).std()) > NAMED * level.std():
+            far[name] = f"{name!r} by {usual:.2g} from {target!r}"
+        elif (odd := (each > ASTRAY * usual) & (each > NEAR * level.std())).any():
+            astray[f"{name!r} by {each[odd].min():.2g} from {target!r}, elsewhere by {usual:.2g}"] = {*recordings[odd]}
     if far:
         cure = _cure(task, labels, {name: likely[name] for name in far})
         yield f"absolute actions lie away from their targets on average, {some([*far.values()])}: {cure}"
+    if astray:
+        where = some([called[number] for number in sorted(set().union(*astray.values()))])
+        yield f"absolute actions lie far from targets in {where}, {some([*astray])}: columns in another order or unit?"
 
 
 def _readings(labels: _Labels, task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

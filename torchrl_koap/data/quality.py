@@ -64,7 +64,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     actions = zip(data.get(keys.ACTION).split(lengths), known, strict=True)
     labels = [steps[labelled].double().cpu().numpy() for steps, labelled in actions]
     return [
-        *kind_warnings(data, task),
+        *kind_warnings(data, task, called),
         *command_warnings(data, task),
         *_trajectory_warnings(data, task, lengths, called),
         *_short(lengths, called),
