@@ -172,6 +172,20 @@ def test_a_controller_worse_than_the_mean_is_a_fault():
     assert fault.startswith("action b is hardly better than always giving its mean") and "950 against 1000" in fault
 
 
+def test_a_switch_that_rounding_seldom_gives_is_a_fault_and_has_no_share_in_errors_of_others():
+    task = Task(
+        name="arm", observation_parts={"q": 1}, actions={"a": Action(), "brake": Action(kind="raw")}, position="q"
+    )
+    true = torch.tensor([[0.1, 0.0], [-0.1, 0.0], [0.1, 1.0], [-0.1, 1.0], [0.0, 1.0]])
+    answers = {"controller": torch.tensor([0.5, 0.6]), "ridge": 1.0, "mean_action": torch.tensor([0.0, 0.6])}
+    models = {name: true * share for name, share in answers.items()}
+    models["controller"][2:4, 1] = 0.4
+    found = summarise_errors(models, true, torch.tensor([4, 4, 4, 5, 5]), task)
+    assert [row["columns"] for row in found["unit"]] == [["a"], ["brake"]]
+    fault = offline_faults({}, {"left_out": found})[-1]
+    assert fault.startswith("action brake is nearest to 1 in only 1 of 3 labels of that value (each labelled")
+
+
 def test_a_recording_whose_labels_disagree_is_named(tmp_path):
     for name, sign in (("good", 1), ("bad", -1)):  # in one file
         (tmp_path / name).mkdir()

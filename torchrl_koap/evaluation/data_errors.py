@@ -36,6 +36,7 @@ SITUATIONS = 500  # that are looked at, at most
 # frames around a decoded action: enough history and look-ahead for every controller compared
 BEFORE, AFTER = 8, 11
 _MOST_FOLDS = 20  # labelled trajectories that are left out in turn, at most
+_FEW_VALUES = 5  # an action of more numbers is no switch and no mode
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
@@ -242,11 +243,22 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
     Returns:
         dict: ``labels``, ``trajectories``; ``relative``: the controller's error as a share of that of the mean action,
         root mean square over columns (1: no better than always giving the mean action); ``ridge_relative``: the
-        ridge's likewise; ``unit`` and ``column``: rows with the errors of every model in the unit of the data;
-        ``trajectory``: the relative error of each.
+        ridge's likewise; ``unit`` and ``column``: rows with the errors of every model in the unit of the data, raw
+        actions without a unit apart; ``trajectory``: the relative error of each. Rows of raw columns of few numbers
+        have ``values``: how many ``labels`` each has, and in how many the controller came ``nearest`` to it.
     """
     square = {name: (predicted - true).square() for name, predicted in models.items()}
     units, names = list(task.action_units), task.action_names
+    raw = [action.kind == "raw" for action in task.actions.values()]
+    own_unit = [unit or ("raw" if of_none else "") for unit, of_none in zip(units, raw, strict=True)]
+
+    def values(column: int) -> dict[str, Any]:
+        levels, which = true[:, column].unique(return_inverse=True)
+        if not raw[column] or not 1 < len(levels) <= _FEW_VALUES:
+            return {}
+        near = (models["controller"][:, column, None] - levels).abs().argmin(-1) == which
+        counted = [(value.item(), which == place) for place, value in enumerate(levels)]
+        return {"values": [{"value": v, "labels": int(at.sum()), "nearest": int(near[at].sum())} for v, at in counted]}
 
     def root(columns: Sequence[int]) -> dict[str, float]:
         return {name: part[:, columns].mean().sqrt().item() for name, part in square.items()}
@@ -257,10 +269,13 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
         "relative": _relative(square),
         "ridge_relative": _relative(square, "ridge"),
         "unit": [
-            {"unit": unit, "columns": [names[column] for column in columns], **root(columns)}
-            for unit, columns in unit_groups(units).items()
+            {"unit": units[columns[0]], "columns": [names[column] for column in columns], **root(columns)}
+            for columns in unit_groups(own_unit).values()
         ],
-        "column": [{"name": names[column], "unit": units[column], **root([column])} for column in range(len(names))],
+        "column": [
+            {"name": name, "unit": units[column], **root([column]), **values(column)}
+            for column, name in enumerate(names)
+        ],
         "trajectory": [
             {"episode": int(number), "relative_action_error": _relative(square, where=episode == number)}
             for number in episode.unique()

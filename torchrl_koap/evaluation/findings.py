@@ -19,6 +19,7 @@ GOOD = 0.9  # a success rate of a part that is not at fault
 DATA = "mend what `koap validate` warns of"
 MORE = f"{DATA}, then record more, or train longer (--steps) if plans were still improving"  # what to do about plans
 KIND = f"{DATA}, check --action-kind and --robot, or label a recording that moves it"  # about an action
+ROUND = "round at another threshold, or decide it in your driver; give each of several modes a column of 0 and 1"
 _NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, leave it"
 UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of a loop on labels
 HARDLY = 0.9  # of the error of the mean action: a column that is not learned, which others may hide
@@ -121,6 +122,12 @@ def offline_faults(
                 against = _against(row["controller"], row["mean_action"], row["unit"])
                 how = "worse" if row["controller"] > row["mean_action"] else "hardly better"
                 faults.append(f"action {row['name']} is {how} than always giving its mean ({words}): {against}; {KIND}")
+            for each in row.get("values", ()):
+                if 2 * each["nearest"] < each["labels"]:
+                    faults.append(
+                        f"action {row['name']} is nearest to {each['value']:g} in only {each['nearest']} of"
+                        f" {each['labels']} labels of that value ({words}): rounding seldom gives it; {ROUND}"
+                    )
     return faults
 
 
