@@ -30,13 +30,13 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.closed_form import action_facts, fit_closed_form
+from torchrl_koap.training.controller import FEW_VALUES
 
 SAMPLES = 16  # plans in each situation
 SITUATIONS = 500  # that are looked at, at most
 # frames around a decoded action: enough history and look-ahead for every controller compared
 BEFORE, AFTER = 8, 11
 _MOST_FOLDS = 20  # labelled trajectories that are left out in turn, at most
-_FEW_VALUES = 5  # an action of more numbers is no switch and no mode
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
@@ -254,7 +254,7 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
 
     def values(column: int) -> dict[str, Any]:
         levels, which = true[:, column].unique(return_inverse=True)
-        if not raw[column] or not 1 < len(levels) <= _FEW_VALUES:
+        if not raw[column] or not 1 < len(levels) <= FEW_VALUES:
             return {}
         near = (models["controller"][:, column, None] - levels).abs().argmin(-1) == which
         counted = [(value.item(), which == place) for place, value in enumerate(levels)]

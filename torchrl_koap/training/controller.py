@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import cut_windows, make_window_buffer
-from torchrl_koap.data.trajectories import labelled_episodes
+from torchrl_koap.data.trajectories import labelled_episodes, trajectory_lengths
 from torchrl_koap.data.windows import WindowTable, spread_evenly
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.runs.config import TrainConfig
@@ -29,6 +30,7 @@ from torchrl_koap.training.policy_facts import command_ranges, controller_data, 
 from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
+FEW_VALUES = 5  # an action of more numbers is no switch and no mode
 FITTED = 50_000  # windows that statistics without labels are fitted to
 _KEYS = [STATE, ACTION, HAS_ACTION]
 
@@ -65,15 +67,18 @@ def learn_controller(
 def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None:
     """Refuses flat data ``[N]`` of which a trajectory is shorter than a window, before anything is trained.
 
-    A controller that does not give actions of the task's width is refused, too.
+    A controller that does not give actions of the task's width is refused, too. Of labels that no fit sees it warns.
     """
-    method, window, past = get_method(config.method), WINDOW, 1
+    method, window, past, ahead = get_method(config.method), WINDOW, 1, 0
     if method.plans and method.fit is None:
         with torch.random.fork_rng(devices=[]):
             controller = build_controller(task, method, config.controller).eval()
             window, past = max(WINDOW, controller.num_window_frames), controller.num_past
             _check_actions(task, config, controller, window)
+            ahead = window - controller.valid_frames(window).stop
     WindowTable.build(data, window, pad_before=past)
+    if ahead:
+        _warn_of_late_switches(task, data, ahead)
 
 
 def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, window: int) -> None:
@@ -89,6 +94,23 @@ def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, windo
         raise ValueError(f"method {config.method!r}: {said}") from error
     if list(given.shape) != wanted:
         raise ValueError(f"method {config.method!r}: its network gave {list(given.shape)}, wanted {wanted}")
+
+
+def _warn_of_late_switches(task: Task, data: TensorDictBase, ahead: int) -> None:
+    """Names raw actions of few values that change in the last steps, to which a controller is not fitted."""
+    parts = [part for part in data.split(trajectory_lengths(data).tolist()) if part[HAS_ACTION].all()]
+    if not parts:
+        return
+    tails = torch.stack([part[ACTION][-ahead - 1 :] for part in parts])
+    changes = (tails != tails[:, :1]).any(1).sum(0).tolist()
+    labels = torch.cat([part[ACTION] for part in parts])
+    for (name, action), column, count in zip(task.actions.items(), labels.T, changes, strict=True):
+        if action.kind == "raw" and 2 * count > len(parts) and len(column.unique()) <= FEW_VALUES:
+            warnings.warn(
+                f"action {name!r} changes in the last {ahead} steps of {count} of {len(parts)} labelled recordings."
+                f" No controller is fitted to these steps, as it looks ahead: record {ahead} frames more",
+                stacklevel=4,
+            )
 
 
 def _train_network(
