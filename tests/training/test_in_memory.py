@@ -1,7 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Fitting in memory does what `koap train` does, on data that lack labels."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.data import LabelBudget, cut_windows, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.data.ted import load_ted
 from torchrl_koap.files import DataError
-from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.modules import LinearInverseDynamics, StatePlanner, TemporalUnet
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.objectives import DiffusionPolicyLoss, KOAPLoss
@@ -215,26 +213,6 @@ def test_what_is_asked_of_a_method_before_its_training_leaves_random_numbers_as_
     before = torch.get_rng_state()
     check_lengths(task, resolve(TrainConfig(out=Path(), method=method), task), data)
     assert torch.equal(torch.get_rng_state(), before)
-
-
-@pytest.mark.parametrize(("brake_at", "told"), [(25, True), (15, False)])
-def test_a_switch_so_late_that_no_controller_is_fitted_to_it_is_told(brake_at, told):
-    states = [np.random.default_rng(i).normal(size=(31, 2)).cumsum(0) for i in range(4)]
-    brake = (np.arange(30) >= brake_at)[:, None]
-    actions = [np.concatenate([np.diff(path, axis=0), brake], 1) if i < 3 else None for i, path in enumerate(states)]
-    names = ["x", "y", "brake"]
-    data, task = make_demonstrations(
-        states, actions, control_hz=30, action_names=names, action_kind=["delta", "delta", "raw"]
-    )
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check_lengths(task, resolve(TrainConfig(out=Path()), task), data)
-    said = [str(each.message) for each in caught if "No controller is fitted" in str(each.message)]
-    assert len(said) == told
-    if told:
-        assert "'brake' changes in the last 5 steps of 3 of 3 labelled recordings" in said[0]
-        data[HAS_ACTION][:] = False  # hidden labels are not looked at
-        check_lengths(task, resolve(TrainConfig(out=Path()), task), data)
 
 
 def test_refusals():

@@ -1,12 +1,26 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The table of methods: every entry can be built, its losses train it, and unknown names are answered."""
 
+import warnings
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 from small_networks import controller_of, plain_task
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap import TrainConfig
+from torchrl_koap.data import (
+    LabelBudget,
+    flatten_trajectories,
+    make_demonstrations,
+    make_window_buffer,
+    select_state,
+)
+from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.tasks import WINDOW
+from torchrl_koap.training.controller import check_lengths
+from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import METHODS
 
 CONTROLLERS = [name for name, method in METHODS.items() if method.plans and method.fit is None]
@@ -79,3 +93,23 @@ def test_statistics_are_those_of_what_a_method_may_see(name, data):
         assert not changed
     elif "state_normalizer.offset" in clean:
         assert "state_normalizer.offset" in changed
+
+
+@pytest.mark.parametrize(("brake_at", "told"), [(25, True), (15, False)])
+def test_a_switch_so_late_that_no_controller_is_fitted_to_it_is_told(brake_at, told):
+    states = [np.random.default_rng(i).normal(size=(31, 2)).cumsum(0) for i in range(4)]
+    brake = (np.arange(30) >= brake_at)[:, None]
+    actions = [np.concatenate([np.diff(path, axis=0), brake], 1) if i < 3 else None for i, path in enumerate(states)]
+    names = ["x", "y", "brake"]
+    data, task = make_demonstrations(
+        states, actions, control_hz=30, action_names=names, action_kind=["delta", "delta", "raw"]
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_lengths(task, resolve(TrainConfig(out=Path()), task), data)
+    said = [str(each.message) for each in caught if "No controller is fitted" in str(each.message)]
+    assert len(said) == told
+    if told:
+        assert "'brake' changes in the last 5 steps of 3 of 3 labelled recordings" in said[0]
+        data[HAS_ACTION][:] = False  # hidden labels are not looked at
+        check_lengths(task, resolve(TrainConfig(out=Path()), task), data)
