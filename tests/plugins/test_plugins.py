@@ -36,7 +36,8 @@ def plugin():
     own = types.ModuleType("own_task")
     with patch.dict(TASKS), pytest.MonkeyPatch.context() as context:
         context.setitem(sys.modules, "own_task", own)
-        definitions = TUTORIAL.read_text().partition("# Everything else is there")[0]
+        definitions, training, _ = TUTORIAL.read_text().partition("# Record, train, roll out")
+        assert training, f"{TUTORIAL.name}: the heading behind the definitions has another name"
         exec(compile(definitions, TUTORIAL, "exec"), vars(own))
         yield
 
