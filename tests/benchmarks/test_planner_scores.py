@@ -1,11 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The study of scores: what a row of it holds, and how scores are ranked."""
 
+from functools import partial
 from pathlib import Path
 
 import planner_scores
 import torch
 
+from torchrl_koap import fit
 from torchrl_koap.data import save_demonstrations
 
 
@@ -20,6 +22,7 @@ def test_a_row_says_how_a_planner_scored_and_how_often_it_succeeded(tmp_path, mo
     ground = planner_scores.Ground(write, "success", (2,), 5, "Toy-v0", 10)
     monkeypatch.setattr(planner_scores, "RESULTS", tmp_path / "planner_scores.csv")
     monkeypatch.setattr(planner_scores, "TRAININGS", (("mlp", 0, 1), ("mlp", 1, 2)))
+    monkeypatch.setattr(planner_scores, "fit", partial(fit, controller={"steps": 2}))
     monkeypatch.setattr(planner_scores, "roll", lambda ground, trained, execution, n: {"successes": 3})
     for _ in range(2):  # what is there is not trained again
         planner_scores.study("toy", ground, tmp_path, 0, 5)

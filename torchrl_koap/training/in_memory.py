@@ -93,7 +93,7 @@ def fit(
         >>> states = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(3)]
         >>> actions = [np.diff(states[0], axis=0), None, None]
         >>> data, task = make_demonstrations(states, actions, control_hz=30)
-        >>> trained = fit(data, task, planner={"steps": 2, "width": 8}, progress=False)
+        >>> trained = fit(data, task, planner={"steps": 2, "width": 8}, controller={"steps": 2}, progress=False)
         >>> trained.planner.sample(data["observation"][None, :2]).shape
         torch.Size([1, 14, 2])
         >>> other = fit(data, task, method="linear", planner=trained.planner, progress=False)
