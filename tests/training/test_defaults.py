@@ -163,3 +163,11 @@ def test_a_method_declares_columns_and_labels_stay_as_asked():
     assert resolved("sorting", "koap_paper").controller.columns == "all"
     assert resolved("sorting").controller.columns == "robot" and resolved("sorting").controller.steps == 500
     assert resolved(labels=LabelConfig(count=3)).labels == LabelConfig(count=3)
+
+
+def test_no_updates_are_refused_where_no_closed_form_would_fit_the_network():
+    for method in ("dd", "koap_paper", "pretrain", "vpt"):
+        with pytest.raises(ValueError, match=f"controller.steps 0: method '{method}' has no closed form"):
+            resolved(method=method, controller=ControllerConfig(steps=0))
+    for method in ("koap", "linear", "mpc", "dp"):
+        assert resolved(method=method, controller=ControllerConfig(steps=0)).controller.steps == 0

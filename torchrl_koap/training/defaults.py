@@ -114,6 +114,8 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
     lookup(PRESETS, section.preset, "preset")
     if section.preset not in presets:
         raise ValueError(f"method {method.name!r} has no preset {section.preset!r}, it has {list(method.presets)}")
+    if section.steps == 0 and method.phases and not method.closed_form and (method.plans or method.teacher):
+        raise ValueError(f"controller.steps 0: method {method.name!r} has no closed form, nothing would train it")
     return section
 
 
