@@ -163,6 +163,25 @@ def test_single_losses_are_the_terms_of_the_sum_and_read_no_more(loss_class, red
         single(batch.exclude("state"))
 
 
+def test_a_subclass_adds_errors_that_count_where_those_of_the_dynamics_do():
+    class Bounded(KOAPLoss):
+        out_keys = [*TestKOAP.out_keys, "loss_norm", "loss_again"]
+
+        def further_errors(self, lifted, latent):
+            frames = self.network.valid_frames(lifted.shape[-2])
+            now, after = lifted[..., frames.start : frames.stop, :], lifted[..., frames.start + 1 : frames.stop + 1, :]
+            again = (self.network.predict_next(now, latent) - after).square().mean(-1)
+            return {"loss_norm": torch.linalg.matrix_norm(self.network.operator.weight, 2), "loss_again": again}
+
+    network, batch = make_network(), partly_labelled(4)  # some frames are padded
+    found, norm = Bounded(network)(batch), torch.linalg.matrix_norm(network.operator.weight, 2)
+    assert set(found.keys()) == {*TestKOAP.out_keys, "loss_norm", "loss_again"}
+    torch.testing.assert_close(found["loss_again"], found["loss_koopman"])
+    torch.testing.assert_close(found["loss_norm"], norm)
+    found["loss_norm"].backward()
+    assert network.operator.weight.grad.abs().sum() > 0
+
+
 # labels
 
 

@@ -46,11 +46,21 @@ class _KoopmanLoss(WindowLoss):
             if KOOPMAN in wanted:
                 predicted = network.predict_next(lifted[..., span.start : span.stop, :], latent)
                 error = (predicted - lifted[..., span.start + 1 : span.stop + 1, :]).square().mean(-1)
-                found[KOOPMAN] = self._reduce(error, recorded[..., span.start : span.stop])
+                errors = {KOOPMAN: error} | self.further_errors(lifted, latent)
+                counts = recorded[..., span.start : span.stop]
+                found |= {name: self._reduce(error, counts) for name, error in errors.items()}
             if ACTION in wanted:
                 target, counts = self._targets(tensordict, state, recorded, span)
                 found[ACTION] = self._reduce(self._action_error(network.decode(latent), target), counts)
         return found
+
+    def further_errors(self, lifted: Tensor, latent: Tensor) -> dict[str, Tensor]:
+        """Computes errors of a subclass, by the ``loss_*`` names that its ``out_keys`` list after the three others.
+
+        They are ``[*B, frames]``, or a number, and reduced as those of the dynamics. Lifted states are ``[*B, T, m]``,
+        latent actions ``[*B, frames, p]``, those of the network's ``valid_frames(T)``. Here there are none.
+        """
+        return {}
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -115,7 +125,7 @@ class KOAPLoss(_KoopmanLoss):
     """Computes the three terms from one pass through the networks; their sum is the total, coefficients applied.
 
     The reconstruction averages over all frames, the dynamics over those of :meth:`InverseDynamics.valid_frames`, the
-    actions over the labelled ones of these.
+    actions over the labelled ones of these. A subclass adds terms by :meth:`further_errors`.
 
     Args:
         network (KoopmanInverseDynamics or NonlinearInverseDynamics): the model.
