@@ -16,6 +16,7 @@ from torchrl_koap import keys
 from torchrl_koap.data.action_kinds import command_warnings, kind_warnings
 from torchrl_koap.data.formats.clocks import FASTEST, SLOWEST, rises_evenly
 from torchrl_koap.data.formats.recordings import Recordings
+from torchrl_koap.data.late_labels import late_warnings
 from torchrl_koap.data.odd_values import (
     leap_warnings,
     mark_warnings,
@@ -49,8 +50,8 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     unit, reach a place beyond 100 m or rad, or lie far from all labelled ones or move much less; state columns that
     never change, equal another one, leap, hold marks of what is missing, are clocks, quaternions that change their sign
     or angles a turn apart, or have no unit and move much farther than others; frames at both ends in which nothing
-    moves; actions of another kind than declared, that never change, leap for one frame or hold marks; a command that no
-    action follows; labels that stand alone; an unlikely rate; plans that are short against the motion.
+    moves; actions of another kind than declared, that come late, never change, leap for one frame or hold marks; a
+    command that no action follows; labels that stand alone; an unlikely rate; plans that are short against the motion.
 
     ``names`` are what to call each trajectory, such as its file. Default: their numbers.
     """
@@ -66,6 +67,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     return [
         *kind_warnings(data, task, called),
         *command_warnings(data, task),
+        *late_warnings(data, task),
         *_trajectory_warnings(data, task, lengths, called),
         *_short(lengths, called),
         *_column_warnings(state, task.state_names),

@@ -1,0 +1,84 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Labels that are logged after the motion that they cause, and robots that respond late."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.data import make_demonstrations
+from torchrl_koap.data.late_labels import frames_late
+
+JOINTS, FRAMES = 3, 80
+
+
+def recordings(late=0, *, lag=0.4, delay=0, noise=0.0, kind="delta", labelled=5):
+    """An arm that follows steps ``[T, 3]``, or targets, of an operator with unsteady hands."""
+    generator, states, actions = np.random.default_rng(0), [], []
+    for number in range(6):
+        place, speed, command, given = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS), []
+        frames = []
+        for _ in range(FRAMES):
+            frames.append(place + noise * generator.normal(size=JOINTS))
+            command = 0.9 * command + generator.normal(0, 0.01, JOINTS)
+            given.append(command if kind != "absolute" else place + 3 * command)
+            caused = given[-1 - delay] if len(given) > delay else 0 * command
+            wanted = caused if kind != "absolute" else 0.3 * (caused - place)
+            speed = lag * speed + (1 - lag) * wanted
+            place = place + speed
+        logged = np.full((FRAMES, JOINTS), np.nan)
+        logged[max(late, 0) : FRAMES + min(late, 0)] = np.array(given)[max(-late, 0) : FRAMES - max(late, 0)]
+        states.append(np.array(frames))
+        actions.append(logged if number < labelled else None)
+    return make_demonstrations(states, actions, control_hz=30, action_kind=kind)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.8])
+@pytest.mark.parametrize("late", [1, 3])
+@pytest.mark.parametrize(("kind", "noise"), [("delta", 0.0), ("delta", 0.001), ("absolute", 0.0), ("absolute", 0.001)])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_labels_that_are_late_are_counted(late, lag, kind, noise):
+    assert frames_late(*recordings(late, lag=lag, kind=kind, noise=noise)) == late
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"lag": 0.0}, {"lag": 0.8}, {"delay": 2}, {"noise": 0.001}, {"noise": 0.1}, {"kind": "absolute"}]
+    + [{"labelled": 1}, {"late": -2}, {"late": 1, "delay": 1}, {"late": 1, "kind": "raw"}],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_labels_on_time_or_early_within_a_robot_s_delay_or_without_a_column_are_no_fault(how):
+    assert frames_late(*recordings(**how)) == 0
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_delay_of_the_robot_hides_as_many_frames():
+    assert frames_late(*recordings(3, delay=1)) == 2
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_script_that_reacts_to_noisy_states_is_on_time():
+    generator, states, actions = np.random.default_rng(0), [], []
+    for _ in range(6):
+        place, goal = generator.uniform(-1, 1, (2, 2))
+        seen, given = [], []
+        for _ in range(FRAMES):
+            seen.append(np.r_[place + 0.0003 * generator.normal(size=2), goal])
+            given.append(0.1 * (goal - seen[-1][:2]))
+            place = place + given[-1]
+        states.append(np.array(seen)), actions.append(np.array(given))
+    assert frames_late(*make_demonstrations(states, actions, control_hz=30, robot=[0, 1])) == 0
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_few_or_constant_labels_say_nothing():
+    data, task = recordings(2)
+    data["has_action"][16:] = False
+    assert frames_late(data, task) == 0
+    data, task = recordings(2)
+    data["action"] = torch.ones_like(data["action"])
+    assert frames_late(data, task) == 0
+
+
+def test_the_warning_says_by_how_many_frames():
+    with pytest.warns(UserWarning, match="actions look 2 frames late.* up by 2 frames and leave the last ones empty"):
+        recordings(2)

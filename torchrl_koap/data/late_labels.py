@@ -1,0 +1,82 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Labels that are logged after the motion that they cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from tensordict import TensorDictBase
+
+from torchrl_koap import keys
+from torchrl_koap.data.windows import spread_evenly
+from torchrl_koap.tasks import Task
+
+REACH = 3  # frames before and after a label; a longer lag is not found
+CLEAR, NEAR = 0.15, 0.05  # shares of the error: what later labels must explain, and what counts as nothing
+FOLDS, MOST, PENALTY = 5, 4000, 1e-6  # of the cross-validation; most rows; relative ridge
+LARGEST_GAIN = 1.03  # frames per target: a robot goes no farther than its target
+
+
+def late_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
+    """Yields a warning if labels of flat data ``[N]`` are late: later labels cause the motion, present ones do not."""
+    late = frames_late(data, task)
+    if late:
+        frames = "one frame" if late == 1 else f"{late} frames"
+        yield (
+            f"actions look {frames} late: the robot moves {frames} before its command, and policies of such labels"
+            f" fail; move the actions of every recording up by {frames} and leave the last ones empty, unless a script"
+            " computed them from noisy states"
+        )
+
+
+def frames_late(data: TensorDictBase, task: Task) -> int:
+    """Counts the frames by which the labels of flat data ``[N]`` are late; 0 where that is not clear.
+
+    This is a test of Granger causality. The next change of every commanded column is regressed on past states and on
+    labels up to a frame, by cross-validated ridge regression. Labels that are on time explain it by the present frame.
+    If later labels are needed, they are late by that many frames. A script that reacts to noisy states leaves the same
+    trace, with a coefficient of the other sign, or above 1 for targets; such data count as on time.
+
+    Labels that are early cannot be told from a robot that responds late. A late robot hides as many late frames.
+    """
+    episode, labelled = (data.get(key).flatten().cpu().numpy() for key in (keys.EPISODE, keys.HAS_ACTION))
+    rows = np.arange(REACH, len(episode) - REACH)
+    rows = rows[episode[rows - REACH] == episode[rows + REACH]]
+    rows = rows[np.all([labelled[rows + ahead] for ahead in range(-REACH, REACH + 1)], axis=0)]
+    rows = spread_evenly(data.get(keys.EPISODE).new_tensor(rows), MOST).cpu().numpy()
+    states = data.get(keys.OBSERVATION).double().cpu().numpy()[:, list(task.state_columns)]
+    actions, moved = data.get(keys.ACTION).double().cpu().numpy(), list(task.moves.values())
+    change = (states[rows + 1] - states[rows])[:, moved]
+    robot = states[:, list(task.robot) or moved]
+    inputs = (REACH + 1) * robot.shape[1] + (2 * REACH + 1) * actions.shape[1]
+    used = np.flatnonzero(change.std(0) > 1e-9) if len(rows) > inputs else []
+    if not len(used):
+        return 0
+    change, commands = change[:, used], np.array(list(task.moves))[used]
+    past = [robot[rows]] + [robot[rows - i] - robot[rows - i - 1] for i in range(REACH)]
+    given = [actions[rows + ahead] for ahead in range(-REACH, REACH + 1)]
+    errors, gains = _regress(past, change)[0], []
+    shares = []
+    for ahead in range(REACH + 1):
+        error, weights = _regress([*past, *given[: REACH + ahead + 1]], change)
+        shares.append(np.median(np.minimum(error / errors, 1)))
+        last = weights[-actions.shape[1] - 1 : -1]
+        gains.append(np.median(last[commands, np.arange(len(commands))]))
+    needed = next(ahead for ahead, share in enumerate(shares) if share <= min(shares) + NEAR)
+    clear = shares[0] - min(shares) > CLEAR and gains[needed] > 0
+    return needed if clear and not (task.targets and gains[needed] > LARGEST_GAIN) else 0
+
+
+def _regress(parts: list[np.ndarray], outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns cross-validated squared errors ``[d]`` and weights ``[i + 1, d]`` of ridge regression, constant last."""
+    inputs = np.concatenate(parts, 1)
+    mean, spread = inputs.mean(0), np.maximum(inputs.std(0), 1e-12)
+    inputs = np.c_[(inputs - mean) / spread, np.ones(len(inputs))]
+    product, sums = inputs.T @ inputs + PENALTY * len(inputs) * np.eye(inputs.shape[1]), inputs.T @ outputs
+    error = np.zeros(outputs.shape[1])
+    for fold in np.array_split(np.arange(len(inputs)), FOLDS):
+        out = inputs[fold]
+        weights = np.linalg.solve(product - out.T @ out, sums - out.T @ outputs[fold])
+        error += ((outputs[fold] - out @ weights) ** 2).sum(0)
+    return error, np.linalg.solve(product, sums) / np.r_[spread, 1.0][:, None]
