@@ -55,9 +55,9 @@ def test_a_gripper_of_two_values():
     """As a change it would widen the range in which all commands of its unit are kept."""
     opening = [np.column_stack([steps[:, 0], steps[:, 1] > 0]) for steps in DELTAS]
     (said,) = warnings(PATHS, opening, acting=("a", "grip"))
-    assert said.startswith("grip: an action of two values") and said.endswith("--action-kind delta raw")
+    assert said.startswith("grip: an action with two values") and said.endswith("--action-kind delta raw")
     assert not warnings(PATHS, opening, action_kind=["delta", "raw"])
-    with pytest.raises(ValueError, match="'gripper': it is 'raw' if two values open and close, 'absolute' if a width"):
+    with pytest.raises(ValueError, match="'gripper' is unknown: use 'raw' if two values open and close, 'absolute' for a width"):
         demonstrations(PATHS, opening, action_kind=["delta", "gripper"])
 
 
@@ -67,7 +67,7 @@ def test_a_width_of_two_values_is_said_to_be_one_kind():
     steps = [np.column_stack([np.diff(path[:, 0]), path[1:, 1]]) for path in paths]
     assert likely_kinds(*demonstrations(paths, steps))["b"].kind == "absolute"
     (said,) = warnings(paths, steps)
-    assert said.startswith("b: an action of two values") and said.endswith("--action-kind delta raw")
+    assert said.startswith("b: an action with two values") and said.endswith("--action-kind delta raw")
 
 
 def test_targets_and_a_gripper_have_one_cure():
@@ -144,7 +144,7 @@ def test_beside_targets_what_is_near_nothing_is_raw():
 
 def test_normalised_targets_are_raw():
     (said,) = warnings(PATHS, NORMALISED)
-    assert said.startswith("2 of 2 actions follow columns of the state and not their changes (mean correlation 0.")
+    assert said.startswith("2 of 2 actions follow state columns rather than their changes (mean correlation 0.")
     assert said.endswith("convert again with --action-kind raw")
     assert not warnings(PATHS, NORMALISED, action_kind="raw")
 
@@ -162,7 +162,7 @@ def test_targets_of_one_recording_in_another_unit_or_order(change):
     """They say nothing of the kind of all."""
     steps = [*TARGETS[:3], change(TARGETS[3])]
     (said,) = warnings(PATHS, steps, action_kind="absolute", targets=JOINTS[:2])
-    assert said.startswith("absolute actions lie far from targets in d, 'a' by ") and "'b' by" in said
+    assert said.startswith("absolute actions lie far from their targets in d, 'a' by ") and "'b' by" in said
 
 
 def test_a_switch_beside_targets_is_raw_and_the_others_keep_theirs():

@@ -78,7 +78,7 @@ def test_every_action_may_be_of_its_own_kind():
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds, targets=["state_3"])
     assert [action.kind for action in task.actions.values()] == list(kinds)
     assert task.delta_actions == (0,) and task.targets == {1: 3}
-    with pytest.raises(DataError, match="absolute actions are 1, the robot's columns are 4.* target of none is 'raw'"):
+    with pytest.raises(DataError, match="absolute actions: 1, columns of the robot: 4.* without such a column is 'raw'"):
         make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds)
 
 
@@ -127,21 +127,21 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
         ({"control_hz": None}, "control_hz .* is missing"),
         ({"command": ["q3"]}, "unknown column in command .*: 'q3'; did you mean 'q2'"),
         ({"command": [9]}, r"command .*: there is no column 9, only 0..3"),
-        ({"command": [0, 2]}, "command columns must lie side by side, got q1, cup_x"),
+        ({"command": [0, 2]}, "command columns must be adjacent, got q1, cup_x"),
         ({"command": [0, 1, 2, 3]}, "every column is a command"),
-        ({"command": [0], "robot": [0]}, "column 'q1' is the robot's and a command"),
+        ({"command": [0], "robot": [0]}, "column 'q1' is robot and command"),
         ({"robot": [0, 0]}, "robot .* holds q1 more than once"),
         (
             {"action_kind": "absolute"},
-            r"are 2, the robot's columns are 4: name in targets \(--targets\) the col",
+            r"actions: 2, columns of the robot: 4; name in targets \(--targets\) the col",
         ),
-        ({"action_kind": "raw", "targets": [0, 1]}, "targets .* are for action_kind .* 'absolute'"),
-        ({"action_kind": "absolute", "targets": [0, 3], "command": [3]}, "column 'cup_y' is a target and a command"),
+        ({"action_kind": "raw", "targets": [0, 1]}, "targets .* requires action_kind .* 'absolute'"),
+        ({"action_kind": "absolute", "targets": [0, 3], "command": [3]}, "column 'cup_y' is target and command"),
         ({"action_units": ["m"]}, "action_units .* names 1 columns, there are 2"),
         ({"state_units": ["m"]}, "state_units .* names 1 columns, there are 4"),
         ({"action_kind": ("delta",) * 3}, "action_kind .* names 3 columns, there are 2"),
         ({"action_kind": "absolut"}, "unknown kind of action 'absolut'; did you mean 'absolute'"),
-        ({"robot": [True, False]}, r"robot \(--robot\) names columns by name or number, got True"),
+        ({"robot": [True, False]}, r"robot \(--robot\) takes columns by name or number, got True"),
         ({"robot": []}, r"used: robot \(--robot\) names no column$"),
         ({"max_steps": 0}, r"max_steps \(--max-steps\) must be a positive whole number, got 0"),
         ({"state_names": ["time", *NAMES[1:]]}, "state column 'time' is a clock, a counter or a flag by its name"),
@@ -173,7 +173,7 @@ def test_what_never_changes_within_a_recording_is_not_the_robot():
 
 def test_a_robot_that_stands_where_there_are_labels():
     still = [np.column_stack([0 * STATES[0][:, :2], STATES[0][:, 2:]]), *STATES[1:]]
-    with pytest.raises(DataError, match="robot: q1, q2 never move where there are labels"):
+    with pytest.raises(DataError, match="robot: q1, q2 never move in labelled trajectories"):
         make_demonstrations(still, ACTIONS, control_hz=20, state_names=NAMES, robot=["q1", "q2"])
 
 
@@ -205,9 +205,9 @@ def test_small_offsets_stay():
 
 def test_offsets_that_nothing_could_subtract():
     far = [frames + 1e8 for frames in STATES]
-    with pytest.raises(DataError, match="command column 'cup_x' is at 1e.08: subtract that from it"):
+    with pytest.raises(DataError, match="command column 'cup_x' is at 1e.08: subtract this value"):
         make_demonstrations(far, ACTIONS, control_hz=20, state_names=NAMES, command=["cup_x"])
-    with pytest.raises(DataError, match="action column 'action_1' is at 1e.08: subtract that from it"):
+    with pytest.raises(DataError, match="action column 'action_1' is at 1e.08: subtract this value"):
         make_demonstrations(STATES, [ACTIONS[0] + [0, 1e8], None, None], control_hz=20)
 
 
@@ -217,7 +217,7 @@ def test_what_no_number_holds_is_refused(scale, recwarn):
         make_demonstrations([frames * [scale, 1, 1, 1] for frames in STATES], ACTIONS, control_hz=20, state_names=NAMES)
     with pytest.raises(DataError, match="action column 'action_1' lies in .* too coarsely"):
         make_demonstrations(STATES, [ACTIONS[0] * [1, scale], None, None], control_hz=20)
-    with pytest.raises(DataError, match="float64 hold too coarsely"):
+    with pytest.raises(DataError, match="float64 resolves too coarsely"):
         make_demonstrations([frames + 1e16 for frames in STATES], ACTIONS, control_hz=20)
     assert not recwarn
 

@@ -35,9 +35,9 @@ def leaping(frames, at, change):
     ("columns", "message"),
     [
         ((3 * TIME + 1 + np.pi) % (2 * np.pi) - np.pi, r"'q0' from 3.14 to -3.05 \(frame 22 of trajectory 0\): angles"),
-        (np.hstack([np.pi - (4 * TIME) % (2 * np.pi), TIME / 9, 0.1 * TIME**2]), "'q0' .*: angles that were wrapped"),
-        ((170 * TIME + 180) % 360 - 180, "angles that were wrapped by 360"),
-        ((900 * TIME + 2600) % 4096, "a count or an angle that was wrapped by 4.0.e.03"),
+        (np.hstack([np.pi - (4 * TIME) % (2 * np.pi), TIME / 9, 0.1 * TIME**2]), "'q0' .*: angles wrapped"),
+        ((170 * TIME + 180) % 360 - 180, "angles wrapped by 360"),
+        ((900 * TIME + 2600) % 4096, "a counter or an angle wrapped by 4.0.e.03"),
         (np.hstack([np.cos(TIME), np.sin(TIME)]) * np.where(TIME < 1, 1, -1), "'q0' .*, 'q1' .*: a quaternion"),
         (
             leaping(TIME + 3, 17, lambda value: 0 * value),
@@ -57,14 +57,14 @@ def test_a_shove_is_no_wrapped_count():
     columns = 0.1 * np.sin(np.arange(600.0)[:, None] + np.arange(3))
     columns[300:303, 0] = [11, 10, 9]
     (warning,) = leap_warnings([columns], ["log"], ["gyro", "hip", "knee"])
-    assert "a switch, or" in warning and "where the robot was reset, say that an episode ends" in warning
+    assert "a switch, or" in warning and "where the robot was reset, mark the end of an episode" in warning
 
 
 @pytest.mark.parametrize("axis", [(0.9, 0.43589, 0), (0, 0.6, 0.8)])
 def test_a_rotation_vector_turns_over_at_pi(axis):
     vector = ((3 * TIME + np.pi) % (2 * np.pi) - np.pi) * np.array(axis)
     warnings = seen(np.hstack([TIME**2, vector, TIME**3]))
-    assert warnings and all("a rotation vector, which turns over at pi" in warning for warning in warnings)
+    assert warnings and all("a rotation vector, whose axis flips at pi" in warning for warning in warnings)
 
 
 def test_many_columns_that_leap_are_counted():
@@ -82,7 +82,7 @@ def test_labels_that_leap():
     steps = 0.01 * np.sin(np.arange(1, 20)[:, None] / 4.5)
     steps[7] -= 2 * np.pi
     (warning,) = spike_warnings([steps], ["a.csv"], ["v"])
-    assert warning.startswith("action 'v' is -6.27 in label 7 of a.csv and far from that before")
+    assert warning.startswith("action 'v' is -6.27 in label 7 of a.csv and far from that in the labels before")
     assert list(spike_warnings([(np.arange(19) == 7).astype(float)[:, None]], ["a.csv"], ["v"])) == []  # a switch
 
 
@@ -94,7 +94,7 @@ def test_signs_of_quaternions(signs):
     turn, names = np.hstack([np.cos(TIME / 4), np.sin(TIME / 4), 0 * TIME, 0 * TIME]), ["w", "x", "y", "z", "height"]
     trajectories = [np.hstack([turn * sign, TIME]) for sign in signs]
     (warning,) = quaternion_warnings(trajectories, names)
-    assert warning.startswith("columns w, x, y, z are a quaternion that changes its sign")
+    assert warning.startswith("columns w, x, y, z are a quaternion that changes sign")
     assert not [*quaternion_warnings([np.hstack([turn, TIME])] * 2, names)]
 
 
@@ -102,7 +102,7 @@ def test_a_quaternion_that_leaps_in_one_column_is_no_wrapped_angle():
     turn = np.hstack([np.cos(TIME / 9), np.sin(TIME / 9), 0 * TIME, 0 * TIME]) * np.where(TIME < 1, 1, -1)
     assert seen(turn) == []
     (warning,) = quaternion_warnings([turn], ["w", "x", "y", "z"])
-    assert "in 1 frames" in warning and warning.endswith("do the same on the robot")
+    assert "in 1 frames" in warning and warning.endswith("also on the robot")
     turn[9] = 0  # a measurement that failed does not hide what the columns are
     assert [warning] == [*quaternion_warnings([turn], ["w", "x", "y", "z"])]
     assert seen(turn)[0].endswith("a measurement that failed for a frame? fill it from its neighbours")
@@ -113,7 +113,7 @@ def test_the_same_angle_a_turn_apart(turn):
     """A roll near pi that was unwrapped in each trajectory by itself; a wrist that winds has no gap."""
     roll = turn / 2 * (1 + 0.05 * np.sin(TIME))
     (warning,) = turn_warnings([roll, roll - turn, roll + 0.01], ["roll"])
-    assert f"in 1 trajectories and about {turn:.3g} above" in warning
+    assert f"in 1 trajectories and about {turn:.3g} higher" in warning
     winding = [roll, roll - turn, roll - turn / 2]
     assert not [*turn_warnings([roll, roll + 0.01], ["roll"]), *turn_warnings(winding, ["roll"])]
     assert not [*turn_warnings([roll], ["roll"]), *turn_warnings([roll, roll + 3 * turn], ["roll"])]
@@ -123,7 +123,7 @@ def test_the_same_angle_a_turn_apart(turn):
 def test_marks_of_what_is_missing(kind):
     rows = np.where(np.arange(60)[:, None] % 7, np.sin(TIME), -999)
     (warning,) = mark_warnings(rows, ["v"], kind)
-    assert warning.startswith(f"{kind} 'v' is -999 in 9 of 60 rows and within 0") and "missing?" in warning
+    assert warning.startswith(f"{kind} 'v' is -999 in 9 of 60 rows and within 0") and "missing values?" in warning
     for sound in (TIME > 1, np.round(TIME), np.minimum(TIME, 1), np.where(TIME > 1.97, 99, TIME)):
         assert not [*mark_warnings(sound.astype(float), ["v"], kind)]
 
@@ -167,4 +167,4 @@ def test_recordings_without_labels_in_a_smaller_unit_or_with_sensors_off(share, 
     found = list(unlabelled_warnings(frames, known, called, ["x", "y", "p", "q"]))
     where = "'p', 'q' move less than a tenth as far as in labelled trajectories in 2 of 6 without labels (take 8, take"
     assert [where in said for said in found] == [True] * told
-    assert all(said.endswith("leave recordings out, not the columns") for said in found)
+    assert all(said.endswith("leave out these recordings, not columns") for said in found)

@@ -46,7 +46,7 @@ def test_each_warning_is_said_once_and_names_its_trajectory():
     names = [f"{letter}.pkl" for letter in "abcdef"]
     paths = [PATH, PATH, PATH * 0, PATH * 1e36, PATH + 1, PATH + 2]
     assert warnings(paths, [STEPS, STEPS, STEPS, STEPS, 0 * STEPS, None], names=names) == [
-        "b.pkl repeats a.pkl: every state is the same; leave out the one with fewer labels",
+        "b.pkl repeats a.pkl: all states are equal; leave out the one with fewer labels",
         "c.pkl: nothing moves in its 19 steps",
         "d.pkl: x reaches 3.6e+37 m",
         "e.pkl: all 19 labelled actions are zero",
@@ -72,7 +72,7 @@ def test_columns_that_say_nothing_are_named():
     states = [torch.cat([path, path[:, :1], torch.full((20, 1), 3.0)], -1) for path in (PATH, PATH + 1)]
     assert warnings(states, columns=["x", "y", "again", "shelf"], units=()) == [
         "columns 'x' and 'again' are the same in every step",
-        "column 'shelf' is 3 in all 38 steps: it says nothing",
+        "column 'shelf' is 3 in all 38 steps: it carries no information",
     ]
 
 
@@ -80,14 +80,14 @@ def test_short_trajectories_are_named():
     (warning,) = warnings([PATH, PATH[:6], PATH[:9]])
     assert "2 of 3 trajectories have fewer steps than a window of 16" in warning
     assert (
-        "trajectory 1 (5), trajectory 2 (8); leave them out of the lists, or with `koap convert --drop-short`"
+        "trajectory 1 (5), trajectory 2 (8); remove them, in Python or with `koap convert --drop-short`"
         in warning
     )
 
 
 def test_actions_that_never_change_are_named():
     assert warnings([PATH], [torch.cat([PATH[1:, :1], ACTIONS], 1)], acting=["v", "grip"]) == [
-        "action 'grip' is 1 in all labels: controllers command that, method dp something near it"
+        "action 'grip' is 1 in all labels: controllers command this value, method dp a value near it"
     ]
     assert constant_columns(np.array([[1.0, np.nan], [2.0, 5.0], [2.0, 5.0]])) == [2.0, 5.0]
 
@@ -95,7 +95,7 @@ def test_actions_that_never_change_are_named():
 def test_clocks_and_rates_are_told():
     wave = torch.sin(PATH[:, :1])
     (warning,) = warnings([torch.cat([wave + i, PATH[:, :1]], 1) for i in range(2)], columns=["q", "ticks"], units=())
-    assert warning.startswith("column 'ticks' rises by much the same amount in every frame")
+    assert warning.startswith("column 'ticks' rises by nearly the same amount in every frame")
     data = flatten_trajectories([wave], None, action_dim=1)
     task = Task(name="arm", observation_parts={"q": 1}, actions={"v": Action()}, position="q", control_hz=0.03)
     assert "control_hz is 0.03: frames per second" in find_warnings(data.set("state", data["observation"]), task)[0]
@@ -104,7 +104,7 @@ def test_clocks_and_rates_are_told():
 def test_labels_that_stand_alone():
     alone = torch.where(torch.arange(19)[:, None] % 4 == 1, STEPS, torch.nan)
     (warning,) = warnings([MOVED, MOVED + 1], [alone, STEPS])
-    assert warning.startswith("labels stand alone in 1 trajectories: trajectory 0 (5 of 19 steps)")
+    assert warning.startswith("most labels are isolated in 1 trajectories: trajectory 0 (5 of 19 steps)")
 
 
 def test_odd_values_of_states_and_actions_are_warned_of():
@@ -114,9 +114,9 @@ def test_odd_values_of_states_and_actions_are_warned_of():
     labels = np.hstack([wave - 6.28 * (rows == 7), np.where(rows % 3, wave, -999)])[:59]
     said = "\n".join(warnings([np.hstack(columns)], [torch.tensor(labels)], columns="sqmwxyz", units=(), acting="vu"))
     for words in (
-        "angles that were wrapped",
+        "angles wrapped",
         "column 'm' is -9999",
-        "w, x, y, z are a quaternion that changes its sign",
+        "w, x, y, z are a quaternion that changes sign",
     ):
         assert words in said
     assert "action 'v' is -5" in said and "action 'u' is -999" in said
@@ -188,7 +188,7 @@ def test_short_trajectories_are_left_out_and_named():
 
 def test_a_recording_with_labels_beside_itself_without_them():
     said = warnings([MOVED, MOVED], [None, STEPS], names=["run_5.csv", "run_5_labelled.csv"])
-    wanted = "run_5_labelled.csv repeats run_5.csv: every state is the same; leave out the one with fewer labels"
+    wanted = "run_5_labelled.csv repeats run_5.csv: all states are equal; leave out the one with fewer labels"
     assert said == [wanted]
 
 

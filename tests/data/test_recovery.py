@@ -140,7 +140,7 @@ def test_observed_frames_move_along_the_way_to_the_nearest_other_window_and_the_
 
 @pytest.mark.parametrize("shape", [(16, 3), (1, 16, 3), (2, 2, 16, 3)])
 def test_windows_without_neighbours_are_refused(shape):
-    with pytest.raises(ValueError, match="batch .B, T, d. of two or more"):
+    with pytest.raises(ValueError, match="batch of states .B, T, d. with B >= 2"):
         NeighborRecovery(1.0)(TensorDict({"state": torch.zeros(shape)}, shape[:1]))
 
 

@@ -50,9 +50,9 @@ def test_partially_labelled_data(tmp_path):
 def test_save_refuses(tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "thesis.txt").write_text("years")
-    with pytest.raises(FileExistsError, match="left as it is"):
+    with pytest.raises(FileExistsError, match="it was not changed"):
         save_ted(recorded(), tmp_path / "work", AVOIDING)
-    with pytest.raises(TypeError, match="only tensors can be saved, .'note'. are none"):
+    with pytest.raises(TypeError, match="entries .'note'. are not tensors"):
         save_ted(recorded().set_non_tensor("note", "text"), tmp_path / "other", AVOIDING)
     with pytest.raises(DataError):
         save_ted(recorded().exclude("action"), tmp_path / "other", AVOIDING)

@@ -100,9 +100,9 @@ def test_labels_on_inner_frames_count_unasked():
 def test_wrong_options():
     data = demonstrations()
     for counted in (range(1, 16), range(-1, 4)):
-        with pytest.raises(ValueError, match=r"all but the last may count: got 16 and range"):
+        with pytest.raises(ValueError, match=r"counted exclude the last frame, got 16 and range"):
             WindowTable.build(data, 16, counted=counted)
-    with pytest.raises(ValueError, match="a window has 2 frames or more"):
+    with pytest.raises(ValueError, match="window must be >= 2"):
         cut_windows(data, 1)
     with pytest.raises(ValueError, match=r"pad_before must be in 0\.\.15"):
         make_window_buffer(data, 16, 4, pad_before=16)
@@ -112,7 +112,7 @@ def test_wrong_options():
         make_window_buffer(data.exclude("episode"), 16, 4)
     with pytest.raises(ValueError, match="flat data"):
         make_window_buffer(demonstrations((20, 20)).reshape(2, 20), 16, 4)
-    with pytest.raises(ValueError, match="of a batch of 4 is no window"):
+    with pytest.raises(ValueError, match="of a batch of 4 rounds to 0 windows"):
         make_window_buffer(data, 16, 4, labelled_share=0.1)
 
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which kind actions are of by their labels, and whether that is the kind that their task declares."""
+"""Guesses the kind of actions from their labels, and warns where their task declares another kind."""
 
 from __future__ import annotations
 
@@ -16,43 +16,40 @@ from torchrl_koap.files import option, some
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
-NEAR, NAMED = 0.3, 1.0  # share of a column's spread within which its targets lie; likewise if they bear its name
-NEARER = 3.0  # times as far from one reading of an action as from the other
-CLEARER = 2.0  # times as much that one reading leaves unexplained as the other
+NEAR, NAMED = 0.3, 1.0  # targets lie within this share of a column's spread; NAMED if action and column share a name
+NEARER = 3.0  # one reading of an action is this many times closer than the other
+CLEARER = 2.0  # one reading leaves this many times less unexplained than the other
 ASTRAY = 5.0  # times as far from its target as in half of the recordings: another order or unit of columns
-FOLLOWS = 0.8  # correlation with a change that no level explains away
-UNLIKE = 0.5  # correlation with every action below which a column repeats no command
-FEW, MANY = 20, 20_000  # labels below which nothing is said, and that are looked at
+FOLLOWS = 0.8  # above this correlation with a change, an action is a delta even if a level correlates as well
+UNLIKE = 0.5  # a command column that correlates less than this with every action repeats no command
+FEW, MANY = 20, 20_000  # fewest labels to judge by; about as many labels are read at most
 
 
 @dataclass(frozen=True)
 class LikelyKind:
-    """What an action column looks like by its labels."""
+    """Likely kind of an action column, by its labels."""
 
     kind: ActionKind  # "absolute": near a state column; "delta": follows the change of one; "raw": neither
-    column: int  # the state column that it lies nearest to, in units of that column's spread
-    distance: float  # from there, on average
+    column: int  # nearest state column, in units of that column's spread
+    distance: float  # mean distance from that column
     follows_column: float  # largest correlation with a state column, between 0 and 1
     follows_change: float  # largest correlation with the change of one
 
 
 @dataclass(frozen=True)
 class _Labels:
-    """Labelled steps ``[n]``: the actions ``[n, a]``, what followed ``[n, d]`` and how it changed ``[n, d]``."""
+    """Labelled steps."""
 
-    actions: np.ndarray
-    level: np.ndarray
-    change: np.ndarray
+    actions: np.ndarray  # [n, a]
+    level: np.ndarray  # [n, d]: state columns of the next frame
+    change: np.ndarray  # [n, d]: their change over the step
     names: list[str]  # of the columns
-    turns: list[tuple[int, int, int]]  # quaternions: first action, first column of its target, labels of other sign
+    turns: list[tuple[int, int, int]]  # quaternions: first action, first target column, number of labels of other sign
     episodes: np.ndarray  # [n]: number of the recording
 
 
 def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
-    """Guesses the kind of every action of flat data ``[N]`` from its labels, by the name of the action.
-
-    There is none below 20 labels, and none of an action that never changes.
-    """
+    """Guesses the kind of every action of flat data ``[N]``, by name; no constant actions, none below 20 labels."""
     labels = _labels(data, task)
     return {} if labels is None else _likely(labels, task)
 
@@ -60,10 +57,10 @@ def likely_kinds(data: TensorDictBase, task: Task) -> dict[str, LikelyKind]:
 def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> Iterator[str]:
     """Finds actions of flat data ``[N]`` that contradict their kind; ``called`` are the names of recordings.
 
-    Quaternions of targets look wrong where their sign is not that of the state. Changes look wrong where they lie at
-    the next value of a state column, or follow columns more than their changes; or have two values alone; absolute
-    targets where they lie at the change of their column, per frame or per second, or far from the column in half of the
-    recordings or in some; raw actions where all of them are near columns, or all follow changes.
+    * Quaternion targets: the sign differs from that of the state.
+    * ``"delta"``: near the next value of a state column, following columns more than their changes, or only two values.
+    * ``"absolute"``: near the change of their column (per frame or second), or far from it in half or some recordings.
+    * ``"raw"``: all near columns, or all following changes.
     """
     labels = _labels(data, task)
     if labels is None:
@@ -73,8 +70,8 @@ def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> It
         if against:
             yield (
                 f"actions {', '.join([*task.actions][start : start + 4])} are a quaternion of the other sign than"
-                f" {', '.join(labels.names[column : column + 4])} in {against} of {len(labels.actions)} labels: mend"
-                " the signs of the state first, then flip the action where the product of both is negative"
+                f" {', '.join(labels.names[column : column + 4])} in {against} of {len(labels.actions)} labels: first"
+                " correct the signs of the state, then negate the action where the dot product of both is negative"
             )
     yield from _targets_far_away(labels, task, likely, called)
     kinds = {name: action.kind for name, action in task.actions.items()}
@@ -84,7 +81,7 @@ def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> It
     wrong = {name for name in aimed if kinds[name] == "delta" and name not in switches}
     wrong |= aimed if len(aimed) == task.action_dim and set(kinds.values()) == {"raw"} else set()
     found = {name: likely[name] for name in wrong} | {name: replace(likely[name], kind="raw") for name in switches}
-    if wrong:  # of the others "delta" was the default, which is worse where they are none
+    if wrong:  # "delta" was probably the default then, so other actions that look raw are reported too
         found |= {name: each for name, each in likely.items() if kinds[name] == "delta" and each.kind == "raw"}
     cure = _cure(task, labels, found)
     if wrong:
@@ -94,13 +91,13 @@ def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> It
             f" look like absolute targets; {cure}"
         )
     if switches:
-        yield f"{some(switches)}: an action of two values, such as a gripper's that opens and closes: {cure}"
+        yield f"{some(switches)}: an action with two values, such as open and close of a gripper: {cure}"
     wrong.update(found)
     changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
     still = [each for each in changes if each.kind == "raw" and _clear(each.follows_column, each.follows_change)]
     if 2 * len(still) > len(changes):
         yield (
-            f"{len(still)} of {task.action_dim} actions follow columns of the state and not their changes"
+            f"{len(still)} of {task.action_dim} actions follow state columns rather than their changes"
             f" ({_correlations(still)}): they look like neither changes nor targets; convert again with"
             " --action-kind raw"
         )
@@ -110,7 +107,7 @@ def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> It
 
 
 def command_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
-    """Finds command columns of flat data ``[N]`` that no action follows, neither their values nor their changes."""
+    """Finds command columns of flat data ``[N]`` whose values and changes correlate with no action."""
     steps = _labelled_steps(data)
     if task.command_columns is None or steps is None:
         return
@@ -121,13 +118,13 @@ def command_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
         if most < UNLIKE:
             yield (
                 f"command column {task.observation_names[column]!r} follows no action (largest correlation"
-                f" {most:.2f}): it is hidden from planner and controller; what the robot is to follow, such as a"
-                f" joystick, is no {option('command')}"
+                f" {most:.2f}), yet it is hidden from planner and controller; a signal that the robot follows, such as"
+                f" a joystick, is not a {option('command')}"
             )
 
 
 def describe_likely(likely: dict[str, LikelyKind]) -> str:
-    """Returns what :func:`likely_kinds` found in words, with its numbers."""
+    """Returns the result of :func:`likely_kinds` as text."""
     found: dict[str, list[str]] = {}
     for name, each in likely.items():
         found.setdefault(each.kind, []).append(name)
@@ -139,7 +136,7 @@ def describe_likely(likely: dict[str, LikelyKind]) -> str:
 
 
 def _labelled_steps(data: TensorDictBase) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Observations around labelled steps ``[n, obs]``, actions ``[n, a]`` and recordings ``[n]``; None where few."""
+    """Returns observations before and after labels ``[n, obs]``, actions ``[n, a]``, episodes ``[n]``; None if few."""
     labelled = data.get(keys.HAS_ACTION).squeeze(-1).nonzero().squeeze(-1)
     if len(labelled) < FEW:
         return None
@@ -162,7 +159,7 @@ def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
         for column in quaternion_starts([level]):
             turn, there = actions[:, start : start + 4], level[:, column : column + 4]
             products = (turn * there).sum(1)
-            other = np.abs((turn * np.roll(there, len(there) // 2, axis=0)).sum(1))  # at another time
+            other = np.abs((turn * np.roll(there, len(there) // 2, axis=0)).sum(1))  # the product by chance
             if (1 - np.abs(products)).mean() < NEAR * (1 - other).mean():
                 turns.append((start, column, int((products < 0).sum())))
                 turn *= np.where(products < 0, -1, 1)[:, None]
@@ -185,14 +182,14 @@ def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
         kind: ActionKind = "absolute" if len(fits) else "delta" if moves else "raw"
         column = int(fits[share[fits].argmin()] if len(fits) else share.argmin())
         found[name] = LikelyKind(kind, column, float(distance[column]), float(level.max()), float(change.max()))
-    for start, column, _ in labels.turns:  # parts of one target, also those near 0
+    for start, column, _ in labels.turns:  # all four parts are targets, also those near 0
         for name, at in zip([*task.actions][start : start + 4], range(column, column + 4), strict=True):
             found[name] = replace(found.get(name, LikelyKind("raw", 0, 0.0, 0.0, 0.0)), kind="absolute", column=at)
     return found
 
 
 def _cure(task: Task, labels: _Labels, found: Mapping[str, LikelyKind]) -> str:
-    """How to convert again where some actions are of another kind, or the targets of another column."""
+    """Returns the options to convert again with, where actions are of another kind or target another column."""
     actions = {name: found.get(name, action) for name, action in task.actions.items()}
     kinds = [action.kind for action in actions.values()]
     targets = [action.column for action in actions.values() if action.kind == "absolute"]
@@ -205,9 +202,9 @@ def _cure(task: Task, labels: _Labels, found: Mapping[str, LikelyKind]) -> str:
 def _targets_far_away(
     labels: _Labels, task: Task, likely: Mapping[str, LikelyKind], called: Sequence[str]
 ) -> Iterator[str]:
-    """Absolute actions that are nearer to the change of their column, or farther from it than the column moves.
+    """Finds absolute actions that are nearer to the change of their column, or farther from it than the column moves.
 
-    In half of the recordings, it is of another kind. In fewer, these have another order or unit of columns.
+    If half of the recordings show this, the action has another kind; if fewer, their columns another order or unit.
     """
     far: dict[str, str] = {}
     astray: dict[str, set[int]] = {}
@@ -226,19 +223,19 @@ def _targets_far_away(
             astray[f"{name!r} by {each[odd].min():.2g} from {target!r}, elsewhere by {usual:.2g}"] = {*recordings[odd]}
     if far:
         cure = _cure(task, labels, {name: likely[name] for name in far})
-        yield f"absolute actions lie away from their targets on average, {some([*far.values()])}: {cure}"
+        yield f"absolute actions lie far from their targets on average, {some([*far.values()])}: {cure}"
     if astray:
         where = some([called[number] for number in sorted(set().union(*astray.values()))])
-        yield f"absolute actions lie far from targets in {where}, {some([*astray])}: columns in another order or unit?"
+        yield f"absolute actions lie far from their targets in {where}, {some([*astray])}: another order or unit?"
 
 
 def _readings(labels: _Labels, task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What actions may be equal to: the next columns, their changes over a frame, and these per second."""
+    """Returns what actions may be equal to: the next state columns, their changes per frame, and these per second."""
     return labels.level, labels.change, labels.change * task.control_hz
 
 
 def _correlation(steps: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Size of the correlation of an action ``[n]`` with columns ``[n, d]``, 0 for one that never moves."""
+    """Returns the absolute correlation of an action ``[n]`` with columns ``[n, d]``; 0 for constant columns."""
     columns = columns - columns.mean(0)
     size = np.sqrt((columns**2).mean(0))
     moves = size > 1e-12 * np.abs(columns).max(initial=1.0)
@@ -246,7 +243,7 @@ def _correlation(steps: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _clear(one: np.ndarray | float, other: np.ndarray | float) -> np.ndarray | bool:
-    """Whether a correlation explains an action clearly better than another one."""
+    """Checks whether one correlation explains an action clearly better than the other."""
     return CLEARER * (1 - one) < 1 - other
 
 

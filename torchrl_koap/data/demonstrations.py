@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A user's own demonstrations as a data set that holds its whole task: arrays in, ``koap train --dataset`` out."""
+"""Makes a data set with its task from a user's arrays, for ``koap train --dataset``."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ from torchrl_koap.lookup import lookup, unknown
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
-# what a user calls the kind of an action, and the kind that it is when its rate is settled
+# the kind of an action as a user names it -> as stored, once resampling is done
 ACTION_KINDS: dict[str, ActionKind] = {**dict.fromkeys(ADDS_UP, "delta"), "absolute": "absolute", "raw": "raw"}
-_COARSE = 1e-5  # share of a column's range to which float32 has to hold it
-_SMALLEST, _LARGEST = 1e-18, 1e18  # what a column may span: the squares are numbers of float32 still
-_SLACK = 1.5  # episodes may be that much longer than the longest demonstration
+_COARSE = 1e-5  # float32 must resolve a column to this share of its range
+_SMALLEST, _LARGEST = 1e-18, 1e18  # range that a column may span: float32 can hold the squares
+_SLACK = 1.5  # episodes may last this many times the longest demonstration
 
 
 def save_demonstrations(
     folder: str | Path, states: Sequence[ArrayLike] | Recordings, actions: Any = None, **description: Any
 ) -> Path:
-    """Writes demonstrations, of which few or none have actions, as a data set that ``koap train --dataset`` takes.
+    """Writes demonstrations, of which few or none have actions, as a data set for ``koap train --dataset``.
 
     Args:
-        folder (str or Path): folder to create; a data set there is replaced in one step.
+        folder (str or Path): folder to create; a data set there is replaced atomically.
         states (sequence of array, or Recordings): frames of every trajectory ``[T_i, d]``, in the units that the robot
-            reports; or what :func:`~torchrl_koap.data.read_recordings` found.
+            reports; or the result of :func:`~torchrl_koap.data.read_recordings`.
         actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, NaN
-            where there is no label, or None for a trajectory without. Default: no labels.
-        **description: everything :func:`make_demonstrations` takes besides.
+            where there is no label; None for a trajectory without labels. Default: no labels.
+        **description: the other arguments of :func:`make_demonstrations`.
 
     Returns:
         Path: the folder.
 
     Raises:
-        DataError: with all faults of the arrays and of their description.
+        DataError: listing all faults of the arrays and of their description.
         FileExistsError: if the folder holds something other than a data set.
 
     Examples:
@@ -95,47 +95,46 @@ def make_demonstrations(
     resample: float | None = None,
     max_steps: int | None = None,
 ) -> tuple[TensorDict, Task]:
-    """Demonstrations in memory: flat data and the task they are of.
+    """Makes demonstrations in memory: flat data and their task.
 
     Args:
         states (sequence of array, or Recordings): as for :func:`save_demonstrations`.
         actions (sequence of array or None, optional): likewise.
 
     Keyword Args:
-        control_hz (float): frames per second; recordings may know it.
+        control_hz (float): frames per second. Required unless the recordings have it.
         name (str): name of the task.
         state_names, action_names, action_dim: as for :func:`~torchrl_koap.data.make_recordings`.
         state_units, action_units (sequence of str, or str): unit of every column, or one for all. Errors of actions are
             averaged over columns of one unit.
-        robot (sequence of str or int, optional): state columns of the robot itself, by name or number: the controller
-            reads these. Default: all that are no command and change within a recording.
+        robot (sequence of str or int, optional): state columns of the robot, by name or number; the controller reads
+            these. Default: all columns that are not commands and change within a recording.
         command (sequence of str or int): neighbouring columns that repeat the last command. Their differences are the
-            actions, so nothing that learns ever sees them.
-        action_kind (str, or sequence of str): ``"delta"``, velocities or changes: small where the robot stands
-            still; ``"absolute"``, targets of the columns ``targets``; or ``"raw"``, what no state column is moved by or
-            near to, such as torques or normalised targets. One for all actions or one for each, such as of a gripper
-            that is commanded by its width beside joints that are commanded by changes. ``"change"`` (over one frame)
-            and ``"velocity"`` say which ``"delta"`` is meant, as ``resample`` needs to know.
-        targets (sequence of str or int, optional): for every absolute action the state column that it is the
-            target of. Default: the robot's columns, if there are as many.
-        resample (float, optional): frames per second that are wanted, where ``control_hz`` is that of the arrays; see
+            actions, so they are hidden from all models.
+        action_kind (str, or sequence of str): one for all actions, or one for each. ``"delta"``: velocities or changes,
+            small when the robot stands still. ``"absolute"``: targets for the columns ``targets``. ``"raw"``: actions
+            that neither move a state column nor lie near one, such as torques or normalised targets. For ``resample``,
+            give ``"change"`` (over one frame) or ``"velocity"`` instead of ``"delta"``.
+        targets (sequence of str or int, optional): the state column of every absolute action. Default: the robot's
+            columns, if there are as many.
+        resample (float, optional): wanted frames per second, where ``control_hz`` is that of the arrays; see
             :func:`~torchrl_koap.data.read_recordings`.
         max_steps (int, optional): steps after which an episode counts as failed. Default: 1.5 times the longest
             demonstration.
 
     Returns:
         tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the
-        :class:`~torchrl_koap.tasks.Task`. Where float32 would hold the movement of a column coarsely, its middle is
-        subtracted and stored as ``task.observation_origin``; an agent subtracts it too.
+        :class:`~torchrl_koap.tasks.Task`. If float32 resolves a column's movement too coarsely, the middle of its range
+        is subtracted and stored as ``task.observation_origin``; an agent subtracts it too.
 
     Raises:
-        DataError: with all faults: those of :func:`~torchrl_koap.data.make_recordings`, columns that
-            do not exist or overlap, targets that do not fit, units of another number, a robot that never moves, a
-            command or an action without a target whose movement float32 cannot hold, a column that no float holds.
-        ValueError: for an unknown kind of action.
+        DataError: listing all faults: those of :func:`~torchrl_koap.data.make_recordings`; missing or overlapping
+            columns; wrong numbers of targets or units; a robot that never moves; a column that no float can hold; a
+            command, or an action without a target, whose movement float32 cannot resolve.
+        ValueError: if a kind of action is unknown.
 
     Warns:
-        UserWarning: of what is unlikely in the data, as ``koap validate`` does.
+        UserWarning: about unlikely data, as ``koap validate`` does.
 
     Examples:
         >>> import numpy as np
@@ -147,12 +146,12 @@ def make_demonstrations(
     for kind in (action_kind,) if isinstance(action_kind, str) else action_kind:
         if kind == "gripper":
             raise ValueError(
-                "action_kind 'gripper': it is 'raw' if two values open and close, 'absolute' if a width is set"
+                "action_kind 'gripper' is unknown: use 'raw' if two values open and close, 'absolute' for a width"
             )
         lookup(ACTION_KINDS, kind, "kind of action")
     if isinstance(states, Recordings):
         if actions is not None:
-            raise ValueError("recordings hold their actions already; actions must be None")
+            raise ValueError("recordings already hold their actions; actions must be None")
         recordings = states
     else:
         recordings = make_recordings(
@@ -164,7 +163,7 @@ def make_demonstrations(
             control_hz=control_hz,
         )
     problems = [
-        f"state column {column!r} is a clock, a counter or a flag by its name: leave it out, or name it otherwise"
+        f"state column {column!r} is a clock, a counter or a flag by its name: leave it out, or rename it"
         for column in recordings.state_names
         if recordings is not states and kind_of(column)[0]
     ]
@@ -186,20 +185,20 @@ def make_demonstrations(
         own = [column for column in others if moving[column]] or others
     else:
         own = _columns(robot, names, "robot", problems)
-    problems += [f"column {names[column]!r} is the robot's and a command" for column in own if column in commanded]
+    problems += [f"column {names[column]!r} is robot and command" for column in own if column in commanded]
     if commanded and commanded != list(range(min(commanded), min(commanded) + len(commanded))):
-        problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
+        problems.append(f"command columns must be adjacent, got {', '.join(names[c] for c in commanded)}")
     if not others:
-        problems.append("every column is a command: nothing is left to plan and act on")
+        problems.append("every column is a command: no state column is left")
     kinds = [ACTION_KINDS[kind] for kind in one_each(action_kind, len(acting), "action_kind", problems)]
     reached = _targets(kinds, targets, own, names, problems)
     if targets is not None:
-        problems += [f"column {names[column]!r} is a target and a command" for column in reached if column in commanded]
+        problems += [f"column {names[column]!r} is target and command" for column in reached if column in commanded]
     units = one_each(action_units, len(acting), "action_units", problems)
     own_units = one_each(state_units, len(names), "state_units", problems)
     origin = _origin(np.concatenate(recordings.states), names, "state", problems)
     problems += [
-        f"command column {names[column]!r} is at {origin[column]:.3g}: subtract that from it, here and on the robot"
+        f"command column {names[column]!r} is at {origin[column]:.3g}: subtract this value, here and on the robot"
         for column in commanded
         if origin[column]
     ]
@@ -208,7 +207,7 @@ def make_demonstrations(
         added[absolute] = origin[reached]
     actions = [steps - added for steps in recordings.actions]
     problems += [
-        f"action column {acting[column]!r} is at {at:.3g}: subtract that from it, here and on the robot"
+        f"action column {acting[column]!r} is at {at:.3g}: subtract this value, here and on the robot"
         for column, at in enumerate(_origin(np.concatenate(actions), acting, "action", problems))
         if at
     ]
@@ -222,7 +221,7 @@ def make_demonstrations(
     elif own and labelled and not any(np.ptp(frames, axis=0).any() for frames in labelled):
         which = ", ".join(names[column] for column in own)
         problems.append(
-            f"robot: {which} never move where there are labels, so nothing tells what an action does: name others in"
+            f"robot: {which} never move in labelled trajectories, so the effect of actions is unknown: name others in"
             f" {option('robot')}"
         )
     refuse(f"task {name!r}", problems)
@@ -255,7 +254,7 @@ _COMMAND = "command"
 
 
 def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str, tuple[str, ...]]:
-    """Neighbouring columns with the same role as one part each."""
+    """Groups neighbouring columns with the same role into parts."""
 
     def role(column: int) -> str:
         return _COMMAND if column in commanded else "robot" if column in own else "surroundings"
@@ -268,7 +267,7 @@ def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str
 
 
 def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -> list[int]:
-    """Columns that are given by name or number, one or several."""
+    """Returns the numbers of columns given by name or number, one or several."""
     given = [given] if isinstance(given, (str, int, slice)) else list(given)
     odd = [
         column
@@ -278,7 +277,7 @@ def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -
         and (not isinstance(column, (int, float, np.number)) or column % 1)
     ]
     if odd:
-        problems.append(f"{option(what)} names columns by name or number, got {odd[0]!r}")
+        problems.append(f"{option(what)} takes columns by name or number, got {odd[0]!r}")
         return []
     problems += unknown([column for column in given if isinstance(column, str)], names, f"column in {option(what)}:")
     numbers = [names.index(column) if column in names else column for column in given]
@@ -301,24 +300,24 @@ def _targets(
     names: Sequence[str],
     problems: list[str],
 ) -> list[int]:
-    """State columns that absolute actions are the targets of."""
+    """Returns the target columns of absolute actions."""
     number = kinds.count("absolute")
     if not number:
         if given is not None:
-            problems.append(f"{option('targets')} are for {option('action_kind')} 'absolute'")
+            problems.append(f"{option('targets')} requires {option('action_kind')} 'absolute'")
         return []
     columns = list(own) if given is None else _columns(given, names, "targets", problems)
     if len(columns) != number:
-        what = "the robot's columns are" if given is None else "targets are"
+        what = "columns of the robot" if given is None else "targets"
         problems.append(
-            f"absolute actions are {number}, {what} {len(columns)}: name in {option('targets')} the column that each"
-            f" is the target of (known: {', '.join(names)}); an action that is the target of none is 'raw'"
+            f"absolute actions: {number}, {what}: {len(columns)}; name in {option('targets')} the column that each"
+            f" action is a target for (known: {', '.join(names)}); an action without such a column is 'raw'"
         )
     return columns
 
 
 def _origin(rows: np.ndarray, names: Sequence[str], kind: str, problems: list[str]) -> np.ndarray:
-    """The middle of every column of ``[N, d]`` of which float32 would keep too few digits, 0 of any other."""
+    """Returns the middle of every column of ``[N, d]`` that float32 resolves too coarsely, 0 for the others."""
     known = rows[np.isfinite(rows).all(-1)]
     if not len(known):
         return np.zeros(rows.shape[1])
@@ -327,8 +326,8 @@ def _origin(rows: np.ndarray, names: Sequence[str], kind: str, problems: list[st
     moves = high > low
     lost = (top > _LARGEST) | (moves & ((span < _SMALLEST) | (np.spacing(top) > _COARSE * span)))
     problems += [
-        f"{kind} column {names[column]!r} lies in {low[column]:.3g} to {high[column]:.3g}, which numbers of"
-        f" {'float64' if top[column] > 1 else 'float32'} hold too coarsely: change its unit, or subtract an offset"
+        f"{kind} column {names[column]!r} lies in {low[column]:.3g} to {high[column]:.3g}, which"
+        f" {'float64' if top[column] > 1 else 'float32'} resolves too coarsely: change its unit, or subtract an offset"
         for column in np.flatnonzero(lost)
     ]
     kept = np.spacing(np.minimum(top, _LARGEST).astype(np.float32))

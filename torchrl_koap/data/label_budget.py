@@ -1,9 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Label budgets: which steps keep their action label, how many these are, and which trajectories are used.
+"""Label budgets: which steps keep their action label, and which trajectories are used.
 
-Labels outside the budget become NaN, so code that reads them by mistake produces NaN losses. The observation of some
-tasks repeats the last command. Its differences are the actions, so those columns become NaN too
-(:func:`hide_commands`).
+Labels outside the budget become NaN, so code that reads them by mistake produces NaN losses. Some tasks observe the
+last command. Its differences are the actions, so those columns become NaN too (:func:`hide_commands`).
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ Unit = Literal["trajectory", "window", "transition"]
 
 @dataclass(frozen=True)
 class LabelReport:
-    """What a label budget spent."""
+    """Counts of what a label budget selected."""
 
-    unit: str  # what was drawn
+    unit: str  # of the draw
     selected_units: int
     total_units: int
     labelled_transitions: int  # distinct transitions that keep their action
@@ -39,9 +38,9 @@ class LabelReport:
     trajectories_touched: int  # with at least one label
     total_trajectories: int
     seed: int  # of the draw
-    available_units: int  # with a label in the data as they came: those that could be drawn
-    available_transitions: int  # with a label in the data as they came
-    commands_told: int = 0  # labelled transitions whose command is blank in the observation, and told nevertheless
+    available_units: int  # with a label in the input data, so they could be drawn
+    available_transitions: int  # with a label in the input data
+    commands_told: int = 0  # labelled transitions whose command is NaN in the observation, but kept beside the label
 
     def __str__(self) -> str:
         share, units = self.labelled_transitions / self.total_transitions, plural_of(self.unit)
@@ -59,21 +58,21 @@ class LabelReport:
 class LabelBudget:
     """Keeps the labels of a few trajectories, windows or single transitions, and hides all others.
 
-    The draw depends on the seed alone. With the same seed a larger budget contains every smaller one.
+    The draw depends only on the seed. With the same seed a larger budget contains every smaller one.
 
-    Units without a label are passed over, units with some keep those they have. Fractions are of all units, labelled
-    or not, but for ``1.0``, which draws every unit that has a label.
+    Units without any label are skipped; partly labelled units keep their labels. Fractions refer to all units, labelled
+    or not, except ``1.0``, which draws every unit that has a label.
 
     * ``"trajectory"``: whole demonstrations, as robots record them.
     * ``"window"``: the unit of the first public code. Windows of 16 steps are drawn without replacement from all
-      trajectories, and of each the 14 inner frames keep their label.
+      trajectories; the 14 inner frames of each keep their label.
     * ``"transition"``: single steps.
 
     Args:
-        fraction (float, optional): share of the units in (0, 1], rounded half up to whole ones.
-        count (int, optional): number of units instead.
+        fraction (float, optional): share of the units in (0, 1], rounded half up to a whole number.
+        count (int, optional): number of units.
         episodes (iterable of int, optional): these trajectories instead of a draw, such as those that ``koap suggest``
-            names. Default where none of the three is given: every label that there is.
+            names. If none of the three is given, all labels are kept.
         unit (str): ``"trajectory"``, ``"window"`` or ``"transition"``.
         seed (int): seed of the draw.
 
@@ -122,25 +121,25 @@ class LabelBudget:
         Args:
             data (TensorDictBase): flat data ``[N]``; not changed. Without ``has_action``, actions that are NaN
                 throughout are taken to be missing (:func:`mark_labels`).
-            command (slice, optional): columns of the observation that repeat the command, for :func:`hide_commands`.
-            tell_commands (bool): a label tells the command that its action changes, too: labelled steps keep it in
-                ``label_command``. Of hidden actions nothing but the sum of those between two labels follows from it.
+            command (slice, optional): observation columns that repeat the command, for :func:`hide_commands`.
+            tell_commands (bool): labelled steps keep the command that their action changes in ``label_command``. About
+                hidden actions this reveals only their sum between two labels.
 
         Returns:
-            tuple: a copy of the data within the budget, and what was spent.
+            tuple: a copy of the data within the budget, and the :class:`LabelReport`.
 
         Raises:
-            ValueError: if there is no label at all, if the budget selects nothing, or more than there is.
+            ValueError: if there are no labels, or the budget selects none or more than there are.
         """
         data = data if keys.HAS_ACTION in data.keys() else mark_labels(data)
         keys.validate(data, command=command)
         available = data.get(keys.HAS_ACTION).squeeze(-1).cpu().numpy()
         if not available.any():
-            raise ValueError(f"none of the {len(available)} steps has an action: there are no labels to spend")
+            raise ValueError(f"none of the {len(available)} steps has an action: there are no labels to select")
         lengths = trajectory_lengths(data).cpu().numpy()
         starts = np.cumsum(lengths) - lengths
         first, end = self._units(starts, lengths)
-        before = np.concatenate([[0], available.cumsum()])  # labels ahead of every step
+        before = np.concatenate([[0], available.cumsum()])  # number of labels before every step
         usable = before[end] > before[first]
         if self.episodes is None:
             order = np.random.default_rng(self.seed).permutation(len(first))
@@ -148,8 +147,8 @@ class LabelBudget:
         else:
             chosen = _positions(data.get(keys.EPISODE).cpu().numpy()[starts], usable, tuple(self.episodes))
         kept = np.zeros_like(available)
-        for begin, behind in zip(first[chosen], end[chosen], strict=True):
-            kept[begin:behind] = available[begin:behind]
+        for begin, stop in zip(first[chosen], end[chosen], strict=True):
+            kept[begin:stop] = available[begin:stop]
 
         has_action = torch.from_numpy(kept).to(data.get(keys.ACTION).device).unsqueeze(-1)
         labelled, told = data.clone().set(keys.HAS_ACTION, has_action), 0
@@ -179,7 +178,7 @@ class LabelBudget:
         return labelled, report
 
     def _units(self, starts: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The steps of every unit whose labels it shows: the first, and the one behind the last, int ``[units]``."""
+        """Returns the first step whose label each unit keeps, and the end (exclusive), both int ``[units]``."""
         if self.unit == "trajectory":
             return starts, starts + lengths
         if self.unit == "transition":
@@ -192,7 +191,7 @@ class LabelBudget:
         return windows + HISTORY - 1, windows + WINDOW - 1
 
     def _number_of(self, total: int, usable: int) -> int:
-        """Units to draw, of ``total`` of which ``usable`` have a label."""
+        """Returns how many units to draw from ``total``, of which ``usable`` have a label."""
         plural = plural_of(self.unit)
         if self.count is not None:
             if self.count > usable:
@@ -201,7 +200,7 @@ class LabelBudget:
             return int(self.count)
         if self.fraction is None or self.fraction == 1:
             return usable
-        # in decimals, so that 0.145 of 100 is 14.5 and not 14.499999999999998
+        # decimal arithmetic: 0.145 of 100 is 14.5, not 14.499999999999998
         number = int((Decimal(repr(float(self.fraction))) * total).to_integral_value(ROUND_HALF_UP))
         if number == 0:
             least = Context(prec=4, rounding=ROUND_CEILING).divide(Decimal("0.5"), Decimal(total))
@@ -212,7 +211,7 @@ class LabelBudget:
         if number > usable:
             raise ValueError(
                 f"a label fraction of {self.fraction} is {number} of {total} {plural}, but only {usable} have a label"
-                f" ({usable / total:.4g}); 1.0 keeps every label there is"
+                f" ({usable / total:.4g}); 1.0 keeps all labels"
             )
         return number
 
@@ -222,21 +221,21 @@ def _is(value: object, kind: type) -> bool:
 
 
 def _positions(present: np.ndarray, usable: np.ndarray, wanted: tuple[int, ...]) -> np.ndarray:
-    """Where the trajectories of some numbers lie."""
+    """Returns the positions of the trajectories with the ``wanted`` numbers."""
     absent = sorted(set(wanted) - set(present.tolist()))
     if absent:
         raise ValueError(f"there are no episodes {absent} to label; the data have {present.min()} to {present.max()}")
-    bare = sorted(set(wanted) - set(present[usable].tolist()))
-    if bare:
-        raise ValueError(f"episodes {bare} are to be labelled, but the data hold no action of them")
+    unlabelled = sorted(set(wanted) - set(present[usable].tolist()))
+    if unlabelled:
+        raise ValueError(f"episodes {unlabelled} are to be labelled, but the data hold no actions for them")
     return np.flatnonzero(np.isin(present, wanted))
 
 
 def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
-    """Blanks the command columns of every trajectory that has a hidden action, in a copy of flat data ``[N]``.
+    """Sets the command columns of every trajectory with a hidden action to NaN, in a copy of flat data ``[N]``.
 
-    The difference of two commands is the sum of the actions between them, so only trajectories whose actions are all
-    labelled keep theirs. NaN stand in ``observation`` and ``("next", "observation")``; ``state`` never holds commands.
+    The difference of two commands is the sum of the actions between them, so only fully labelled trajectories keep
+    theirs. Changes ``observation`` and ``("next", "observation")``; ``state`` never holds commands.
     """
     episode = data.get(keys.EPISODE)
     rows = torch.isin(episode, episode[~data.get(keys.HAS_ACTION).squeeze(-1)])
@@ -251,14 +250,14 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
 def subsample_trajectories(data: TensorDictBase, fraction: float) -> TensorDictBase:
     """Drops whole trajectories without a label until a share of all trajectories is left.
 
-    Trajectories with a label always stay; a smaller share is part of every larger one. Data ``[N]`` have the label
-    budget applied; what is left keeps its order.
+    Trajectories with a label always stay; a larger share contains every smaller one. Apply the label budget to the data
+    ``[N]`` first. The order of the trajectories stays.
 
     Raises:
         ValueError: if the share is outside (0, 1], or smaller than that of the trajectories with labels.
     """
     if not 0 < fraction <= 1:
-        raise ValueError(f"the share of the trajectories that are used must be in (0, 1], got {fraction}")
+        raise ValueError(f"the share of trajectories to use must be in (0, 1], got {fraction}")
     episodes = data.get(keys.EPISODE).unique_consecutive()
     number = math.floor(fraction * len(episodes) + 0.5)
     labelled = torch.isin(episodes, labelled_episodes(data)).cpu()
@@ -275,5 +274,5 @@ def subsample_trajectories(data: TensorDictBase, fraction: float) -> TensorDictB
 
 
 def plural_of(unit: str) -> str:
-    """What labels are counted in, in words; "" is any unit."""
+    """Returns the plural of a unit of labels; "" stands for any unit."""
     return {"trajectory": "trajectories", "": "labels"}.get(unit, f"{unit}s")

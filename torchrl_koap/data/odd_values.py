@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Numbers that are unlikely in a column: leaps, marks of what is missing, other units, signs of quaternions, turns."""
+"""Warns of unlikely numbers in columns: leaps, marks of missing values, other units, quaternion signs, angle turns."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds, quaternion_starts, sign_flips
 from torchrl_koap.files import some
 
-AWAY, OFTEN = 10.0, 3  # a mark lies that many ranges of the others away from them, and stands so often
-FILLS = 0.1  # share of its range that is the standard deviation of a counter that wraps, at least
+MARK_DISTANCE, MARK_COUNT = 10.0, 3  # a mark: this many ranges of the other values away, and at least this frequent
+FILLS = 0.1  # a wrapped counter's standard deviation is at least this share of its range
 OTHER = 20.0  # times as far as in most trajectories
-AFAR = 0.1  # share of trajectories without labels that differ from those with some
-LESS = 10.0  # times less far than with labels: sensor noise alone may still move
+AFAR = 0.1  # warn above this share of unlabelled trajectories that differ from the labelled ones
+LESS = 10.0  # at rest: this many times less motion than with labels, not none, because of sensor noise
 
 
 def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
     """Finds columns of ``[T_i, d]`` whose largest step is above 1/3 of their range and twenty times the usual one.
 
-    It says why, and what would mend them. :func:`quaternion_warnings` tells of quaternions that change their sign.
+    The warnings name a likely cause and a remedy. Sign changes of quaternions are left to :func:`quaternion_warnings`.
     """
     bound, usual = leap_bounds(trajectories)
     low, high, spread = (end(np.concatenate(trajectories), axis=0) for end in (np.min, np.max, np.std))
@@ -41,11 +41,11 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
         flipped = (np.abs(after + before) < UNUSUAL * usual) & (np.abs(after - before) > UNUSUAL * usual)
         ends = np.sort(frames[at : at + 2, column]) - [low[column], high[column]]
         reach = (high - low)[column]
-        wraps = bool((np.abs(ends) < 0.05 * reach).all()) and spread[column] > FILLS * reach  # else a spike
+        wraps = bool((np.abs(ends) < 0.05 * reach).all()) and spread[column] > FILLS * reach  # not a spike
         near = UNUSUAL * usual[column]
         start, end = (np.stack([path[step + late] for path, _, step in steps]) for late in (0, 1))
         if _turns_over(start, end, column):
-            why = "a rotation vector, which turns over at pi? give quaternions or 6-D rotations; do not unwrap it"
+            why = "a rotation vector, whose axis flips at pi? give quaternions or 6-D rotations; do not unwrap it"
         else:
             why = _cause(frames[at : at + 3, column], near, flipped.sum() > 1, leaping > 0.5, wraps)
         said = f"from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of {source}"
@@ -58,55 +58,53 @@ def _more(found: Sequence[object]) -> str:
 
 
 def _turns_over(before: np.ndarray, after: np.ndarray, column: int) -> bool:
-    """Whether three neighbouring columns are a rotation vector whose axis turns over at pi, by leaps ``[n, d]``."""
+    """Checks by leaps ``[n, d]`` whether three neighbouring columns are a rotation vector whose axis flips at pi."""
     for start in range(max(column - 2, 0), min(column, before.shape[1] - 3) + 1):
         vector, reached = before[:, start : start + 3], after[:, start : start + 3]
         length = np.linalg.norm(vector, axis=1, keepdims=True)
-        apart = reached - vector * (1 - 2 * np.pi / np.maximum(length, 1))
-        others = np.delete(reached - vector, column - start, axis=1)  # as if the column leapt alone
-        if (length <= 1.1 * np.pi).all() and 2 * np.abs(apart).sum() < np.abs(others).sum():
+        error = reached - vector * (1 - 2 * np.pi / np.maximum(length, 1))
+        others = np.delete(reached - vector, column - start, axis=1)  # the error if the column leapt alone
+        if (length <= 1.1 * np.pi).all() and 2 * np.abs(error).sum() < np.abs(others).sum():
             return True
     return False
 
 
 def _cause(values: np.ndarray, near: float, flipped: bool, most: bool, wraps: bool) -> str:
-    """Why a column leaps between the first two of three values, and what to do."""
+    """Returns a likely cause of a leap between the first two of three values, and the remedy."""
     leap = abs(values[1] - values[0])
     turn = next((turn for turn in (2 * np.pi, 360.0) if abs(leap - turn) < max(near, 0.1 * turn)), None)
     if turn is not None:
-        return f"angles that were wrapped by {turn:.3g}? np.unwrap them, or give their sine and cosine"
+        return f"angles wrapped by {turn:.3g}? np.unwrap them, or give their sine and cosine"
     if flipped and leap <= 2 + near:
-        return "a quaternion that changes its sign? flip it where its product with the frame before is negative"
+        return "a quaternion that changes sign? negate it where its dot product with the previous frame is negative"
     if len(values) > 2 and abs(values[2] - values[0]) < near:
         return "a measurement that failed for a frame? fill it from its neighbours"
     if most:
-        return (
-            "two episodes in one trajectory? part them, or say where they end (a column 'episode_index' or 'timeouts')"
-        )
+        return "two episodes in one trajectory? split them, or mark their ends (a column 'episode_index' or 'timeouts')"
     if wraps:
-        return f"a count or an angle that was wrapped by {leap:.3g}? np.unwrap it with that period"
+        return f"a counter or an angle wrapped by {leap:.3g}? np.unwrap it with that period"
     return (
         "a switch, or a measurement that failed? fill it from its neighbours, or leave it out; range scans may leap;"
-        " where the robot was reset, say that an episode ends (a column 'episode_index' or 'timeouts')"
+        " where the robot was reset, mark the end of an episode (a column 'episode_index' or 'timeouts')"
     )
 
 
 def quaternion_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
-    """Finds four neighbouring columns of length 1 whose sign changes, also from one trajectory to another."""
+    """Finds quaternions, four neighbouring columns of norm 1, whose sign changes in or between trajectories."""
     for start in quaternion_starts(trajectories):
         turns = [frames[:, start : start + 4] for frames in trajectories]
         flips = sum(int(sign_flips(turn, [0])[:, 0].sum()) for turn in turns)
         opposite = sum(bool(np.linalg.norm(turn[0] + turns[0][0]) < 0.5) for turn in turns)
         if flips or opposite:
             yield (
-                f"columns {', '.join(names[start : start + 4])} are a quaternion that changes its sign in {flips}"
-                f" frames, and in {opposite} trajectories against that of the first: flip it where its product with the"
-                " frame before is negative, in first frames that with the first of all; do the same on the robot"
+                f"columns {', '.join(names[start : start + 4])} are a quaternion that changes sign in {flips} frames;"
+                f" {opposite} trajectories start with the other sign than the first: negate it where its dot product"
+                " with the previous frame (in first frames: with the first of all) is negative, also on the robot"
             )
 
 
 def turn_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
-    """Finds columns near one angle in some trajectories and near the same one, a turn farther, in all others."""
+    """Finds angles that some trajectories record a full turn above all others."""
     if len(trajectories) < 2:
         return
     low, high = (np.stack([end(frames, axis=0) for frames in trajectories]) for end in (np.min, np.max))
@@ -120,24 +118,24 @@ def turn_warnings(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> I
             if gap[at] > turn / 2 and abs(apart - turn) < turn / 8:
                 yield (
                     f"column {name!r} lies within {bottom[0]:.3g} to {top[at]:.3g} in {at + 1} trajectories and about"
-                    f" {turn:.3g} above in all others: the same angle? add {turn:.3g} where it is below, also on the"
+                    f" {turn:.3g} higher in all others: the same angle? add {turn:.3g} to the lower ones, also on the"
                     " robot, or give sine and cosine"
                 )
 
 
 def mark_warnings(rows: np.ndarray, names: Sequence[str], kind: str) -> Iterator[str]:
-    """Finds numbers of ``[N, d]`` that come again and again, far from all others: marks of what is missing.
+    """Finds numbers of ``[N, d]`` that repeat far from all others: marks of missing values.
 
     ``kind`` is ``"column"`` or ``"action"``.
     """
     for name, values in zip(names, rows.T, strict=True):
         levels, counts = np.unique(values, return_counts=True)
         for mark, others in ((0, levels[1:]), (-1, levels[:-1])):
-            far = len(others) > OFTEN and np.abs(others - levels[mark]).min() > AWAY * np.ptp(others)
-            if far and counts[mark] >= OFTEN:
+            far = len(others) > MARK_COUNT and np.abs(others - levels[mark]).min() > MARK_DISTANCE * np.ptp(others)
+            if far and counts[mark] >= MARK_COUNT:
                 yield (
                     f"{kind} {name!r} is {levels[mark]:g} in {counts[mark]} of {len(values)} rows and within"
-                    f" {others[0]:.3g} to {others[-1]:.3g} in all others: a mark of what is missing? "
+                    f" {others[0]:.3g} to {others[-1]:.3g} in all others: a mark of missing values? "
                     + ("make it NaN" if kind == "action" else "fill it, or leave these frames out")
                 )
 
@@ -147,7 +145,7 @@ def scale_warnings(
 ) -> Iterator[str]:
     """Finds trajectories in which a column reaches twenty times as far as in three quarters of the others.
 
-    Also found are those in which most columns move, but less than a twentieth as far as in half of the others.
+    Also finds those in which most columns move, but less than a twentieth as far as in half of the others.
     """
     known = [(name, rows) for name, rows in zip(called, trajectories, strict=True) if len(rows)]
     if len(known) < 3:
@@ -192,19 +190,19 @@ def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: 
             found += [f"{steps[step, column]:.3g} in label {step} of {source}" for step in at]
         if found:
             yield (
-                f"action {name!r} is {found[0]}{_more(found)} and far from that before and behind: the difference of"
-                " wrapped angles, or a command that was not logged? mend it, or make it NaN"
+                f"action {name!r} is {found[0]}{_more(found)} and far from that in the labels before and after: a"
+                " difference of wrapped angles, or a command that was not logged? correct it, or make it NaN"
             )
 
 
 def unlabelled_warnings(
     trajectories: Sequence[np.ndarray], known: Sequence[bool], called: Sequence[str], names: Sequence[str]
 ) -> Iterator[str]:
-    """Finds columns of ``[T_i, d]`` where one in ten of those without labels is mostly where no labelled one is.
+    """Finds columns of ``[T_i, d]`` in which over a tenth of the unlabelled trajectories differ from the labelled ones.
 
-    The range of the labelled ones is widened by half of it on both sides. Also found are columns that all labelled ones
-    move, and one in ten of the others at most a tenth as far, two or more of them together. ``known`` says which ones
-    have labels.
+    They differ if most frames lie outside the labelled range, widened by half of it on both sides. They also differ if
+    two or more columns that move in all labelled trajectories move at most a tenth as far. ``known`` says which
+    trajectories have labels.
     """
     labelled, others = (
         [frames for frames, one in zip(trajectories, known, strict=True) if one == has] for has in (True, False)
@@ -219,7 +217,7 @@ def unlabelled_warnings(
     least = np.median(with_labels, axis=0) / LESS
     rests = (without < least) & (with_labels > least).all(0)
     rests &= rests.sum(1, keepdims=True) > 1  # one alone may have its goal near
-    unknown = [name for name, one in zip(called, known, strict=True) if not one]
+    unlabelled = [name for name, one in zip(called, known, strict=True) if not one]
     for odd, said, why in (
         (
             out,
@@ -229,12 +227,12 @@ def unlabelled_warnings(
         (
             rests,
             "move less than a tenth as far as in labelled trajectories",
-            "another unit, or sensors that were off? bring them to one unit; leave recordings out, not the columns",
+            "another unit, or sensors that were off? convert to one unit, or leave out these recordings, not columns",
         ),
     ):
         found = np.flatnonzero(odd.mean(0) > AFAR)
         if len(found):
-            where = [unknown[index] for index in np.flatnonzero(odd[:, found].any(1))]
+            where = [unlabelled[index] for index in np.flatnonzero(odd[:, found].any(1))]
             yield (
                 f"columns {some([repr(names[column]) for column in found])} {said} in {len(where)} of {len(others)}"
                 f" without labels ({some(where)}): {why}"

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Warnings about demonstrations that are valid but unlikely; cuts of still ends and short trajectories."""
+"""Warns of valid but unlikely demonstrations; cuts still ends and drops short trajectories."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.files import DataError, option, some
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
-FARTHEST = 100.0  # m, or rad: no robot on a table gets there
-STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
-APART = 50.0  # times as far as a fifth of the columns: errors that are measured together hardly show those
-ROUNDING = 1e-5  # share of the farthest column's way below which a column rests
-NOISE = 8.0  # standard deviations of the noise at an end of the recordings, within which a robot stands still too
-CANCELS = 0.25  # of the mean square step, that much is the product of neighbours: 0.5 of noise, 0 of a random walk
+FARTHEST = 100.0  # m or rad: no tabletop robot reaches this
+STILL, MUCH = 2e-3, 0.2  # still: within this share of the range; warn above this share of still frames
+APART = 50.0  # warn if a column moves this many times as far as a fifth of them: joint errors hide those
+ROUNDING = 1e-5  # a column that moves less than this share of the farthest one rests
+NOISE = 8.0  # still as well: within this many standard deviations of the noise at that end of the recordings
+CANCELS = 0.25  # noise: -(product of neighbouring steps) / square step above this; 0.5 for noise, 0 for a random walk
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
-AS_FAR = 0.5  # of the mean square distance between any two frames
-LOOKED_AT = 20_000  # windows, of which motions that repeat are told
-SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
+AS_FAR = 0.5  # of the mean square distance between any two frames: motions repeat above this
+LOOKED_AT = 20_000  # windows to check for repeating motions
+SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: warn below, suggest a rate that reaches this
 
 
 def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -> list[str]:
-    """Finds what is unlikely in demonstrations, flat data ``[N]`` with ``state``, a sentence each.
+    """Returns a sentence for each unlikely property of demonstrations, flat data ``[N]`` with ``state``.
 
-    Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, are in another
-    unit, reach a place beyond 100 m or rad, or lie far from all labelled ones or move much less; state columns that
-    never change, equal another one, leap, hold marks of what is missing, are clocks, quaternions that change their sign
-    or angles a turn apart, or have no unit and move much farther than others; frames at both ends in which nothing
-    moves; actions of another kind than declared, that come late, never change, leap for one frame or hold marks; a
-    command that no action follows; labels that stand alone; an unlikely rate; plans that are short against the motion.
+    * Trajectories: repeat another one, never move, are shorter than a window, have only zero labels or another unit,
+      reach beyond 100 m or rad, lie far from all labelled ones or move much less than these.
+    * State columns: constant, equal to another one, leaping, with marks of missing values, clocks, quaternions that
+      change sign, angles a turn apart, or without unit and moving much farther than others; still frames at both ends.
+    * Actions: another kind than declared, late, constant, leaping for one frame, or with marks of missing values.
+    * A command that no action follows; isolated labels; an unlikely rate; plans that are short against the motion.
 
-    ``names`` are what to call each trajectory, such as its file. Default: their numbers.
+    ``names`` labels each trajectory, for example by its file. Default: their numbers.
     """
     lengths = trajectory_lengths(data).tolist()
     called = [*names, *(f"trajectory {index}" for index in range(len(names), len(lengths)))]
@@ -78,7 +78,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *scale_warnings(frames, called, task.state_names, "column"),
         *_without_units(frames, task),
         *unlabelled_warnings(
-            [part[:, task.robot] for part in frames],  # few recordings show few goals
+            [part[:, task.robot] for part in frames],  # not the surroundings: a few labelled recordings show few goals
             [bool(part.any()) for part in known],
             called,
             [task.state_names[column] for column in task.robot],
@@ -90,7 +90,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *scale_warnings(labels, called, task.action_names, "action"),
         *_single_labels(known, called),
         *(
-            f"action {name!r} is {value:g} in all labels: controllers command that, method dp something near it"
+            f"action {name!r} is {value:g} in all labels: controllers command this value, method dp a value near it"
             for name, value in constants
             if value is not None
         ),
@@ -103,13 +103,13 @@ def _trajectory_warnings(
 ) -> Iterator[str]:
     first: dict[bytes, str] = {}
     names, units = task.observation_names, task.known_units
-    looked_at = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
+    checked = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
     read = (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)
     parts = [data.get(key).split(lengths) for key in read]
     for name, observed, steps, has_action, last in zip(called, *parts, strict=True):
-        same = first.setdefault(_digest(observed, last[-1:]), name)  # one with labels may lie beside one without
+        same = first.setdefault(_digest(observed, last[-1:]), name)  # states only: labels may differ
         if same is not name:
-            yield f"{name} repeats {same}: every state is the same; leave out the one with fewer labels"
+            yield f"{name} repeats {same}: all states are equal; leave out the one with fewer labels"
             continue
         labelled = steps[has_action.squeeze(-1)]
         if len(labelled) and not labelled.any():
@@ -117,7 +117,7 @@ def _trajectory_warnings(
         if bool((observed == observed[:1]).all()) and bool((last == observed[:1]).all()):
             yield f"{name}: nothing moves in its {len(observed)} steps"
         farthest = observed.abs().amax(0)
-        far = next((column for column in looked_at if farthest[column] > FARTHEST), None)
+        far = next((column for column in checked if farthest[column] > FARTHEST), None)
         if far is not None:
             yield f"{name}: {names[far]} reaches {farthest[far]:.3g} {units[far]}"
 
@@ -127,7 +127,7 @@ def _short(lengths: Sequence[int], called: Sequence[str]) -> Iterator[str]:
     if short:
         yield (
             f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
-            f" refuse them: {some(short)}; leave them out of the lists, or with `koap convert --drop-short`"
+            f" refuse them: {some(short)}; remove them, in Python or with `koap convert --drop-short`"
         )
 
 
@@ -135,39 +135,39 @@ def _column_warnings(state: Tensor, names: Sequence[str]) -> Iterator[str]:
     first: dict[bytes, str] = {}
     for name, values in zip(names, state.unbind(-1), strict=True):
         if bool((values == values[:1]).all()):
-            yield f"column {name!r} is {values[0]:g} in all {len(values)} steps: it says nothing"
+            yield f"column {name!r} is {values[0]:g} in all {len(values)} steps: it carries no information"
         elif (same := first.setdefault(_digest(values), name)) is not name:
             yield f"columns {same!r} and {name!r} are the same in every step"
 
 
 def _without_units(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
     moved = np.median([np.ptp(frames, axis=0) for frames in trajectories], axis=0)
-    alike = sorted((column for column, unit in enumerate(task.state_units) if not unit), key=moved.__getitem__)
-    rising = [column for column in alike if moved[column] > ROUNDING * moved[alike[-1]]]
-    if not rising:
+    unitless = sorted((column for column, unit in enumerate(task.state_units) if not unit), key=moved.__getitem__)
+    moving = [column for column in unitless if moved[column] > ROUNDING * moved[unitless[-1]]]
+    if not moving:
         return
-    most, little = rising[-1], rising[: max(len(rising) // 5, 1)]
+    most, little = moving[-1], moving[: max(len(moving) // 5, 1)]
     if moved[most] > APART * moved[little[-1]]:
         yield (
             f"columns without a unit: {task.state_names[most]!r} moves {moved[most]:.3g} in a trajectory,"
             f" {some([repr(task.state_names[column]) for column in little])} at most {moved[little[-1]]:.3g}:"
-            f" errors of plans hardly show those; if their units differ, give {option('state_units')}"
+            f" plan errors hardly reflect the latter; if units differ, give {option('state_units')}"
         )
 
 
 def _clocks(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
     moving = np.flatnonzero(np.ptp(np.concatenate(trajectories), axis=0))
     even = [column for column in moving if rises_evenly([frames[:, column] for frames in trajectories], room=JITTER)]
-    if len(even) < len(moving):  # else it is how all move
+    if len(even) < len(moving):  # if all columns rise evenly, this is the motion itself
         for column in even:
-            said = "rises by much the same amount in every frame: a clock is no state, leave it out"
+            said = "rises by nearly the same amount in every frame: it looks like a clock; leave it out"
             yield f"column {task.state_names[column]!r} {said}"
     if not SLOWEST <= task.control_hz <= FASTEST:
         yield f"control_hz is {task.control_hz:g}: frames per second, not seconds per frame?"
 
 
 def _single_labels(known: Sequence[Tensor], called: Sequence[str]) -> Iterator[str]:
-    """Trajectories in which most labels stand alone."""
+    """Finds trajectories in which most labels are isolated."""
     few = []
     for name, labelled in zip(called, known, strict=True):
         alone = labelled[1:-1] & ~labelled[:-2] & ~labelled[2:]
@@ -175,16 +175,16 @@ def _single_labels(known: Sequence[Tensor], called: Sequence[str]) -> Iterator[s
             few.append(f"{name} ({int(labelled.sum())} of {len(labelled)} steps)")
     if few:
         yield (
-            f"labels stand alone in {len(few)} trajectories: {some(few)}; if actions are logged only where they change,"
-            " repeat the last one"
+            f"most labels are isolated in {len(few)} trajectories: {some(few)}; if actions are logged only when they"
+            " change, repeat the last one"
         )
 
 
 def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
-    """Frames at both ends of trajectories ``[T_i, d]`` in which no column moves, int ``[n, 2]``.
+    """Counts the frames at both ends of trajectories ``[T_i, d]`` in which no column moves, int ``[n, 2]``.
 
-    Sensor noise is no movement. The last still frame before the movement and the first one behind it are not counted.
-    A trajectory in which nothing ever moves has none.
+    Sensor noise is not movement. The still frames next to the movement are not counted. A trajectory in which nothing
+    ever moves has none.
     """
     least = STILL * np.ptp(np.concatenate(trajectories), axis=0)
     found = np.zeros((len(trajectories), 2), dtype=int)
@@ -197,7 +197,7 @@ def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _noise(parts: Sequence[np.ndarray]) -> np.ndarray | float:
-    """Standard deviation ``[d]`` of independent noise, whose neighbouring steps cancel; 0 where most parts move."""
+    """Estimates the deviation ``[d]`` of independent noise by neighbouring steps; 0 where most parts move."""
     steps = [np.diff(part, axis=0) for part in parts if len(part) == WINDOW]
     if not steps:
         return 0.0
@@ -219,7 +219,7 @@ def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> Ite
 
 
 def trim_still(recordings: Recordings) -> Recordings:
-    """Cuts the frames at both ends of trajectories in which nothing moves; ``skipped`` counts them."""
+    """Cuts the still frames at both ends of trajectories; ``skipped`` counts them."""
     ends = still_ends(recordings.states)
     spans = [
         (number, ends[number, 0], len(frames) - ends[number, 1]) for number, frames in enumerate(recordings.states)
@@ -228,7 +228,7 @@ def trim_still(recordings: Recordings) -> Recordings:
 
 
 def drop_short(recordings: Recordings) -> Recordings:
-    """Leaves out trajectories with fewer steps than a window; ``skipped`` names them."""
+    """Drops trajectories with fewer steps than a window; ``skipped`` names them."""
     lengths = list(map(len, recordings.states))
     spans = [(number, 0, length) for number, length in enumerate(lengths) if length > WINDOW]
     if not spans:
@@ -238,10 +238,10 @@ def drop_short(recordings: Recordings) -> Recordings:
 
 
 def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | None]:
-    """Says how long a plan and the demonstrations of flat data ``[N]`` last at ``control_hz``.
+    """Describes how long a plan and the demonstrations of flat data ``[N]`` last at ``control_hz``.
 
-    Second stands a warning where a plan is short against the motion, else None. Motions that repeat within a plan, such
-    as a gait, may go on as long as they like.
+    The second value is a warning if a plan is short against the motion, else None. Motions that repeat within a plan,
+    such as a gait, may have any length.
     """
     frames = float(trajectory_lengths(data).double().median())
     covers = f"{HORIZON} frames, {1e3 * HORIZON / control_hz:.4g} ms"
@@ -256,23 +256,23 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
 
 
 def _repeats(data: TensorDictBase) -> bool:
-    """Whether most columns move as far in a plan as between any two frames, as in a gait: its length says nothing."""
+    """Checks whether most columns move as far within a plan as between any two frames, as in a gait."""
     observed, episode = data.get(keys.OBSERVATION), data.get(keys.EPISODE)
-    varies = observed.double().var(0)
+    variance = observed.double().var(0)
     now = spread_evenly((episode[:-HORIZON] == episode[HORIZON:]).nonzero().squeeze(-1), LOOKED_AT)
     moved = [observed[now + ahead].double() - observed[now] for ahead in (HORIZON // 2, HORIZON)]
-    share = torch.stack([steps.square().mean(0) for steps in moved]).amax(0) / (2 * varies)
-    return bool(share[varies > 0].nanmedian() > AS_FAR)
+    share = torch.stack([steps.square().mean(0) for steps in moved]).amax(0) / (2 * variance)
+    return bool(share[variance > 0].nanmedian() > AS_FAR)
 
 
 def goal_columns(recordings: Recordings) -> list[str]:
-    """Names state columns that are constant in each trajectory and differ between them: goals, or what was varied."""
+    """Names state columns that are constant in each trajectory and differ between them: goals, or varied conditions."""
     differ = np.ptp([frames[0] for frames in recordings.states], axis=0) > 0
     return [name for name, goal in zip(recordings.state_names, ~recordings.moving & differ, strict=True) if goal]
 
 
 def constant_columns(actions: np.ndarray) -> list[float | None]:
-    """Returns the constant value of each column of actions ``[N, act]``; None if it varies or has one label at most."""
+    """Returns the constant value of each column of actions ``[N, act]``; None if it varies or has at most one label."""
     steps = actions[np.isfinite(actions).all(-1)]
     return [float(column[0]) if len(column) > 1 and np.ptp(column) == 0 else None for column in steps.T]
 

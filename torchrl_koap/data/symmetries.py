@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Symmetries of a scene as augmentations of windows: its pose on the table, and the order of identical objects."""
+"""Augments windows by symmetries of the scene: its pose on the table, and the order of identical objects."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torchrl_koap.keys import ACTION, STATE
 
 
 class RandomPlanarTransform(TensorDictModuleBase):
-    """Random planar transform: moves and turns the whole scene, tool and objects together, about a vertical axis.
+    """Random planar transform: shifts the whole scene, tool and objects together, and turns it about a vertical axis.
 
-    How a tool pushes an object does not depend on where on the table that happens.
+    How a tool pushes an object does not depend on the place on the table.
 
     Args:
         points (sequence): state columns ``(x, y)`` of every position.
@@ -23,14 +23,14 @@ class RandomPlanarTransform(TensorDictModuleBase):
 
     Keyword Args:
         shift (float): standard deviation of the displacement (m). Defaults to ``0.05``.
-        turn (float): standard deviation of the angle (rad); the scene turns about the first point of the last frame
-            observed. Defaults to ``0.3``.
+        turn (float): standard deviation of the angle (rad). The centre is the first point in the last observed frame.
+            Defaults to ``0.3``.
         turned_actions (sequence of int, optional): action columns ``(x, y)`` of a displacement, turned with the scene.
         history (int): observed frames of the window. Defaults to ``2``.
-        state_key, action_key (NestedKey): of the windows. Default: ``"state"``, ``"action"``.
+        state_key, action_key (NestedKey): keys in the windows. Default: ``"state"``, ``"action"``.
 
     Raises:
-        ValueError: for a negative shift or turn.
+        ValueError: if ``shift`` or ``turn`` is negative.
 
     Examples:
         >>> import torch
@@ -64,12 +64,12 @@ class RandomPlanarTransform(TensorDictModuleBase):
         self.shift, self.turn, self.history = shift, turn, history
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replaces the windows by moved ones."""
+        """Replaces the windows by transformed ones."""
         state = tensordict.get(self.in_keys[0])
         kind = {"dtype": state.dtype, "device": state.device}
         angle = self.turn * torch.randn(state.shape[:-2], **kind)
         cosine, sine = angle.cos(), angle.sin()
-        turn = torch.stack([torch.stack([cosine, sine], -1), torch.stack([-sine, cosine], -1)], -2)  # rows are turned
+        turn = torch.stack([torch.stack([cosine, sine], -1), torch.stack([-sine, cosine], -1)], -2)  # for row vectors
         centre = state[..., self.history - 1 : self.history, self.points[0]]
         shift = self.shift * torch.randn(*state.shape[:-2], 1, 2, **kind)
         moved = state.clone()
@@ -85,13 +85,13 @@ class RandomPlanarTransform(TensorDictModuleBase):
 
 
 class ObjectPermutation(TensorDictModuleBase):
-    """Random permutation of interchangeable objects: which of two red boxes is called the first does not matter.
+    """Random permutation of interchangeable objects, such as two red boxes.
 
     Args:
-        groups (sequence): for each kind of object the state columns of each of its instances, all of the same number.
+        groups (sequence): for each kind of object, the state columns of each instance (equally many per instance).
 
     Keyword Args:
-        state_key (NestedKey): of the windows. Default: ``"state"``.
+        state_key (NestedKey): key in the windows. Default: ``"state"``.
 
     Examples:
         >>> import torch
@@ -109,7 +109,7 @@ class ObjectPermutation(TensorDictModuleBase):
         self.groups = [[list(columns) for columns in group] for group in groups]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replaces the windows by ones with exchanged columns."""
+        """Replaces the windows by ones with permuted columns."""
         state = tensordict.get(self.in_keys[0])
         index = torch.arange(state.shape[-1], device=state.device).expand(*state.shape[:-2], -1).clone()
         for group in self.groups:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A data set on disk: TED data as safetensors, and a description in JSON beside them.
+"""Reads and writes data sets on disk: TED data as safetensors, with a description in JSON.
 
 ::
 
@@ -7,7 +7,7 @@
       about.json           task, number of trajectories and steps, lengths, checksum, and the caller's notes
       steps.safetensors    the entries in the storage layout of ``torchrl_koap.keys``, nested ones as ``next/done``
 
-The folder is written aside and renamed.
+The folder is written under a temporary name, then renamed.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 
 FORMAT = 2
-CAMERAS = "cameras"  # folder of what frames are embedded by, beside a data set and in a run
+CAMERAS = "cameras"  # folder of the projections that embed camera frames, beside a data set and in a run
 _ABOUT, _STEPS = "about.json", "steps.safetensors"
 
 
 def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mapping[str, Any] | None = None) -> Path:
-    """Writes flat TED data into a folder; an earlier data set there is replaced in one step.
+    """Writes flat TED data into a folder; an earlier data set there is replaced atomically.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout.
         folder (str or Path): folder to create or replace.
-        task (Task): what the data are of. One that names no code is kept with them, any other one by its name.
-        notes (mapping, optional): anything JSON can hold that should be kept with the data.
+        task (Task): task of the data. Its definition is stored if it references no code, otherwise only its name.
+        notes (mapping, optional): further JSON values to store with the data.
 
     Returns:
         Path: the folder.
 
     Raises:
         DataError: if the data do not follow the storage layout.
-        TypeError: if an entry is no tensor.
+        TypeError: if an entry is not a tensor.
         FileExistsError: if the folder holds something other than a data set.
 
     Examples:
@@ -65,11 +65,11 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     folder = Path(folder)
     keys.validate(data, command=task.command_columns)
     entries = dict(data.flatten_keys("/").items())
-    strange = [name for name, value in entries.items() if not isinstance(value, torch.Tensor)]
-    if strange:
-        raise TypeError(f"only tensors can be saved, {strange} are none")
+    invalid = [name for name, value in entries.items() if not isinstance(value, torch.Tensor)]
+    if invalid:
+        raise TypeError(f"only tensors can be saved; entries {invalid} are not tensors")
     if folder.exists() and not (folder.is_dir() and ((folder / _ABOUT).is_file() or not any(folder.iterdir()))):
-        raise FileExistsError(f"{folder} exists and holds no data set; it is left as it is")
+        raise FileExistsError(f"{folder} exists and holds no data set; it was not changed")
     lengths = trajectory_lengths(data).tolist()
     about = {
         "format": FORMAT,
@@ -90,7 +90,7 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
 
 
 def stored_folder(folder: str | Path) -> Path | None:
-    """Where a folder holds a data set of this library: in ``ted`` inside it, or itself; None if nowhere."""
+    """Returns the folder of this library's data set: ``folder`` itself or ``ted`` in it; None if neither."""
     folder = Path(folder)
     if (folder / "ted").is_dir():
         return folder / "ted"
@@ -100,7 +100,7 @@ def stored_folder(folder: str | Path) -> Path | None:
 def read_about(folder: str | Path) -> dict[str, Any]:
     """Reads the description of a data set.
 
-    It has ``task``, ``definition`` (None of a task that is only named), ``trajectories``, ``steps``, ``lengths``,
+    It has ``task``, ``definition`` (None if only the name is stored), ``trajectories``, ``steps``, ``lengths``,
     ``labelled_steps``, ``notes``, and size and checksum of the steps.
 
     Raises:
@@ -117,12 +117,12 @@ def read_about(folder: str | Path) -> dict[str, Any]:
     kinds |= {"task": str, "sha256": str, "lengths": list}
     wrong = [name for name, kind in kinds.items() if not isinstance(about.get(name), kind)]
     if wrong:
-        raise DataError(path, f"it says nothing of {', '.join(wrong)}, or nothing that can be read")
+        raise DataError(path, f"missing or invalid: {', '.join(wrong)}")
     return about
 
 
 def source_names(folder: str | Path) -> list[str]:
-    """What each trajectory of a data set is from, such as its file; an empty list where it does not say."""
+    """Returns the source of each trajectory of a data set, such as its file; an empty list if none is stored."""
     stored = stored_folder(folder)
     return [] if stored is None else read_about(stored)["notes"].get("sources", [])
 
@@ -130,10 +130,10 @@ def source_names(folder: str | Path) -> list[str]:
 def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
     """Reads a data set that :func:`save_ted` wrote.
 
-    A task that names code to import is refused: a folder that somebody sent must not decide what is run.
+    A task that names code to import is refused: a received folder must not choose the code that runs.
 
     Returns:
-        tuple: flat data ``[N]``, and the task that they are of.
+        tuple: flat data ``[N]``, and their task.
 
     Raises:
         DataError: if files are missing, changed or damaged, or the task names code or is not registered.
@@ -147,11 +147,11 @@ def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
 
 
 def stored_task(folder: str | Path) -> Task:
-    """Reads the task of a data set: the one that it holds, or the registered one that it names.
+    """Reads the task of a data set: the stored definition, or the registered task of that name.
 
     Raises:
         DataError: if the folder holds no data set, or its task is damaged or names code.
-        ValueError: if nobody has registered the task that it names.
+        ValueError: if the named task is not registered.
     """
     about = read_about(folder)
     try:
@@ -161,11 +161,11 @@ def stored_task(folder: str | Path) -> Task:
 
 
 def read_steps(folder: str | Path) -> TensorDict:
-    """Reads the data of a data set ``[N]``, whatever their task, or says what is damaged."""
+    """Reads the data of a data set ``[N]`` without its task; raises a DataError if files are missing or damaged."""
     about, path = read_about(folder), Path(folder) / _STEPS
     try:
         if path.stat().st_size != about["bytes"] or sha256_of(path) != about["sha256"]:
-            raise DataError(path, "it was changed: its checksum is another one")
+            raise DataError(path, "it was changed: its size or checksum differs from about.json")
         return TensorDict(load_file(path), [about["steps"]]).unflatten_keys("/")
     except DataError:
         raise

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From separate trajectories to the flat storage layout, and the columns a policy may see."""
+"""Converts separate trajectories to the flat storage layout, and selects the columns a policy may see."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_koap import keys
 
-_VELOCITY = 3  # steps whose mean is the last velocity
+_VELOCITY = 3  # steps over which the last velocity is averaged
 
 
 def flatten_trajectories(
@@ -21,26 +21,26 @@ def flatten_trajectories(
     action_dim: int | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> TensorDict:
-    """Lays recorded trajectories one after the other in the storage layout.
+    """Concatenates recorded trajectories in the storage layout.
 
     ``T`` frames make ``T - 1`` steps: step ``t`` goes from frame ``t`` to frame ``t + 1``. The last step of every
-    trajectory is marked as terminated. Steps have a label where their action is given: ``None`` for a trajectory, or
-    NaN throughout a row, means that it is not.
+    trajectory is marked as terminated. A step has a label if its action is given. Missing actions are ``None`` for a
+    trajectory, or a row of NaN.
 
     Args:
-        observations (sequence of Tensor or array): for each trajectory its frames ``[T_i, obs]``.
-        actions (sequence of Tensor, array or None): for each trajectory its actions ``[T_i - 1, act]``, or None. None
-            instead of the sequence: no trajectory has any.
+        observations (sequence of Tensor or array): frames ``[T_i, obs]`` of each trajectory.
+        actions (sequence of Tensor, array or None): actions ``[T_i - 1, act]`` of each trajectory, or None. None
+            instead of the sequence: no trajectory has actions.
 
     Keyword Args:
-        action_dim (int, optional): size of an action; needed where no trajectory has one.
+        action_dim (int, optional): size of an action; required if no trajectory has actions.
         dtype (torch.dtype): floating type of the entries.
 
     Returns:
         TensorDict: flat data ``[sum(T_i - 1)]``.
 
     Raises:
-        ValueError: if numbers of trajectories, frames or columns do not fit each other, or an action is not finite.
+        ValueError: if numbers of trajectories, frames or columns do not match, or an action is infinite or partly NaN.
 
     Examples:
         >>> import torch
@@ -75,7 +75,7 @@ def flatten_trajectories(
         if bad.any():
             raise ValueError(
                 f"trajectory {index}: {int(bad.sum())} actions are infinite or NaN in some entries only, first at step"
-                f" {int(bad.nonzero()[0])}; an action without a label is NaN in all of them"
+                f" {int(bad.nonzero()[0])}; a missing action is NaN in all entries"
             )
     lengths = [len(steps) for steps in actions]
     done = torch.zeros(sum(lengths), 1, dtype=torch.bool)
@@ -99,9 +99,9 @@ def flatten_trajectories(
 
 
 def mark_labels(data: TensorDictBase, *, action_dim: int | None = None) -> TensorDictBase:
-    """Adds ``has_action [N, 1]`` to flat data: where ``action`` is there, and not NaN throughout a row.
+    """Adds ``has_action [N, 1]`` to a shallow copy of flat data: True unless a row of ``action`` is all NaN.
 
-    A shallow copy is returned. Where ``action`` is missing, NaN actions of ``action_dim`` columns are added.
+    If the entry ``action`` is missing, NaN actions of ``action_dim`` columns are added.
 
     Raises:
         ValueError: if there is no ``action`` and no ``action_dim``.
@@ -109,24 +109,24 @@ def mark_labels(data: TensorDictBase, *, action_dim: int | None = None) -> Tenso
     data, action = data.copy(), data.get(keys.ACTION, None)
     if action is None:
         if action_dim is None:
-            raise ValueError("the data have no entry 'action', and thus no labels; action_dim is needed to go on")
+            raise ValueError("the data have no entry 'action', and thus no labels: action_dim is needed")
         action = torch.full((*data.batch_size, action_dim), torch.nan, device=data.device)
     return data.set(keys.ACTION, action).set(keys.HAS_ACTION, ~action.isnan().all(-1, keepdim=True))
 
 
 def trajectory_lengths(data: TensorDictBase) -> torch.Tensor:
-    """Number of steps of every trajectory of flat data, int64 ``[trajectories]``, in the order of the data."""
+    """Returns the number of steps of every trajectory of flat data, int64 ``[trajectories]``, in their order."""
     return torch.unique_consecutive(data.get(keys.EPISODE), return_counts=True)[1]
 
 
 def begins(data: TensorDictBase) -> torch.Tensor:
-    """Which steps of flat data begin a trajectory, bool ``[N]``."""
+    """Returns which steps of flat data begin a trajectory, bool ``[N]``."""
     episode = data.get(keys.EPISODE)
     return episode.diff(prepend=episode[:1] - 1) != 0
 
 
 def labelled_episodes(data: TensorDictBase) -> torch.Tensor:
-    """Numbers of the trajectories of flat data that have a label, int64 ``[k]``, ascending."""
+    """Returns the numbers of trajectories of flat data that have a label, int64 ``[k]``, ascending."""
     return data.get(keys.EPISODE)[data.get(keys.HAS_ACTION).squeeze(-1)].unique()
 
 
@@ -144,7 +144,7 @@ def select_state(
         TensorDictBase: a shallow copy of ``data`` with ``state``.
 
     Raises:
-        ValueError: if there is no such column, or none is asked for.
+        ValueError: if a column does not exist, or ``columns`` is empty.
 
     Examples:
         >>> import torch
@@ -163,7 +163,7 @@ def select_state(
 
 
 def extrapolate_ends(data: TensorDictBase, frames: int) -> TensorDict:
-    """Continues every trajectory at its last mean velocity, so that a plan made near the end has a future.
+    """Continues every trajectory at its last mean velocity, so that windows near the end have planned frames.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``.

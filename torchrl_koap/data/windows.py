@@ -1,11 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Windows of consecutive steps: where they may start, which frames they have, all of them at once or a replay buffer.
+"""Windows of consecutive steps: their table, all of them at once, or a replay buffer over them.
 
 In the buffer a *sampler* draws numbers of windows, a *sample unit* turns each into ``T`` storage indices. TorchRL's own
-unit ``Sequence`` and its ``SliceSampler`` give flat batches ``[B * T]``, know no padding and no strata.
+unit ``Sequence`` and its ``SliceSampler`` give flat batches ``[B * T]``, without padding or stratification.
 
-With ``pad_before`` and ``pad_after`` windows may reach over the ends of their trajectory by that many frames, whose
-place is taken by the first or last step::
+With ``pad_before`` and ``pad_after`` windows may extend that many frames beyond the ends of their trajectory. The first
+or last step is repeated there::
 
     steps of the trajectory                0 1 2 3 4
     window 3, no padding                   0 1 2 ... 2 3 4
@@ -43,7 +43,7 @@ Rows = TypeVar("Rows", Tensor, TensorDictBase)
 class WindowTable:
     """All windows of a data set.
 
-    A window is *labelled* if a frame that counts has an action label and neither that frame nor the next one is padded.
+    A window is *labelled* if a counted frame has an action label and neither that frame nor the next one is padded.
 
     Examples:
         >>> import torch
@@ -73,16 +73,16 @@ class WindowTable:
     ) -> WindowTable:
         """Tabulates the windows of ``window`` frames of flat data ``[N]``.
 
-        The data have ``episode``; ``step_count`` and ``has_action`` are used if they are there. Windows may begin
-        before their trajectory by ``pad_before`` frames and end behind it by ``pad_after``, which repeat its first and
-        last step. Labels of the frames ``counted`` count; by default all but the first and the last frame.
+        The data need ``episode``; ``step_count`` and ``has_action`` are optional. Windows may begin ``pad_before``
+        frames before their trajectory and end ``pad_after`` behind it; these frames repeat its first or last step. Only
+        labels of the frames ``counted`` count; by default all but the first and the last frame.
 
         Raises:
             ValueError: if an argument is out of range, or a trajectory is too short.
         """
         counted = range(1, window - 1) if counted is None else counted
         if window < 2 or not 0 <= counted.start <= counted.stop < window:
-            raise ValueError(f"a window has 2 frames or more, all but the last may count: got {window} and {counted}")
+            raise ValueError(f"window must be >= 2 and counted exclude the last frame, got {window} and {counted}")
         for name, value in (("pad_before", pad_before), ("pad_after", pad_after)):
             if not 0 <= value < window:
                 raise ValueError(f"{name} must be in 0..{window - 1} frames (less than the window), got {value}")
@@ -92,7 +92,7 @@ class WindowTable:
         device, steps = episode.device, len(episode)
         new = begins(data)
         count = data.get(keys.STEP_COUNT, None)
-        if count is not None:  # where steps were left out, those of one trajectory are not consecutive
+        if count is not None:  # a trajectory with missing steps is split there
             new[1:] |= count[1:] != count[:-1] + 1
         first = new.nonzero().squeeze(-1)
         lengths = torch.diff(first, append=torch.tensor([steps], device=device))
@@ -119,14 +119,14 @@ class WindowTable:
         return cls(starts, first, last, labelled, window)
 
     def frames(self, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Gives the storage index of every frame of windows, padded at the ends of their trajectories.
+        """Returns the storage index of every frame of windows, padded at the ends of their trajectories.
 
         Args:
-            rows (Tensor, optional): numbers of windows ``[M]``, or bool. Default: all of them.
+            rows (Tensor, optional): numbers of windows ``[M]``, or a bool mask. Default: all of them.
 
         Returns:
-            tuple: int64 ``[M, T]``, and bool ``[M, T]``, which of them repeat the first or last step. A transition is
-            recorded, rather than made up, where neither its frame nor the next one is padded.
+            tuple: indices, int64 ``[M, T]``, and padding, bool ``[M, T]``: True where a frame repeats the first or last
+            step. A transition is recorded only if neither its frame nor the next one is padded.
         """
         starts, first, last = (value if rows is None else value[rows] for value in (self.starts, self.first, self.last))
         wanted = starts.unsqueeze(-1) + torch.arange(self.window, device=starts.device)
@@ -137,7 +137,7 @@ class WindowTable:
 class WindowUnit(SampleUnit):
     """Turns numbers of windows ``[B]`` into storage indices ``[B, T]``, by :meth:`WindowTable.frames`.
 
-    With ``padded`` bool ``[B, T]``, which of them are padded, is the entry ``padded`` of the sample's info.
+    With ``padded``, the sample's info has the entry ``padded``, bool ``[B, T]``: which frames are padded.
 
     Examples:
         >>> import torch
@@ -156,7 +156,7 @@ class WindowUnit(SampleUnit):
         self._frames, self._padded = frames, padded
 
     def expand(self, index: Tensor, info: dict[str, Any], storage: Storage | None) -> tuple[Tensor, dict[str, Any]]:
-        """Storage indices ``[B, T]`` of the windows ``[B]``, and ``info`` with ``padded`` where it is handed out."""
+        """Returns storage indices ``[B, T]`` of the windows ``[B]``, and ``info``, with ``padded`` if requested."""
         frames, padded = self._frames(index)
         return frames, info | {keys.PADDED: padded} if self._padded else info
 
@@ -164,18 +164,17 @@ class WindowUnit(SampleUnit):
 class WindowSampler(RandomSampler):
     """Draws windows with replacement, each equally likely.
 
-    Draws come from the global torch generator (of the table's device), unless the buffer was given its own.
+    Uses the global torch generator of the table's device, unless the buffer has its own.
 
     Args:
         labelled (Tensor): bool ``[M]``, which windows have a label on an inner frame (``WindowTable.labelled``).
 
     Keyword Args:
-        labelled_share (float, optional): in a batch of ``B``, ``round(labelled_share * B)`` windows (half up) have a
-            label and come first; the others have none, as far as such windows exist. Default: windows are drawn without
-            regard to labels.
+        labelled_share (float, optional): the first ``round(labelled_share * B)`` windows (half up) of a batch of ``B``
+            have a label; the others have none, if such windows exist. Default: labels do not affect the draw.
 
     Raises:
-        ValueError: for a share outside (0, 1], or if labelled windows are asked for and there are none.
+        ValueError: if the share is outside (0, 1], or no window has a label.
 
     Examples:
         >>> import torch
@@ -191,7 +190,7 @@ class WindowSampler(RandomSampler):
         if labelled_share is not None and not labelled.any():
             raise ValueError(
                 f"labelled_share is {labelled_share}, but none of the {len(labelled)} windows has a label on an inner"
-                " frame; leave labelled_share out to train without labels"
+                " frame; omit labelled_share to train without labels"
             )
         self.labelled_share = labelled_share
         everything = torch.arange(len(labelled), device=labelled.device)
@@ -200,16 +199,16 @@ class WindowSampler(RandomSampler):
         self._others = everything[~labelled] if stratified and not labelled.all() else everything
 
     def number_labelled(self, batch_size: int) -> int:
-        """Number of windows of a batch that have a label.
+        """Returns the number of windows of a batch that have a label.
 
         Raises:
-            ValueError: if the share of a batch of that size is no window at all.
+            ValueError: if the share of such a batch rounds to no window.
         """
         if self.labelled_share is None:
             return 0
         number = math.floor(self.labelled_share * batch_size + 0.5)
         if number == 0:
-            raise ValueError(f"labelled_share {self.labelled_share} of a batch of {batch_size} is no window at all")
+            raise ValueError(f"labelled_share {self.labelled_share} of a batch of {batch_size} rounds to 0 windows")
         return number
 
     def sample(self, storage: Storage | None, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
@@ -226,7 +225,7 @@ class WindowSampler(RandomSampler):
 
 
 def spread_evenly(rows: Rows, most: int) -> Rows:
-    """At most so many of some rows, spread evenly from the first to the last."""
+    """Returns at most ``most`` of the rows, spread evenly from the first to the last."""
     return rows if len(rows) <= most else rows[torch.linspace(0, len(rows) - 1, most).round().long()]
 
 
@@ -245,7 +244,7 @@ def cut_windows(
         window (int): frames per window.
         select (sequence of keys, optional): the entries to return. Default: all.
         pad_before (int): frames by which a window may begin before its trajectory; they repeat its first frame.
-        most (int, optional): number of windows at most. All of them take ``window`` times the memory of the data.
+        most (int, optional): largest number of windows. All of them take ``window`` times the memory of the data.
 
     Returns:
         TensorDictBase: ``[M, window]`` in the order of the data, with ``padded`` ``[M, window, 1]``.
@@ -286,7 +285,7 @@ def make_window_buffer(
             example a :class:`D3ILExperienceReplay`. Not copied.
         window (int): frames per window.
         batch_size (int): windows per batch.
-        select (sequence of keys, optional): the entries to return; the fewer the faster. Default: all.
+        select (sequence of keys, optional): the entries to return; fewer are faster. Default: all.
         labelled_share (float, optional): see :class:`WindowSampler`.
         counted, pad_before, pad_after: see :meth:`WindowTable.build`.
 
@@ -320,7 +319,7 @@ def make_window_buffer(
             raise KeyError(f"the data have no entries {absent}")
         data = data.select(*select)
     sampler = WindowSampler(table.labelled, labelled_share=labelled_share)
-    sampler.number_labelled(batch_size)  # a share that is no window at all is refused here
+    sampler.number_labelled(batch_size)  # raises if the share rounds to 0 windows
     padded = bool(pad_before or pad_after)
     return (TensorDictReplayBuffer if padded else ReplayBuffer)(
         storage=TensorStorage(data),
