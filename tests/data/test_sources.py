@@ -74,7 +74,7 @@ def test_demonstrations_of_po_sorting_are_as_noisy_as_its_rollouts(tmp_path):
 
 
 def test_what_cannot_be_opened(tmp_path):
-    with pytest.raises(FileNotFoundError, match="dataset '.*nowhere' is no folder of"):
+    with pytest.raises(FileNotFoundError, match="dataset '.*nowhere' is no folder in"):
         open_dataset(tmp_path / "nowhere")
     (tmp_path / "b_raw").mkdir()
     with pytest.raises(FileNotFoundError, match="did you mean '.*/b_raw'. `koap convert DATA --out DIR` makes one"):
@@ -86,7 +86,7 @@ def test_what_cannot_be_opened(tmp_path):
     assert open_dataset(folder)[1].name == "arm"
     arm = open_dataset(folder)[1]
     write_demonstrations(tmp_path / "raw", episodes=1)
-    with pytest.raises(DataError, match="task 'arm' is none of D3IL's: `koap convert` it"):
+    with pytest.raises(DataError, match="D3IL has no task 'arm': `koap convert` it"):
         open_dataset(tmp_path / "raw", task=arm)
     for name in ("lerobot/meta/info.json", "tables/run.csv", "arm.hdf5"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations: reading, storing, hiding labels, normalising, cutting into windows."""
+"""Demonstrations: reading, storing, hiding labels, augmenting, cutting into windows."""
 
 from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
 from torchrl_koap.data.formats import Recordings, make_recordings, read_recordings

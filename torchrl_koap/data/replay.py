@@ -19,21 +19,21 @@ from torchrl_koap.tasks import get_task
 class D3ILExperienceReplay(BaseDatasetExperienceReplay):
     """Demonstrations of a task as a replay buffer over flat steps.
 
-    The entries are those of :mod:`torchrl_koap.keys`; ``state`` holds the columns that a policy may see. Also reached
-    by ``torchrl.data.datasets.load_dataset("d3il:avoiding", root=...)``.
+    The entries are those of :mod:`torchrl_koap.keys`; ``state`` holds the columns that a policy may see. Also available
+    as ``torchrl.data.datasets.load_dataset("d3il:avoiding", root=...)``.
 
     Args:
         task (str): name of the task. ``po_sorting`` and ``stacking_1`` use the demonstrations of ``sorting`` and
             ``stacking``.
         root (str or Path): folder of the demonstrations, see :func:`~torchrl_koap.data.open_dataset`.
-        label_budget (LabelBudget, optional): hides labels, and commands whose changes are labels, from everything that
-            uses this data set; what was spent is in :attr:`label_report`.
+        label_budget (LabelBudget, optional): hides labels, and commands whose changes are labels, in this data set.
+            :attr:`label_report` counts the labels that are left.
         batch_size, sampler, sample_unit, transform, prefetch, collate_fn (optional): as in
             :class:`~torchrl.data.TensorDictReplayBuffer`.
 
     Raises:
-        FileNotFoundError: if the folder or its demonstrations are not there.
-        DataError: with the problems of all files.
+        FileNotFoundError: if the folder or its demonstrations are missing.
+        DataError: listing the problems of all files.
         ValueError: if the task is unknown.
 
     Examples:

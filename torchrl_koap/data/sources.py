@@ -19,31 +19,31 @@ from torchrl_koap.files import DataError
 from torchrl_koap.lookup import nearest
 from torchrl_koap.tasks import TASKS, Task, get_task
 
-DEFAULT_TASK = "avoiding"  # what D3IL's pickles are of if nobody says so
+DEFAULT_TASK = "avoiding"  # task of D3IL's pickles unless another one is named
 
 
 def open_dataset(
     folder: str | Path, *, task: Task | None = None, progress: Callable[[int, int], None] | None = None
 ) -> tuple[TensorDictBase, Task]:
-    """Reads demonstrations with all labels that there are, observed as their task observes.
+    """Reads demonstrations with all their labels, and adds the state and the sensor noise of their task.
 
     Args:
-        folder (str or Path): what ``koap demos``, ``koap convert``, ``koap embed`` or
-            :func:`~torchrl_koap.data.save_demonstrations` wrote, or a folder of D3IL's raw pickles.
+        folder (str or Path): folder written by ``koap demos``, ``koap convert``, ``koap embed`` or
+            :func:`~torchrl_koap.data.save_demonstrations`, or a folder of D3IL's raw pickles.
 
     Keyword Args:
-        task (Task, optional): what the data are to be used for: their task, or one that takes its demonstrations, such
-            as ``po_sorting`` those of ``sorting``. Default: their own; of raw pickles ``avoiding``.
-        progress (callable, optional): called with the number of raw files that were read, and that of all.
+        task (Task, optional): the data's task, or one that uses the same demonstrations, as ``po_sorting`` uses those
+            of ``sorting``. Default: the data's own task; ``avoiding`` for raw pickles.
+        progress (callable, optional): called with the number of raw files read so far, and of all raw files.
 
     Returns:
-        tuple: flat data ``[N]`` in the storage layout with ``state``, the columns that a policy may see, measured with
-        the task's noise; and the task.
+        tuple: flat data ``[N]`` in the storage layout with ``state``, the columns that a policy may see, with the
+        task's noise; and the task.
 
     Raises:
         FileNotFoundError: if there is no such folder, or it holds no demonstrations.
         DataError: if the data are damaged, or of another task.
-        ValueError: if nobody registered the task that the data name.
+        ValueError: if the data name a task that is not registered.
 
     Examples:
         >>> import tempfile
@@ -63,7 +63,7 @@ def open_dataset(
             raise DataError(stored, f"it holds demonstrations of {name!r}, wanted {task.source!r}")
         data = read_steps(stored)
     elif task.source not in CONVERTERS:
-        raise DataError(folder, f"it holds no data set, and task {task.name!r} is none of D3IL's: `koap convert` it")
+        raise DataError(folder, f"it holds no data set, and D3IL has no task {task.name!r}: `koap convert` it")
     else:
         data = flatten_trajectories(*read_raw(CONVERTERS[task.source], folder, progress=progress))
     if data["observation"].shape[-1] != task.observation_dim or data["action"].shape[-1] != task.action_dim:
@@ -78,12 +78,12 @@ def open_dataset(
 
 
 def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
-    """Finds the task of a data set: the one named, else the one that it holds or names; of raw pickles ``"avoiding"``.
+    """Finds the task of a data set: ``name``, else the one it holds or names; for raw pickles ``"avoiding"``.
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        ValueError: if none is named, the name is unknown, or the data set holds the definition of another task.
-        DataError: if the data set's task is damaged or names code, or the data are to be converted first.
+        ValueError: if ``dataset`` is None, the name is unknown, or the data set holds the definition of another task.
+        DataError: if the data set's task is damaged or names code, or the data must be converted first.
     """
     if dataset is None:
         what = name or DEFAULT_TASK
@@ -104,13 +104,13 @@ def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
 
 
 def check_new(folder: str | Path) -> None:
-    """Raises a FileExistsError where a folder holds a data set, recordings or a run already."""
+    """Raises a FileExistsError if a folder already holds a data set, recordings or a run."""
     if (Path(folder) / "config.json").exists() or find_format(folder) is not None:
         raise FileExistsError(f"{folder} holds a data set, recordings or a run already; choose another --out")
 
 
 def _find_stored(source: str | Path) -> Path | None:
-    """Where a folder holds a data set of this library; None if it may hold D3IL's raw pickles."""
+    """Returns the folder of this library's data set; None if ``source`` may hold D3IL's raw pickles."""
     form = find_format(source)
     if form == "ted":
         return stored_folder(source)
@@ -118,7 +118,7 @@ def _find_stored(source: str | Path) -> Path | None:
         out = shlex.quote(f"{Path(source).stem}_data")
         raise DataError(
             source,
-            f"it is {FORMATS[form].what}, and does not say what its columns are for:"
+            f"it is {FORMATS[form].what}, without the roles of its columns:"
             f" `koap convert {shlex.quote(str(source))} --out {out}`, then `--dataset {out}`",
         )
     if not Path(source).is_dir():
@@ -126,17 +126,17 @@ def _find_stored(source: str | Path) -> Path | None:
         near = nearest([other.name for other in path.parent.glob("*") if other.is_dir()], path.name)
         hint = "" if near is None else f"did you mean {str(path.with_name(near))!r}? "
         raise FileNotFoundError(
-            f"dataset {str(source)!r} is no folder of {Path.cwd()}; {hint}`koap convert DATA --out DIR` makes one of"
-            " your own data, `koap demos --out DIR` records one"
+            f"dataset {str(source)!r} is no folder in {Path.cwd()}; {hint}`koap convert DATA --out DIR` makes one from"
+            " your data, `koap demos --out DIR` records one"
         )
     return None
 
 
 def with_noise(data: TensorDictBase, columns: slice, sigma: float) -> TensorDictBase:
-    """Returns flat data ``[N]`` as a noisy sensor records them; ``sigma`` is its standard deviation in some columns.
+    """Adds sensor noise with standard deviation ``sigma`` to some observation columns of flat data ``[N]``.
 
-    A frame has the same noise as the next observation of a step and as the observation of the step that follows it.
-    Actions are untouched.
+    A frame has the same noise as next observation of one step and as observation of the following step. Actions do not
+    change.
     """
     generator = torch.Generator().manual_seed(0)
     now, following = data["observation"].clone(), data["next", "observation"].clone()

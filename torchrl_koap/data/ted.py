@@ -150,8 +150,7 @@ def stored_task(folder: str | Path) -> Task:
     """Reads the task of a data set: the stored definition, or the registered task of that name.
 
     Raises:
-        DataError: if the folder holds no data set, or its task is damaged or names code.
-        ValueError: if the named task is not registered.
+        DataError: if the folder holds no data set, or its task is damaged, names code or is not registered.
     """
     about = read_about(folder)
     try:

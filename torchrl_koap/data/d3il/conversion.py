@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From D3IL's raw pickles to trajectories (docs/appendix/d3il.md, Recordings), by the task in :data:`CONVERTERS`.
+"""Converts D3IL's raw pickles to trajectories (docs/appendix/d3il.md, Recordings), by the task in :data:`CONVERTERS`.
 
 One pickle per demonstration, one row per control step, ``T`` rows::
 
-    context                                              what the scene was reset to; None in Avoiding
+    context                                              initial scene of the episode; None in Avoiding
     robot    c_pos, c_vel, des_c_pos            (T, 3)   measured velocity and pose, commanded pose of the end effector
              c_quat, des_c_quat                 (T, 4)
              j_pos, j_vel, des_j_pos, des_j_vel, des_j_acc   (T, 7)
@@ -43,7 +43,7 @@ _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.p
 
 @dataclass(frozen=True)
 class RawEpisode:
-    """One recorded demonstration of ``T`` control steps: arrays ``[T, ...]`` by name, of the robot and each object."""
+    """Recorded demonstration of ``T`` control steps: arrays ``[T, ...]`` by name, of the robot and each object."""
 
     robot: Mapping[str, np.ndarray]
     objects: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
@@ -55,13 +55,13 @@ Poses = Sequence[tuple[np.ndarray, np.ndarray]]  # positions [T, 3] and quaterni
 
 @dataclass(frozen=True)
 class Converter:
-    """How the raw episodes of one task become observations and actions."""
+    """Converts the raw episodes of one task to observations and actions."""
 
-    robot: tuple[str, ...]  # entries of ``robot`` that are read
-    objects: tuple[str, ...]  # logged objects whose pose is read, in the order of ``Task.objects``
-    folder: str  # where D3IL keeps the files, seen from its data folder
-    columns: Callable[[Robot, Poses], tuple[np.ndarray, np.ndarray]]  # what is read to what :meth:`convert` returns
-    unread: tuple[str, ...] = ()  # objects that may be logged as well
+    robot: tuple[str, ...]  # entries of ``robot`` to read
+    objects: tuple[str, ...]  # logged objects whose pose to read, in the order of ``Task.objects``
+    folder: str  # of the files, relative to D3IL's data folder
+    columns: Callable[[Robot, Poses], tuple[np.ndarray, np.ndarray]]  # to observations and actions
+    unread: tuple[str, ...] = ()  # objects that may be logged too, and are ignored
 
     def convert(self, episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
         """Converts a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``, float64."""
@@ -118,10 +118,10 @@ CONVERTERS = {
 
 
 def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
-    """Finds raw demonstrations below a folder, as D3IL lays them out, in the order of their names.
+    """Finds raw demonstrations below a folder in D3IL's layout, sorted by name.
 
     Raises:
-        FileNotFoundError: if nothing is there; the message lists the folders looked at.
+        FileNotFoundError: if there are none; the message lists the searched folders.
     """
     root, inside = Path(root).expanduser(), PurePosixPath(converter.folder).parts
     ends = [Path(*inside[start:]) for start in range(len(inside) - 1, -1, -1)]
@@ -133,8 +133,8 @@ def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
             return files
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
-    looked = ", ".join(map(str, folders))
-    raise FileNotFoundError(f"no data set of `koap convert` and no demonstrations of D3IL (*.pkl) in {looked}")
+    searched = ", ".join(map(str, folders))
+    raise FileNotFoundError(f"no data set of `koap convert` and no demonstrations of D3IL (*.pkl) in {searched}")
 
 
 def read_raw(
@@ -149,20 +149,20 @@ def read_raw(
         if progress is not None and index:
             progress(index, len(files))
         try:
-            seen, done = converter.convert(_read_episode(file, converter))
+            observed, acted = converter.convert(_read_episode(file, converter))
         except DataError as error:
             problems += [f"{file}: {problem}" for problem in error.problems]
         except OSError as error:
             problems.append(f"{file}: cannot be read: {error}")
         else:
-            frames.append(seen)
-            actions.append(done)
+            frames.append(observed)
+            actions.append(acted)
     refuse(root, problems)
     return frames, actions
 
 
 def _read_episode(path: Path, converter: Converter) -> RawEpisode:
-    """Reads and checks a pickle, in which the converter's entries and poses must be there."""
+    """Reads a pickle and checks that it has the converter's entries and poses."""
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("robot"), dict):
         held = f"the keys {sorted(map(str, content))}" if isinstance(content, dict) else f"a {type(content).__name__}"
@@ -187,7 +187,7 @@ def _problems(robot: Mapping[str, Any], objects: Mapping[str, Any], converter: C
             problems.append(f"missing key '{name}'" if entries is None else f"'{name}' is no dictionary of arrays")
             continue
         problems += [f"missing key '{name}/{key}'" for key in required if key not in entries]
-        for key in (key for key in columns if key in entries):  # others this library knows nothing about
+        for key in (key for key in columns if key in entries):  # unknown entries are ignored
             problem = _array_problem(entries[key], columns[key])
             if problem:
                 problems.append(f"'{name}/{key}' {problem}")
@@ -195,7 +195,7 @@ def _problems(robot: Mapping[str, Any], objects: Mapping[str, Any], converter: C
                 lengths[f"{name}/{key}"] = len(entries[key])
     if len(set(lengths.values())) > 1:
         problems.append(f"unequal lengths: {', '.join(f'{key} {length}' for key, length in sorted(lengths.items()))}")
-    elif not lengths and not problems:  # else the faults of the arrays say more
+    elif not lengths and not problems:  # the other problems are more specific
         problems.append("'robot' holds none of the known arrays: " + ", ".join(ROBOT_COLUMNS))
     elif lengths and min(lengths.values()) < _LEAST_ROWS:
         problems.append(f"too short: {min(lengths.values())} rows, at least {_LEAST_ROWS} are needed")

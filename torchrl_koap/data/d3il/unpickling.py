@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """A restricted unpickler: numpy arrays and plain containers, nothing else.
 
-A pickle is a program. Two gates stand before this one runs:
+A pickle is a program. Two checks keep it from running code:
 
-1. The instructions are *scanned* without executing them: those that plain data never need (extension codes, persistent
-   ids, class instances) are refused.
-2. The file is loaded with *stand-ins* for numpy's constructors; every other class or function that it asks for is
-   refused by name. Stand-ins build views of the bytes in the file, so no declared shape allocates more than it holds.
+1. Its instructions are *scanned* without executing them. Those that plain data never need are refused: extension codes,
+   persistent ids, class instances.
+2. It is loaded with *stand-ins* for numpy's constructors; any other class or function is refused by name. Stand-ins
+   build views of the file's bytes, so a declared shape cannot allocate more memory than the file holds.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _INSTRUCTIONS = frozenset(
 
 
 class UnsafePickleError(DataError):
-    """A pickle that asks for something other than arrays and plain containers; nothing of it was run."""
+    """A pickle asks for something other than arrays and plain containers; none of its code was run."""
 
 
 class _RefusedError(Exception):
-    """What a file asks for and does not get."""
+    """A pickle asks for something that is refused."""
 
 
 def load_pickle(path: str | Path) -> Any:
@@ -68,7 +68,7 @@ def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
         raise UnsafePickleError(name, str(refused)) from None
     except RecursionError:
         raise UnsafePickleError(name, "containers are nested too deeply") from None
-    # a damaged pickle program can fail in as many ways as a damaged Python program
+    # a damaged pickle may raise any exception
     except Exception as error:
         raise DataError(name, f"not a complete pickle ({str(error) or type(error).__name__})") from error
 
@@ -78,8 +78,8 @@ def _asks_for(what: str) -> _RefusedError:
 
 
 def _scan(content: bytes) -> None:
-    """Refuses instructions that plain data do not need, and names that can be seen, without running anything."""
-    refused: dict[str, None] = {}  # in the order they are met
+    """Refuses instructions that plain data do not need, and visible names of classes, without running anything."""
+    refused: dict[str, None] = {}  # in the order of the file
     position, texts = 0, [""]
     try:
         for opcode, argument, position in pickletools.genops(content):
@@ -88,7 +88,7 @@ def _scan(content: bytes) -> None:
                 refused[_spelled(*argument.split(" ", 1))] = None
             elif opcode.name not in _INSTRUCTIONS:
                 refused[f"pickle instruction {opcode.name} (after {' '.join(texts[-2:])})"] = None
-            elif "PUT" in opcode.name and argument > position:  # the C unpickler allocates up to the largest slot
+            elif "PUT" in opcode.name and argument > position:  # the C unpickler allocates memory up to this slot
                 refused[f"memory slot {argument}"] = None
     finally:
         if refused:
@@ -112,7 +112,7 @@ class _RestrictedUnpickler(pickle.Unpickler):
 
 
 class _StandIn:
-    """Takes the place of a class or function; can be called, and cannot be changed by the file."""
+    """Callable that replaces a class or function; the file cannot change it."""
 
     __slots__ = ("_build", "name")
 
@@ -127,7 +127,7 @@ class _StandIn:
 
 
 class _ElementType:
-    """What ``numpy.dtype`` would be: the type of the elements of an array."""
+    """Stand-in for ``numpy.dtype``: the element type of an array."""
 
     __slots__ = ("dtype",)
 
@@ -137,7 +137,7 @@ class _ElementType:
         self.dtype = np.dtype(code)
 
     def __setstate__(self, state):
-        byte_order = state[1]  # the rest is for structured types, which have no code that is read
+        byte_order = state[1]  # the rest is for structured types, which are refused
         if byte_order in ("<", ">"):
             self.dtype = self.dtype.newbyteorder(byte_order)
         elif byte_order not in ("|", "="):
@@ -145,7 +145,7 @@ class _ElementType:
 
 
 class _Array:
-    """What ``numpy.ndarray`` would be until its state is set."""
+    """Stand-in for ``numpy.ndarray`` until its state is set."""
 
     __slots__ = ("value",)
 
@@ -217,10 +217,10 @@ for _core in ("numpy.core", "numpy._core"):  # numpy 1.x and 2.x
 
 
 def _finish(value, *, depth: int, finished: dict, open_containers: set) -> Any:
-    """Puts the arrays in the place of their stand-ins and refuses what is left of the others."""
+    """Replaces array stand-ins by their arrays and refuses all other stand-ins."""
     if isinstance(value, _PLAIN) or isinstance(value, np.generic):
         return value
-    if id(value) in finished:  # shared containers stay shared, and are visited once
+    if id(value) in finished:  # shared containers stay shared and are visited once
         return finished[id(value)]
     if id(value) in open_containers:
         raise _RefusedError("a container holds itself")
