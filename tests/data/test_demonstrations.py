@@ -78,7 +78,7 @@ def test_every_action_may_be_of_its_own_kind():
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds, targets=["state_3"])
     assert [action.kind for action in task.actions.values()] == list(kinds)
     assert task.delta_actions == (0,) and task.targets == {1: 3}
-    with pytest.raises(DataError, match="absolute actions: 1, columns of the robot: 4.* without such a column is 'raw'"):
+    with pytest.raises(DataError, match="absolute actions: 1, columns of the robot: 4.* without such a column"):
         make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds)
 
 

@@ -79,10 +79,7 @@ def test_columns_that_say_nothing_are_named():
 def test_short_trajectories_are_named():
     (warning,) = warnings([PATH, PATH[:6], PATH[:9]])
     assert "2 of 3 trajectories have fewer steps than a window of 16" in warning
-    assert (
-        "trajectory 1 (5), trajectory 2 (8); remove them, in Python or with `koap convert --drop-short`"
-        in warning
-    )
+    assert "trajectory 1 (5), trajectory 2 (8); remove them, in Python or with `koap convert --drop-short`" in warning
 
 
 def test_actions_that_never_change_are_named():

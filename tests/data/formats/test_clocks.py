@@ -24,11 +24,11 @@ def test_the_usual_step_is_the_rate():
 @pytest.mark.parametrize(
     ("times", "declared", "message"),
     [
-        (TIME * 1e3, None, "says 0.03 frames per second if it is in seconds: name it time_ms"),
+        (TIME * 1e3, None, "gives 0.03 frames per second if it is in seconds: name it time_ms"),
         (-TIME, None, r"do not increase, or are missing, in column 'time' of 1 of 2 .*: 1.csv \(frame 1\)"),
         (np.r_[TIME, 9.0], None, r"1.csv: frames are 0.03333 to 7.033 s apart \(frame 59\); .* pass resample .* 30"),
         (np.insert(TIME, 9, 0.29), None, r"1.csv: frames are 0.01 to 0.03333 s apart"),
-        (TIME, 20, "says 30 frames per second, the source declares 20: pass control_hz"),
+        (TIME, 20, "gives 30 frames per second, the source declares 20: pass control_hz"),
     ],
 )
 def test_stamps_that_cannot_be_are_told(times, declared, message):
@@ -44,7 +44,7 @@ def test_what_is_not_looked_at():
     assert told_rate(clock(TIME, 2 * TIME[:9]), 30) == " (its frames are 1 to 2 usual steps apart)"
     microseconds = 1e6 * np.delete(TIME, 5)
     assert told_rate(clock(microseconds), 30) == " (its frames are 1 to 2 usual steps apart)"
-    assert told_rate(clock(0 * TIME), 20) == " (its time stamps are not looked at)"
+    assert told_rate(clock(0 * TIME), 20) == " (its time stamps are ignored)"
 
 
 @pytest.mark.parametrize("clock", [TIME, TIME.astype(np.float32), TIME.round(3), np.arange(60, dtype=np.uint8)])

@@ -37,7 +37,7 @@ def test_a_counter_splits_and_sorts():
     rows = np.random.default_rng(1).permutation(30)
     by_time = read(x=rows, time=rows / 20)
     np.testing.assert_array_equal(by_time.states[0][:, 0], np.arange(30))
-    with pytest.raises(DataError, match="neither counts on nor starts again"):
+    with pytest.raises(DataError, match="neither continues nor restarts"):
         read(frame_index=[0, 1, 1, 2, 3, 4])
 
 
@@ -73,7 +73,7 @@ def test_columns_are_chosen_by_name():
 
 def test_the_rate_is_read_in_its_unit_and_compared():
     assert read(control_hz=None, time_ms=np.arange(6) * 20.0).control_hz == pytest.approx(50)
-    with pytest.raises(DataError, match="says 50 frames per second, the source declares 20"):
+    with pytest.raises(DataError, match="gives 50 frames per second, the source declares 20"):
         assemble([Piece("run", {"x": X, "timestamp": np.arange(6) / 50}, {"v": X})], "data", declared_hz=20)
 
 
@@ -115,7 +115,7 @@ def test_the_order_of_columns_does_not_count_but_their_names_do():
     with pytest.raises(DataError, match="c, d: its state columns are not those of a: it lacks y and has Y besides"):
         assemble(pieces, "data", control_hz=20, action_dim=1)
     told = [replace(piece, actions={"v": X}) for piece in pieces]
-    with pytest.raises(DataError, match=r"Y besides; leave out what some files lack by drop_columns \(--drop-columns"):
+    with pytest.raises(DataError, match=r"Y besides; drop columns that some files lack with drop_columns"):
         assemble(told, "data", control_hz=20)
     chosen = {"drop_columns": ["y", "Y"]}, {"state_columns": ["x"]}
     assert all(assemble(pieces, "data", control_hz=20, action_dim=1, **only).state_names == ("x",) for only in chosen)
@@ -128,7 +128,7 @@ def test_what_splits_can_be_dropped():
 
 
 def test_lost_frames_and_rows_without_episode_are_told():
-    with pytest.raises(DataError, match="run: column 'frame_index' goes from 2 to 5: give the missing frames"):
+    with pytest.raises(DataError, match="run: column 'frame_index' goes from 2 to 5: add the missing frames"):
         read(frame_index=[0, 1, 2, 5, 6, 7])
     assert read(frame_index=[0, 5, 10, 15, 20, 25]).control_hz == 20
     with pytest.raises(DataError, match="column 'traj_id' is empty in row 2"):
@@ -159,7 +159,7 @@ def test_archives_say_where_episodes_end(name, values, tmp_path):
     assert [frames[:, 0].tolist() for frames in found.states] == [X[:2].tolist(), X[2:].tolist()]
     np.savez(tmp_path / "a.npz", states=X[:, None], actions=X[:, None], control_hz=20.0, other=values)
     if len(values) == 2 and values[0]:  # anything may count from 0
-        with pytest.raises(DataError, match="'other' may say which episode a frame is of"):
+        with pytest.raises(DataError, match="'other' may be the episode of each frame"):
             read_recordings(tmp_path)
         assert read_recordings(tmp_path, drop_columns=["other"]).skipped == ("other",)
 
@@ -182,7 +182,7 @@ def test_episodes_of_one_frame_are_left_out_and_listed():
         (b"0.1,0.2\n0.3,0.4\n", "its first row holds numbers, wanted the names of the columns"),
         ("x,y\n1,2\n3,4\n".encode("utf-16"), "it is no text in UTF-8: save it as CSV UTF-8"),
         (b"x,done\n1,no\n2,yes\n", "column 'done' is the end of episodes and holds no numbers"),
-        (b"x,done\n1,0.5\n2,1\n", "column 'done' of the ends of episodes must be 0 or 1: name it otherwise"),
+        (b"x,done\n1,0.5\n2,1\n", "column 'done' of the ends of episodes must be 0 or 1: rename it"),
     ],
 )
 def test_tables_that_cannot_be_understood(content, message, tmp_path):

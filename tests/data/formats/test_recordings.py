@@ -32,7 +32,7 @@ def test_what_has_no_label():
 def test_no_labels_at_all_needs_their_width():
     assert make_recordings([FRAMES], action_dim=7).actions[0].shape == (4, 7)
     assert make_recordings([FRAMES], action_names=["a", "b"]).actions[0].shape == (4, 2)
-    with pytest.raises(DataError, match=r"how many columns an action has, or in action_columns \(--action-columns\)"):
+    with pytest.raises(DataError, match=r"number of action columns in action_dim .*, or the action columns of tables"):
         make_recordings([FRAMES])
 
 
@@ -72,15 +72,15 @@ def with_nan(array):
         ([FRAMES.astype(complex)], [np.ones((4, 1))], {}, "trajectory 0: states are complex128, wanted numbers"),
         ([FRAMES[0]], [np.ones((4, 1))], {}, r"trajectory 0: states must be \[T, d\], got \[3\]"),
         ([with_nan(FRAMES)], [np.ones((4, 1))], {}, "not finite, first at frame 2 in column 'state_1'"),
-        ([FRAMES], [np.full((4, 1), np.inf)], {}, "the action of step 0 is infinite; NaN means that it is unknown"),
+        ([FRAMES], [np.full((4, 1), np.inf)], {}, "the action of step 0 is infinite; mark unknown actions by NaN"),
         ([FRAMES], [np.ones((3, 1))], {}, r"3 actions for 5 frames; wanted one per frame \(5\) or one per"),
         ([FRAMES], [np.ones(4)], {}, r"actions must be \[T, a\] or \[T - 1, a\], got \[4\]"),
         ([FRAMES], [np.array([["x"]] * 4)], {}, "wanted numbers"),
         ([FRAMES, FRAMES], [np.ones((4, 1)), np.ones((4, 2))], {}, "trajectory 1: actions have 2 columns"),
         ([FRAMES], [np.ones((4, 1))], {"action_dim": 3}, r"actions have 1 columns, action_dim \(--action-dim\) says 3"),
-        ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b"]}, "state_names names 2 columns, there are 3"),
+        ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b"]}, "state_names has 2 names for 3 columns"),
         ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b", "a"]}, "state_names holds a more than once"),
-        ([FRAMES], [np.ones((4, 1))], {"state_names": "abc"}, "state_names must be a name for each of 3 columns, got"),
+        ([FRAMES], [np.ones((4, 1))], {"state_names": "abc"}, "state_names must be a list of 3 names, got"),
         ([FRAMES], None, {"action_dim": -1}, r"action_dim \(--action-dim\) must be a positive whole number, got -1"),
         ([FRAMES], None, {"action_dim": "2"}, "must be a positive whole number, got '2'"),
         ([FRAMES], [np.ones((4, 1))], {"control_hz": 0}, r"control_hz \(--control-hz\) must be a positive"),
@@ -134,7 +134,7 @@ def test_columns_of_data_frames_are_matched_by_name():
     turned = make_recordings([first, second], action_dim=1, state_names=["b", "a"])
     assert turned.state_names == ("b", "a") and turned.states[0].tolist() == [[2, 1], [4, 3]]
     assert make_recordings([first], action_dim=1, state_names=["x", "y"]).state_names == ("x", "y")
-    with pytest.raises(DataError, match="trajectory 1: states here and before do not both have the columns b, c"):
+    with pytest.raises(DataError, match="trajectory 1: columns of states differ from those before by b, c"):
         make_recordings([first, Frame("ac", [[1, 2], [3, 4]])], action_dim=1)
     with pytest.raises(DataError, match=r"states must be a list of recordings \[T, d\]"):
         make_recordings(first, action_dim=1)

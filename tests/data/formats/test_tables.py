@@ -56,7 +56,7 @@ def test_files_without_the_action_columns_have_no_actions(tmp_path):
     assert recordings.state_names == ("x", "y") and recordings.action_names == ("motor_1", "motor_2")
     assert recordings.num_labels == 5 and np.isnan(recordings.actions[0]).all()
     with pytest.raises(
-        DataError, match=r"b.csv: .* has motor_1, motor_2 besides; say in action_columns \(--action-col"
+        DataError, match=r"b.csv: .* has motor_1, motor_2 besides; name the action columns of tables in action_co"
     ):
         read_tables(tmp_path)
     with pytest.raises(DataError, match="'motor_3'; did you mean 'motor_2'"):

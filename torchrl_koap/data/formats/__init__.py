@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings of one's own robot, in the formats that :data:`FORMATS` lists."""
+"""Reads and writes recordings of a user's robot, in the formats that :data:`FORMATS` lists."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ __all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recording
 class Format:
     """How recordings in one format are recognised, read and written."""
 
-    what: str  # in words
-    matches: Callable[[str], bool]  # whether a source is in it
-    read: Callable[..., Recordings]  # of a source, and some of the options
-    options: tuple[str, ...] = ()  # those of read_recordings that it takes
-    write: Callable[[Recordings, Path], None] | None = None  # into a new folder; None where it is not written
+    what: str  # description for messages
+    matches: Callable[[str], bool]  # checks whether a source has this format
+    read: Callable[..., Recordings]  # from a source and ``options``
+    options: tuple[str, ...] = ()  # options of read_recordings that it takes
+    write: Callable[[Recordings, Path], None] | None = None  # into a new folder; None: cannot be written
 
 
 def _read_stored(
     source: str, *, resample: float | None = None, action_kind: str | Sequence[str] = "delta"
 ) -> Recordings:
-    """All observation columns of a data set of this library, the command included, and the labels that there are."""
+    """Reads all observation columns, including commands, and all labels of a data set of this library."""
     folder = stored_folder(source)
     data, task = load_ted(folder)
     lengths = trajectory_lengths(data).tolist()
@@ -69,10 +69,10 @@ def _read_stored(
     return resampled(recordings, resample, ["absolute" if is_one.kind == "absolute" else kind for is_one, kind in each])
 
 
-# what folders hold that are no recordings, and what to do
+# files that are no recordings -> advice
 _ELSEWHERE = {
     "*.npy": "it holds *.npy files: save each recording with np.savez(file, states=..., actions=...)",
-    "*.tsv": "it holds *.tsv files: call them *.csv",
+    "*.tsv": "it holds *.tsv files: rename them to *.csv",
     **dict.fromkeys(
         (f"{below}*.{kind}" for below in ("*/", "*/*/") for kind in ("npz", "csv", "parquet")),
         "folders below it hold tables: name one of them",
@@ -80,7 +80,7 @@ _ELSEWHERE = {
     "*/meta/info.json": "folders below it hold LeRobot data sets: name one of them",
     **dict.fromkeys(("*.gz", "*.zip", "*.tar", "*.xz"), "it holds packed files: unpack them"),
 }
-# options of all but this library's own
+# options of all formats except "ted"
 COMMON = ("control_hz", "resample", "action_kind", "action_dim", "state_columns", "drop_columns")
 
 FORMATS = {
@@ -132,36 +132,35 @@ def read_recordings(
     state_columns: Sequence[str] = (),
     drop_columns: Sequence[str] = (),
 ) -> Recordings:
-    """Reads recordings of any robot; where they lie decides which of the :data:`FORMATS` they are in.
+    """Reads recordings of any robot; the source determines which of the :data:`FORMATS` is used.
 
     Args:
         source (str or Path): a folder of tables, a LeRobot data set, an HDF5 file or a folder of them, ``minari:NAME``,
             or a data set of this library.
 
     Keyword Args:
-        control_hz (float, optional): frames per second; time stamps are not looked at then. Default: as the source
-            says.
-        resample (float, optional): frames per second that are wanted, also of irregular time stamps. States between
-            frames are interpolated, switches and leaps take the nearest frame, actions hold on or are summed.
-        action_kind (str, or sequence of str): what actions are, needed to resample them: ``"change"`` over one frame,
-            which is summed, or ``"velocity"``, ``"absolute"`` or ``"raw"`` (torques), which hold on.
+        control_hz (float, optional): frames per second; overrides time stamps. Default: the rate of the source.
+        resample (float, optional): wanted frames per second, also for irregular time stamps. States are interpolated;
+            switches and leaps take the nearest frame; actions are held or summed.
+        action_kind (str, or sequence of str): kind of the actions, needed for ``resample``. ``"change"`` over one frame
+            is summed; ``"velocity"``, ``"absolute"`` and ``"raw"`` (torques) are held.
         observations (sequence of str): features of a LeRobot data set, or entries of an HDF5 file, that make up the
-            state. Default: all that are no images.
-        episodes (sequence of int): which episodes of a LeRobot data set to read. Default: all.
-        action_columns (sequence of str): columns of CSV and parquet tables that are actions, if they are not named
-            ``action...``.
-        action_dim (int, optional): number of action columns where nothing has actions.
-        state_columns (sequence of str): columns that make up the state, in that order. Default: all that are no clock,
-            counter, reward or flag of an episode; those are in ``skipped``.
-        drop_columns (sequence of str): state and action columns that are left out.
+            state. Default: all that are not images.
+        episodes (sequence of int): episodes of a LeRobot data set to read. Default: all.
+        action_columns (sequence of str): action columns of CSV and parquet tables, if their names do not begin with
+            ``action``.
+        action_dim (int, optional): number of action columns, if no trajectory has actions.
+        state_columns (sequence of str): columns that make up the state, in this order. Default: all except clocks,
+            counters, rewards and flags of episodes, which are listed in ``skipped``.
+        drop_columns (sequence of str): state and action columns to leave out.
 
     Returns:
         Recordings: trajectories with the names of their columns.
 
     Raises:
-        DataError: with all faults of the recordings.
+        DataError: listing all faults of the recordings.
         FileNotFoundError: if there is no such source.
-        ValueError: if it is in none of the formats, or an option does not fit its format.
+        ValueError: if the source has none of the formats, or an option does not apply to its format.
 
     Examples:
         >>> from torchrl_koap.data import read_recordings
@@ -187,7 +186,7 @@ def read_recordings(
 
 
 def find_format(source: str | Path) -> str | None:
-    """Which of the :data:`FORMATS` recordings are in; None if in none of them. A DataError refuses a run."""
+    """Returns the name of a source's format among :data:`FORMATS`, or None; raises a DataError for a run."""
     config = Path(source) / "config.json"
     if config.is_file() and config.with_name("metrics.csv").is_file() and "dataset" in (run := read_json(config)):
         raise DataError(source, f"it is a run of `koap train`, which was trained on the data set {run['dataset']}")
@@ -195,11 +194,11 @@ def find_format(source: str | Path) -> str | None:
 
 
 def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path:
-    """Writes recordings into a new folder, in a format that is written: ``"npz"`` or ``"lerobot"``; returns the folder.
+    """Writes recordings into a new folder as ``"npz"`` or ``"lerobot"`` and returns the folder.
 
     Raises:
-        ValueError: for a format that is not written; the message suggests the nearest.
-        FileExistsError: if there is something of that name.
+        ValueError: if the format cannot be written; the message suggests the nearest.
+        FileExistsError: if ``out`` exists.
         DataError: if the format needs a rate, and none is known.
         RuntimeError: if the format's package is not installed; the message names the extra.
     """

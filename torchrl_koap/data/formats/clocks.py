@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Time stamps of recordings: the rate that they say, and whether frames lie evenly in time."""
+"""Reads the frame rate from time stamps of recordings and checks that frames are evenly spaced in time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 from torchrl_koap.files import option, some
 
 UNEVEN = 0.2  # share of the usual step by which a step in time may differ
-SLOWEST, FASTEST = 1.0, 2000.0  # Hz; beyond, stamps are in another unit
+SLOWEST, FASTEST = 1.0, 2000.0  # Hz; outside, stamps are assumed to have another unit
 ROUNDED = 0.03  # share of its mean step by which a rounded clock's steps may differ
-NOT_READ = " (its time stamps are not looked at)"
-_LONG = 20  # frames after which a column that rises evenly is taken for a clock
+NOT_READ = " (its time stamps are ignored)"
+_LONG = 20  # steps that a column must rise evenly to be taken for a clock
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Clock:
 
     name: str  # of the column
     times: Sequence[np.ndarray]  # seconds of every trajectory [T_i]
-    sources: Sequence[str]  # what messages call the trajectories
+    sources: Sequence[str]  # names of the trajectories, for messages
 
     @cached_property
     def steps(self) -> list[np.ndarray]:
@@ -39,12 +39,12 @@ class Clock:
 
 
 def declared_rate(value: Any) -> float | None:
-    """Frames per second that a source declares; None where what it says is no positive number."""
+    """Returns the frames per second that a source declares; None if the value is no positive number."""
     return float(value) if isinstance(value, (int, float)) and value > 0 else None
 
 
 def usual_rate(clock: Clock, problems: list[str]) -> float | None:
-    """Frames per second by the usual step of time stamps; None, and a problem, where they cannot be seconds."""
+    """Returns frames per second by the median step of time stamps; None, and a problem, if they cannot be seconds."""
     back = [
         f"{name} (frame {int((~(step > 0)).argmax()) + 1})"
         for name, step in zip(clock.sources, clock.steps, strict=True)
@@ -53,21 +53,21 @@ def usual_rate(clock: Clock, problems: list[str]) -> float | None:
     if back:
         problems.append(
             f"time stamps do not increase, or are missing, in column {clock.name!r} of {len(back)} of"
-            f" {len(clock.steps)} trajectories: {some(back)}; pass {option('control_hz')} if they mean nothing"
+            f" {len(clock.steps)} trajectories: {some(back)}; pass {option('control_hz')} to ignore them"
         )
         return None
     rate, name = 1 / clock.usual, clock.name
     if SLOWEST <= rate <= FASTEST:
         return rate
     problems.append(
-        f"column {name!r} says {rate:.3g} frames per second if it is in seconds: name it {name}_ms, {name}_us or"
+        f"column {name!r} gives {rate:.3g} frames per second if it is in seconds: name it {name}_ms, {name}_us or"
         f" {name}_ns if it is in another unit, or pass {option('control_hz')}"
     )
     return None
 
 
 def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> float | None:
-    """The rate of frames that lie evenly in time, and agree with what the source declares; else there are problems."""
+    """Returns the frame rate; adds problems if frames are uneven in time or disagree with the declared rate."""
     rate = usual_rate(clock, problems)
     if rate is None:
         return None
@@ -78,19 +78,19 @@ def find_rate(clock: Clock, declared: float | None, problems: list[str]) -> floa
     ]
     if uneven:
         problems.append(
-            f"{some(uneven)}; the usual step is {1 / rate:.4g} s: pass {option('resample')} {rate:.3g} to bring"
-            f" them to a fixed rate, or {option('control_hz')} if the stamps are wrong"
+            f"{some(uneven)}; the usual step is {1 / rate:.4g} s: pass {option('resample')} {rate:.3g} for a"
+            f" fixed rate, or {option('control_hz')} if the stamps are wrong"
         )
     if declared is not None and abs(declared / rate - 1) > UNEVEN:
         problems.append(
-            f"column {clock.name!r} says {rate:.4g} frames per second, the source declares {declared:g}:"
+            f"column {clock.name!r} gives {rate:.4g} frames per second, the source declares {declared:g}:"
             f" pass {option('control_hz')}"
         )
     return rate if declared is None else declared
 
 
 def told_rate(clock: Clock, control_hz: float) -> str:
-    """Returns a note if ignored time stamps, of any unit, give no rate, another one or uneven steps; else ""."""
+    """Returns a note if ignored time stamps, of any unit, give no rate, another rate or uneven steps; else ""."""
     rate = usual_rate(clock, [])
     if rate is not None and abs(control_hz / rate - 1) > UNEVEN:
         return f" (it says {rate:.4g} frames per second)"
@@ -102,10 +102,10 @@ def told_rate(clock: Clock, control_hz: float) -> str:
 
 
 def rises_evenly(trajectories: Sequence[np.ndarray], *, room: float = ROUNDED) -> bool:
-    """Says whether a column, given by trajectory ``[T_i]``, rises in every frame as clocks do.
+    """Checks whether a column, given by trajectory ``[T_i]``, rises in every frame as clocks do.
 
     Keyword Args:
-        room (float): share of the mean step by which steps may differ. Default: what rounding leaves.
+        room (float): share of the mean step by which steps may differ. Default: the size of rounding errors.
     """
     steps = np.concatenate([np.diff(values.astype(np.float64)) for values in trajectories])
     if len(steps) < _LONG or steps.min() <= 0:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From named columns to recordings, for every reader: what is a state, where episodes end, the rate of the frames."""
+"""Converts named columns to recordings, for all readers: selects states, splits episodes, finds the frame rate."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from torchrl_koap.lookup import unknown
 
 @dataclass(frozen=True)
 class Piece:
-    """What a reader found in one file, demonstration or episode."""
+    """Content of one file, demonstration or episode, as a reader found it."""
 
-    name: str  # what messages call it
-    states: dict[str, np.ndarray]  # columns [T] of everything that is no action
-    actions: dict[str, np.ndarray] | None = None  # columns [T] or [T - 1]; None where there are none
-    unclear: tuple[str, ...] = ()  # columns among the states of which the user has to say what they are
-    cameras: dict[str, Clip] = field(default_factory=dict)  # where the frames lie, one per row
-    declared_hz: float | None = None  # frames per second, where it says so itself
-    unread: tuple[str, ...] = ()  # what is in it that was left out
+    name: str  # for messages
+    states: dict[str, np.ndarray]  # columns [T], all but the actions
+    actions: dict[str, np.ndarray] | None = None  # columns [T] or [T - 1]; None if there are none
+    unclear: tuple[str, ...] = ()  # columns of ``states`` whose meaning the user must state
+    cameras: dict[str, Clip] = field(default_factory=dict)  # location of the frames, one per row
+    declared_hz: float | None = None  # frames per second, if the source declares it
+    unread: tuple[str, ...] = ()  # parts that were left out
 
     @property
     def frames(self) -> int:
@@ -39,7 +39,7 @@ class Piece:
 
     @property
     def clocks(self) -> dict[str, np.ndarray]:
-        """The columns of time stamps, in seconds."""
+        """Columns of time stamps, in seconds."""
         kinds = {name: kind_of(name) for name in self.states}
         return {name: self.states[name] * unit for name, (kind, unit) in kinds.items() if kind == "clock"}
 
@@ -59,11 +59,11 @@ def assemble(
     skipped: Sequence[str] = (),
     no_rate: str = "no file has time stamps (a column 'timestamp' in seconds, or dates such as 2024-03-31 12:30:05.1)",
 ) -> Recordings:
-    """Splits episodes, leaves out what is no state, reads the rate off the time stamps, and checks what is left.
+    """Splits episodes, leaves out columns that are no state, finds the rate from time stamps, and checks the rest.
 
-    Options are those of :func:`~torchrl_koap.data.read_recordings`. Messages call the whole ``source``. Of what the
-    reader knows, time stamps must agree with ``declared_hz``; ``action_names`` count where nothing has actions;
-    ``skipped`` was left out already, and ``no_rate`` is said where nothing tells the rate.
+    Options are those of :func:`~torchrl_koap.data.read_recordings`. From the reader come ``source``, the name in
+    messages; ``declared_hz``, with which time stamps must agree; ``action_names``, used if no piece has actions;
+    ``skipped``, what the reader left out; and ``no_rate``, the message if the rate is unknown.
     """
     if not pieces:
         raise DataError(source, "there are no trajectories")
@@ -72,11 +72,11 @@ def assemble(
     every = dict.fromkeys(name for piece in pieces for name in (*piece.states, *(piece.actions or ()), *piece.cameras))
     problems = unknown(state_columns, [*seen], f"column in {option('state_columns')}:")
     problems += unknown(drop_columns, [*every], f"column in {option('drop_columns')}:")
-    looked_at = {name for name in seen if not state_columns or name in state_columns or kind_of(name)[0] is not None}
+    used = {name for name in seen if not state_columns or name in state_columns or kind_of(name)[0] is not None}
     pieces = [
         replace(
             piece,
-            states={name: values for name, values in piece.states.items() if name in looked_at - {*drop_columns}},
+            states={name: values for name, values in piece.states.items() if name in used - {*drop_columns}},
             actions=_without(piece.actions or {}, drop_columns) or None,
             cameras=_without(piece.cameras, drop_columns),
         )
@@ -94,9 +94,9 @@ def assemble(
     unclear = dict.fromkeys(name for piece in pieces for name in piece.unclear if name not in drop_columns)
     if unclear and not state_columns:
         problems.append(
-            f"{', '.join(map(repr, unclear))} may say which episode a frame is of, or where episodes end: call it"
-            " episode_index, timeouts or episode_ends then; if it is a column of the states or the actions, put it"
-            f" there; else name the state's columns in {option('state_columns')}, or drop it in"
+            f"{', '.join(map(repr, unclear))} may be the episode of each frame, or the ends of episodes: if so, name it"
+            " episode_index, timeouts or episode_ends; if it is a column of the states or the actions, store it there;"
+            f" otherwise name the state's columns in {option('state_columns')}, or drop it with"
             f" {option('drop_columns')}"
         )
     even = set() if state_columns else _even(pieces)
@@ -114,8 +114,8 @@ def assemble(
     about |= {clock.name: told_rate(clock, rate) for clock in clocks if rate is not None}
     if clocks and control_hz is not None and (against := about[clocks[0].name]) not in ("", NOT_READ):
         warnings.warn(
-            f"column {clocks[0].name!r}{against} does not count beside {option('control_hz')} {control_hz:g}: if its"
-            f" stamps are right, pass {option('resample')} {resample or control_hz:g} alone",
+            f"column {clocks[0].name!r}{against} is overridden by {option('control_hz')} {control_hz:g}: if its stamps"
+            f" are right, pass only {option('resample')} {resample or control_hz:g}",
             stacklevel=2,
         )
     for name in (name for name in seen if "success" in name.lower() and kind_of(name)[0] == "other"):
@@ -158,14 +158,14 @@ def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarra
 
 
 def _clocks(pieces: Sequence[Piece]) -> list[Clock]:
-    """The columns of time stamps, in seconds from the first frame of every piece."""
+    """Returns the columns of time stamps, in seconds from the first frame of every piece."""
     found: dict[str, list[np.ndarray]] = {}
     seconds_of = [piece.clocks for piece in pieces]
     for name in seconds_of[0]:
         times = [clocks[name] for clocks in seconds_of]
         whole = (other for other, seconds in found.items() if all((part == part.round()).all() for part in seconds))
         seconds = next(whole, None)
-        if seconds is not None and all(((part >= 0) & (part < 1)).all() for part in times):  # ROS: s and ns
+        if seconds is not None and all(((part >= 0) & (part < 1)).all() for part in times):  # ROS: s and ns apart
             found[seconds] = [part + rest for part, rest in zip(found[seconds], times, strict=True)]
         else:
             found[name] = times
@@ -174,7 +174,7 @@ def _clocks(pieces: Sequence[Piece]) -> list[Clock]:
 
 
 def _lost_frames(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
-    """Pieces whose count of frames has holes, which no clock tells."""
+    """Finds pieces whose frame counter skips numbers; used where no clock shows lost frames."""
     for piece in pieces:
         for name in [name for name in piece.states if kind_of(name)[0] == "frame"]:
             steps = np.diff(piece.states[name])
@@ -183,13 +183,13 @@ def _lost_frames(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
                 before, after = piece.states[name][lost[0] : lost[0] + 2]
                 yield (
                     piece.name,
-                    f"column {name!r} goes from {before:g} to {after:g}: give the missing frames, or end an episode"
-                    f" there (a column 'episode_index'), or leave the count out by {option('drop_columns')}",
+                    f"column {name!r} goes from {before:g} to {after:g}: add the missing frames, end an episode there"
+                    f" (a column 'episode_index'), or drop the counter with {option('drop_columns')}",
                 )
 
 
 def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
-    """The episodes of a piece; the piece itself if it is one, or if nothing separates them."""
+    """Splits a piece into episodes; returns the piece itself if it has one episode."""
     try:
         order, begins = _order(piece)
     except ValueError as error:
@@ -201,7 +201,7 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
     if piece.actions is not None and any(len(values) != length for values in piece.actions.values()):
         problems.append(
             f"{piece.name}: it holds {len(starts)} episodes and {len(next(iter(piece.actions.values())))} actions for"
-            f" {length} frames: several episodes need an action beside every frame"
+            f" {length} frames: with several episodes, every frame needs an action"
         )
         return [piece]
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
@@ -213,7 +213,7 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
 
 
 def _taken(piece: Piece, rows: np.ndarray) -> Piece:
-    """Some frames of a piece, with all of its actions."""
+    """Selects frames of a piece and keeps all of its actions."""
     cameras = {name: clip.take(rows) for name, clip in piece.cameras.items()}
     return replace(piece, states=_cut(piece.states, rows), cameras=cameras)
 
@@ -223,10 +223,10 @@ def _cut(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.nd
 
 
 def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-    """The order of the rows of a piece, and which of them, so ordered, begin an episode.
+    """Returns the order of the rows of a piece, and which of the ordered rows begin an episode.
 
-    Told by the numbers of the episode, by a frame counter or a clock that starts again, and by flags of starts and
-    ends. Rows of one episode that lie out of order are sorted by its counter or clock.
+    Episodes are found by their number, by a frame counter or clock that restarts, and by flags of starts and ends. Rows
+    of an episode that are out of order are sorted by its counter or clock.
     """
     rows = np.arange(piece.frames)
     called = {kind_of(name)[0]: name for name in reversed(piece.states)}
@@ -245,7 +245,7 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
             again = next(at for at in np.flatnonzero(starts) if (number[starts] == number[at]).sum() > 1)
             said = " of ".join(f"{name} {values[again]:g}" for name, values in numbers.items())
             raise ValueError(
-                f"{said} comes back after another one, and no frame index or time says how its rows follow each other"
+                f"{said} returns after another one, and no frame index or time gives the order of its rows"
             )
         order = rows if sorting is None else np.lexsort((sorting, number))
         return order, _changes(number[order]) | _flagged(piece, order)
@@ -255,8 +255,8 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
         starts = np.r_[True, np.diff(frame) < 0]
         if not (frame[starts] == frame[0]).all() or (np.diff(frame) == 0).any():
             raise ValueError(
-                f"column {called['frame']!r} neither counts on nor starts again: a column 'episode' says which rows"
-                " belong together"
+                f"column {called['frame']!r} neither continues nor restarts: add a column 'episode' that says which"
+                " rows belong together"
             )
         return rows, starts
     starts = _flagged(piece, rows)
@@ -272,20 +272,20 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flagged(piece: Piece, order: np.ndarray) -> np.ndarray:
-    """Which rows of a piece, so ordered, begin an episode by flags of starts and ends; the first one does."""
+    """Returns which of the ordered rows begin an episode by flags of starts and ends; the first one always does."""
     starts = np.arange(len(order)) == 0
     for name, values in piece.states.items():
         kind, flag = kind_of(name)[0], values[order]
         switch = not set(np.unique(flag)) - {0, 1}
         if kind in ("start", "end") and not switch:
             raise ValueError(
-                f"column {name!r} of the {kind}s of episodes must be 0 or 1: name it otherwise if it is none, or drop"
-                f" it in {option('drop_columns')}"
+                f"column {name!r} of the {kind}s of episodes must be 0 or 1: rename it if it is something else, or drop"
+                f" it with {option('drop_columns')}"
             )
         if kind == "start":
             starts = starts | (flag > 0)
         elif kind == "end" or kind == "length" and switch:
-            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # an episode ends where a flag falls
+            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # the flag may stay 1 for several rows
     return starts
 
 
@@ -294,7 +294,7 @@ def _changes(numbers: np.ndarray) -> np.ndarray:
 
 
 def _even(pieces: Sequence[Piece]) -> set[str]:
-    """State columns that rise by the same amount in every frame of all pieces; none if that would be all."""
+    """Returns state columns that rise by the same amount in every frame of all pieces; none if all do."""
     states = [name for name in pieces[0].states if kind_of(name)[0] is None]
     found = {name for name in states if rises_evenly([piece.states[name] for piece in pieces])}
     return found if len(found) < len(states) else set()
@@ -302,8 +302,8 @@ def _even(pieces: Sequence[Piece]) -> set[str]:
 
 def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
     acting = any(piece.actions for piece in pieces)
-    cure = f"; leave out what some files lack by {option('drop_columns')}"
-    cure = cure if acting else f"; say in {option('action_columns')} which columns of a table are actions"
+    cure = f"; drop columns that some files lack with {option('drop_columns')}"
+    cure = cure if acting else f"; name the action columns of tables in {option('action_columns')}"
     for kind in ("state", "action"):
         named = [(piece.name, piece.states if kind == "state" else piece.actions) for piece in pieces]
         found = [(name, columns) for name, columns in named if columns is not None]
@@ -318,9 +318,9 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
 
 
 def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:
-    """Pieces that lack a camera that others have, or a frame per row, and cameras whose first frame is no picture."""
+    """Finds pieces without a camera that others have or without a frame per row, and unreadable first frames."""
     for name in dict.fromkeys(name for piece in pieces for name in piece.cameras):
-        cure = f"record them, or leave the camera out by {option('drop_columns')} {name}"
+        cure = f"record them, or drop the camera with {option('drop_columns')} {name}"
         absent = [piece.name for piece in pieces if name not in piece.cameras]
         if absent:
             yield f"camera {name!r} has no frames in {some(absent)}: {cure}"
@@ -331,7 +331,7 @@ def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:
                 yield f"{piece.name}: camera {name!r} has {number} frames for {piece.frames} rows: {told}, {cure}"
         where, clip = next((piece.name, piece.cameras[name]) for piece in pieces if name in piece.cameras)
         try:
-            with suppress(RuntimeError):  # the extra that reads it is missing; `koap embed` needs it
+            with suppress(RuntimeError):  # the extra that reads it is missing; only `koap embed` needs it
                 next(clip.take(range(min(len(clip), 1))).read(), None)
         except ValueError as error:
             yield f"{where}: camera {name!r}: {error}"

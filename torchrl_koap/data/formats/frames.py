@@ -1,14 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Camera frames where they lie: convert keeps references, and pictures are read when they are embedded.
+"""References to camera frames: ``koap convert`` stores where they are, ``koap embed`` reads them.
 
 ::
 
-    recordings/run_000.npz              a trajectory, and beside it a folder of its name with its cameras:
-    recordings/run_000/top/000000.png   a picture per row, the names end in their numbers (PNG or JPEG), or
+    recordings/run_000.npz              a trajectory, and beside it a folder of the same name with its cameras:
+    recordings/run_000/top/000000.png   an image per row (PNG or JPEG), names end in numbers, or
     recordings/run_000/top.npy          uint8 [T, H, W, 3]
     recordings/run_000/top_times.npy    optional, in s on the clock of the rows: a row takes the nearest frame
 
-HDF5 files hold ``[T, H, W, 3]``, or a JPEG or PNG file per row, beside the numbers; LeRobot data sets pictures in
+HDF5 files hold ``[T, H, W, 3]``, or a JPEG or PNG file per row, beside the numbers. LeRobot data sets hold images in
 parquet, or videos (extra ``video``).
 """
 
@@ -29,18 +29,18 @@ from torchrl_koap.files import read_bytes, some
 from torchrl_koap.lookup import import_extra
 
 PICTURES = (".png", ".jpg", ".jpeg")
-MAGIC = (b"\xff\xd8\xff", b"\x89PNG")  # how the content of such a file begins
+MAGIC = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG files
 TIMES = "_times.npy"
-LATE = 1.5  # usual steps of a camera's clock that a frame may lie away from its row
+LATE = 1.5  # largest distance in time of a frame from its row, in median steps of the camera's clock
 _COLOURS = {1: "greyscale", 2: "greyscale with alpha", 4: "RGBA"}
 
 
 @dataclass(frozen=True)
 class Clip:
-    """Where the frames of one camera in one trajectory lie."""
+    """Reference to the frames of one camera in one trajectory."""
 
-    file: str  # a folder of pictures, an array (*.npy), an HDF5 file, a parquet file, or a video
-    numbers: tuple[int, ...]  # for every row that of its frame, in the file's own count
+    file: str  # a folder of images, an array (*.npy), an HDF5 file, a parquet file, or a video
+    numbers: tuple[int, ...]  # the frame of every row, as numbered in the file
     entry: str = ""  # data set of an HDF5 file, or column of a parquet file
     episode: int = 0  # of a parquet file, which may hold several
 
@@ -55,16 +55,16 @@ class Clip:
         """Yields the frames, uint8 ``[H, W, 3]``.
 
         Args:
-            size (sequence of int, optional): height and width that they must have. Default: those of the first one.
+            size (sequence of int, optional): required height and width. Default: those of the first frame.
 
         Raises:
-            ValueError: for a frame that is missing, damaged, of another size or type; the message begins with it.
-            RuntimeError: if an extra is missing that reads them.
+            ValueError: if a frame is missing, damaged, or has another size or type; the message begins with it.
+            RuntimeError: if an extra for reading them is missing.
         """
         suffix = Path(self.file).suffix
         read = _READERS.get("folder" if Path(self.file).is_dir() else suffix, _video)
         if not Path(self.file).exists():
-            raise ValueError(f"frame {self.numbers[0]}: {self.file} is not there (any more): convert the data again")
+            raise ValueError(f"frame {self.numbers[0]}: {self.file} is missing: convert the data again")
         for number, frame in zip(self.numbers, read(self), strict=True):
             fault = fault_of(frame, size)
             if fault is not None:
@@ -82,19 +82,19 @@ def stored_clips(notes: Mapping[str, Any]) -> dict[str, list[Clip]]:
 
 
 def fault_of(frame: np.ndarray, size: Sequence[int] | None = None) -> str | None:
-    """Says what is wrong with a picture, and what would do; None if it is uint8 ``[H, W, 3]`` of the size (H, W)."""
+    """Returns a fault of an image and its remedy; None if it is uint8 ``[H, W, 3]`` with the size (H, W)."""
     shape = list(frame.shape)
     channels = 1 if len(shape) == 2 else shape[-1] if len(shape) == 3 else 0
     if channels in _COLOURS:
         return f"is {_COLOURS[channels]} {shape}, wanted three colours [H, W, 3]: save it as RGB"
     if channels != 3:
-        turned = "put the colours last" if shape[:1] == [3] else "a frame is one picture"
-        return f"has shape {shape}, wanted [H, W, 3]: {turned}"
+        cure = "put the colours last" if shape[:1] == [3] else "a frame is one image"
+        return f"has shape {shape}, wanted [H, W, 3]: {cure}"
     if frame.dtype != np.uint8:
         return f"is {frame.dtype}, wanted uint8 in 0 to 255: scale and round it"
     if size is not None and tuple(shape[:2]) != tuple(size):
         height, width = size
-        return f"is {shape[0]} x {shape[1]}, the camera's others are {height} x {width}: bring all to one size"
+        return f"is {shape[0]} x {shape[1]}, the camera's others are {height} x {width}: resize them alike"
     return None
 
 
@@ -112,8 +112,8 @@ def _decode(content: bytes, what: object) -> np.ndarray:
     try:
         image = Image.open(io.BytesIO(content))
         return np.asarray(image.convert("RGB") if image.mode == "P" else image)
-    except Exception as error:  # what a damaged picture makes of a decoder
-        raise ValueError(f"frame {what} is no picture that can be read: {error}") from None
+    except Exception as error:  # damaged images may raise any exception
+        raise ValueError(f"frame {what} is no readable image: {error}") from None
 
 
 def _array(clip: Clip) -> Iterator[np.ndarray]:
@@ -125,7 +125,7 @@ def _array(clip: Clip) -> Iterator[np.ndarray]:
 
 
 def _load(file: Path) -> np.ndarray:
-    """An array ``[T, ...]``, whose frames are read when they are asked for."""
+    """Opens an array ``[T, ...]`` as a memory map."""
     try:
         array = np.load(file, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
@@ -140,7 +140,7 @@ def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
 
     with h5py.File(clip.file, "r") as stream:
         frames, behind = stream[clip.entry], clip.entry.replace("/obs/", "/next_obs/")
-        for number in clip.numbers:  # the one behind the last is that of the observation that followed
+        for number in clip.numbers:  # number T: the last frame of next_obs
             frame = frames[number] if number < len(frames) else stream[behind][-1]
             yield frame if frames.ndim == 4 else _decode(np.asarray(frame).tobytes(), number)
 
@@ -155,19 +155,19 @@ def _parquet(clip: Clip) -> Iterator[np.ndarray]:
         content = cells.get(number)
         content = content.get("bytes") if isinstance(content, dict) else None
         if not isinstance(content, bytes):
-            raise ValueError(f"frame {number} is missing: column {clip.entry!r} has no picture in its row")
+            raise ValueError(f"frame {number} is missing: column {clip.entry!r} has no image in its row")
         yield _decode(content, number)
 
 
 def _video(clip: Clip) -> Iterator[np.ndarray]:
-    """Frames by the time at which they are shown, from the key frame before the first one."""
+    """Decodes frames by presentation time, from the key frame before the first one."""
     av = import_extra("av", "video", "videos are read with")
     try:
         with av.open(clip.file) as container:
             yield from _shown(clip, container, container.streams.video[0])
     except (av.FFmpegError, IndexError) as error:
         raise ValueError(
-            f"frame {clip.numbers[0]}: PyAV cannot decode {clip.file} ({error}): encode it anew, such as by ffmpeg -i"
+            f"frame {clip.numbers[0]}: PyAV cannot decode {clip.file} ({error}): re-encode it, for example by ffmpeg -i"
             " OLD -c:v libx264 NEW.mp4"
         ) from error
 
@@ -195,19 +195,19 @@ _READERS = {
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """Pictures of a folder by the number in which their names end."""
+    """Returns the images of a folder by the number at the end of their names."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in PICTURES:
             digits = re.search(r"\d+$", path.stem)
             if digits is None or int(digits[0]) in found:
-                raise ValueError(f"{path} must end in a number of its own")
+                raise ValueError(f"{path} must end in a unique number")
             found[int(digits[0])] = path
     return found
 
 
 def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
-    """Finds the cameras of a table in the folder of its name; ``clock`` is the time of every row in s.
+    """Finds the cameras of a table in the folder of the same name; ``clock`` is the time of every row in s.
 
     Raises:
         ValueError: if frames are missing or their times cannot be used; the message names the camera.
@@ -225,8 +225,8 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
         if times.is_file():
             stamps = _load(times)
             if clock is None or stamps.shape != (len(held),):
-                lacks = "the table has no clock" if clock is None else f"it has {list(stamps.shape)} times"
-                raise ValueError(f"camera {name!r}: {times.name} is for {len(held)} frames and a clock, {lacks}")
+                got = "no clock in the table" if clock is None else f"times {list(stamps.shape)}"
+                raise ValueError(f"camera {name!r}: {times.name} needs {len(held)} times and a clock, got {got}")
             held = [held[index] for index in _nearest(stamps, clock, name)]
         elif held != list(range(held[0], held[0] + len(held))):
             absent = sorted({*range(held[0], held[-1])} - {*held})
@@ -238,7 +238,7 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
 
 
 def _nearest(stamps: np.ndarray, clock: np.ndarray, camera: str) -> np.ndarray:
-    """For every row the frame that is nearest in time."""
+    """Returns the frame nearest in time to every row."""
     after = np.searchsorted(stamps, clock).clip(1, len(stamps) - 1)
     nearest = np.where(clock - stamps[after - 1] <= stamps[after] - clock, after - 1, after)
     off, most = np.abs(stamps[nearest] - clock), LATE * float(np.median(np.diff(stamps)))
@@ -253,10 +253,10 @@ def _nearest(stamps: np.ndarray, clock: np.ndarray, camera: str) -> np.ndarray:
 def lerobot_clips(
     root: str | Path, info: Mapping[str, Any], cameras: Sequence[str], rows: Mapping[int, Mapping[str, Any]]
 ) -> dict[int, dict[str, Clip]]:
-    """Says of every episode of a LeRobot data set where the frames of its cameras lie.
+    """Returns references to the camera frames of every episode of a LeRobot data set.
 
-    A camera whose videos are nowhere, or have no rate, is left out. ``rows`` are of every episode its ``file``, its
-    ``frame_index`` ``[T]`` and perhaps ``timestamp`` ``[T, 1]``.
+    A camera whose videos are missing or have no rate is left out. ``rows`` holds for every episode its ``file``, its
+    ``frame_index`` ``[T]`` and optionally ``timestamp`` ``[T, 1]``.
     """
     found: dict[int, dict[str, Clip]] = {number: {} for number in rows}
     fps = declared_rate(info.get("fps"))
@@ -281,7 +281,7 @@ def lerobot_clips(
 
 
 def _video_starts(root: Path, camera: str) -> dict[int, tuple[int, int, float]]:
-    """Of every episode chunk and file of its video, and where it begins in it (s); empty before format 3.0."""
+    """Returns chunk, file and start time (s) of every episode's video; empty before format 3.0."""
     columns = [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     found = {}
     for file in (root / "meta/episodes").rglob("*.parquet"):

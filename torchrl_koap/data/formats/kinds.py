@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a column of recordings is: by its name a clock, an episode, an action ...; by what it holds, numbers or none."""
+"""Classifies columns of recordings by name (clock, episode, action, ...) and converts their content to numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _END = (
     "(timeout|terminal|termination|terminated|truncation|truncated|done|last|finished|final|end)(_(step|frame|flag))?"
 )
 _WHOSE = "(sim|wall|ros|unix|system|log|elapsed|robot|host|device|sensor|camera|local|relative|record(ing)?|epoch)"
-# what columns are called that are no state: words of a name joined by _, in lower case, without unit
+# names of columns that are no state: words joined by _, in lower case, without unit
 _KINDS = {
     "clock": rf"t|(.+_)?(ts|time_?stamps?|stamps?)|({_WHOSE}_)?times?|elapsed|epoch|(date|up)_?time"
     r"|clock|utc|zeit|temps",
@@ -39,25 +39,25 @@ _UNITS = {
 _UNITS |= {1e-9: "ns nsec nsecs nanos nanosec nanosecs nanoseconds", 60.0: "min minutes"}
 UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 _UNIT = re.compile(rf"(.+?)[ _.-]*[ _.(\[-]({'|'.join(UNITS)})[)\]]?")
-_EXACT = 2**53  # the largest whole number up to which float64 tells all apart
+_EXACT = 2**53  # float64 represents all integers up to this one
 _WORDS = {"true": 1.0, "false": 0.0} | dict.fromkeys(("", "na", "n/a", "null", "none"), np.nan)
 
 
 def numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a table ``[T]`` or ``[T, d]`` as float64, with their numbers behind the name."""
+    """Returns the columns of a table ``[T]`` or ``[T, d]`` as float64, named ``name_0``, ``name_1``, ..."""
     table = np.asarray(values, dtype=np.float64)
     table = table.reshape(len(table), int(np.prod(table.shape[1:])))
     return {f"{name}_{index}": column for index, column in enumerate(table.T)}
 
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a table ``[T]`` or ``[T, d]`` as float64, numbered if there are several."""
+    """Returns the columns of a table ``[T]`` or ``[T, d]`` as float64, numbered if there are several."""
     columns = numbered(name, values)
     return {name: columns[f"{name}_0"]} if len(columns) == 1 else columns
 
 
 def kind_of(name: str) -> tuple[str | None, float]:
-    """What a column is by its name, None for a state; and of a clock its unit in seconds, 0.001 of "Time [ms]"."""
+    """Returns a column's kind by its name, None for a state, and a clock's unit in seconds: 0.001 for "Time [ms]"."""
     plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.strip()).lower().removeprefix("next.")
     if "sec" in plain and plain in UNITS:
         return "clock", UNITS[plain]
@@ -68,7 +68,7 @@ def kind_of(name: str) -> tuple[str | None, float]:
 
 
 def is_action(name: str) -> bool:
-    """Whether a column of a table is an action by its name: "action", "Action_0", "actions[1]"."""
+    """Checks whether a column of a table is an action by its name: "action", "Action_0", "actions[1]"."""
     return _ACTING.fullmatch(name) is not None
 
 
@@ -77,9 +77,9 @@ def _joined(name: str) -> str:
 
 
 def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
-    """A column ``[T]`` of any type as float64; None if it holds no numbers.
+    """Converts a column ``[T]`` of any type to float64; None if it holds no numbers.
 
-    Truths are 0 and 1, the dates of a clock in its unit, names of episodes numbered in the order in which they come.
+    Booleans become 0 and 1, dates of a clock its unit, names of episodes numbers in order of appearance.
     """
     (kind, unit), held = kind_of(name), values.dtype.kind
     if held in "mM" and kind == "clock":
@@ -103,7 +103,7 @@ def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
     if kind != "clock" or known:
         return None
     try:
-        with warnings.catch_warnings():  # NumPy counts with zones of time, but warns of them
+        with warnings.catch_warnings():  # NumPy converts time zones correctly, but warns
             warnings.simplefilter("ignore")
             return as_numbers(name, np.array(texts, dtype="datetime64[ns]"))
     except ValueError:
@@ -111,7 +111,7 @@ def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
 
 
 def number_of(text: str) -> float | None:
-    """What text says: NaN if it is empty, 0 or 1 for a truth, None if it is no number."""
+    """Converts text to a number: NaN if it is empty, 0 or 1 for a boolean, None if it is no number."""
     text = text.strip().lower()
     try:
         return _WORDS[text] if text in _WORDS else None if "_" in text else float(text)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings from a Minari data set on this machine."""
+"""Reads recordings from a Minari data set on this machine."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ PREFIX = "minari:"
 
 
 def read_minari(source: str, **options: Any) -> Recordings:
-    """Reads a Minari data set that was downloaded or created before, such as ``"minari:D4RL/door/human-v2"``.
+    """Reads a local Minari data set, such as ``"minari:D4RL/door/human-v2"``, without downloading anything.
 
-    Nothing is fetched. Dictionary observations are laid side by side in the order of their names, tuples by number;
-    images are skipped. The rate is declared by ``render_fps`` of its environment. The options are those of
+    Dictionary observations are concatenated in the order of their names, tuples by number; images are skipped. The rate
+    is ``render_fps`` of the environment. The options are those of
     :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     minari = import_extra("minari", "minari", "Minari data sets are read with")
@@ -43,7 +43,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
             else:
                 states |= spread(name or "state", array)
         if not states:
-            faults.append((called, "observations hold no numbers but images"))
+            faults.append((called, "observations hold images only, no numbers"))
         if isinstance(episode.actions, (Mapping, tuple)):
             kind = "Dict" if isinstance(episode.actions, Mapping) else "Tuple"
             faults.append((called, f"its actions are a {kind}, wanted one vector [T, a] of numbers"))
@@ -58,22 +58,22 @@ def read_minari(source: str, **options: Any) -> Recordings:
         pieces,
         source,
         declared_hz=_rate(dataset),
-        no_rate="its environment says nothing of render_fps",
+        no_rate="its environment declares no render_fps",
         **options,
     )
 
 
 def _episodes(dataset: Any, source: str) -> Iterator[Any]:
-    """The episodes of a data set; those that Minari cannot put together as its spaces say are named."""
+    """Yields the episodes of a data set; raises a DataError for those that Minari cannot read with its spaces."""
     for number in dataset.episode_indices:
         try:
             yield next(iter(dataset.iterate_episodes([number])))
         except (KeyError, ValueError, TypeError, OSError, StopIteration) as error:
-            raise DataError(source, f"episode {number} is damaged, or not as its spaces say: {error}") from error
+            raise DataError(source, f"episode {number} is damaged, or does not match its spaces: {error}") from error
 
 
 def _leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays by name, those of dictionaries in the order of their names."""
+    """Yields arrays with their names, those of dictionaries in the order of their names."""
     if isinstance(observations, tuple):
         observations = {str(index): part for index, part in enumerate(observations)}
     if not isinstance(observations, Mapping):
@@ -86,6 +86,6 @@ def _leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray
 def _rate(dataset: Any) -> float | None:
     try:
         rate = dataset.recover_environment().metadata.get("render_fps")
-    except Exception:  # an environment that is not installed can fail in any way, and only its rate is wanted
+    except Exception:  # an environment that is not installed may raise anything; its rate is optional
         return None
     return float(rate) if rate else None

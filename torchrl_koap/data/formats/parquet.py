@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Columns of parquet files as numbers, for every reader of them."""
+"""Reads columns of parquet files as numbers, for all readers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_koap.lookup import import_extra
 
 
 def import_pyarrow() -> Any:
-    """The package pyarrow."""
+    """Imports pyarrow."""
     import_extra("pyarrow", "lerobot", "parquet files and LeRobot data sets need")
     import pyarrow
     import pyarrow.compute
@@ -23,7 +23,7 @@ def import_pyarrow() -> Any:
 
 
 def number_type(kind: Any) -> Any:
-    """The type that a column of numbers, or of lists of numbers, is read as; None of anything else."""
+    """Returns the pyarrow type to read a column of numbers, or of lists of numbers, as; None for other columns."""
     pyarrow = import_pyarrow()
     types = pyarrow.types
     nested = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
@@ -35,9 +35,9 @@ def number_type(kind: Any) -> Any:
 
 
 def numbers(column: Any, name: str, *, announced: int = 1, files: Sequence[str] | None = None) -> np.ndarray:
-    """A column of a type of :func:`number_type` as float64 ``[rows, width]``; rows that are empty are NaN.
+    """Returns a column with a type of :func:`number_type` as float64 ``[rows, width]``; empty rows are NaN.
 
-    ``announced`` is the width of lists that are all empty; ``files`` say of every row its file, for messages.
+    ``announced`` is the width if all lists are empty; ``files`` holds the file of every row, for messages.
     """
     pyarrow, column = import_pyarrow(), column.combine_chunks()
     if not pyarrow.types.is_list(column.type):

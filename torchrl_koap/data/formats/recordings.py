@@ -1,9 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Trajectories of any robot as plain arrays, before they become a data set: what every reader hands over, checked once.
+"""Trajectories of any robot as plain arrays: the result of every reader, checked before it becomes a data set.
 
-A trajectory of ``T`` frames has ``T - 1`` transitions. Whoever logs an action beside every frame has ``T`` actions; the
-last one leads to a frame that was not recorded and is dropped. A trajectory without actions, and every step whose
-action is NaN, has no label.
+A trajectory of ``T`` frames has ``T - 1`` transitions. If an action was logged with every frame, the last of the ``T``
+actions leads to an unrecorded frame and is dropped. Trajectories without actions and steps with NaN have no label.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ class Recordings:
     actions: list[np.ndarray]  # of every trajectory [T_i - 1, a]; NaN rows have no label
     state_names: tuple[str, ...]  # of the d columns
     action_names: tuple[str, ...]  # of the a columns
-    sources: tuple[str, ...]  # where each trajectory is from, for messages
-    control_hz: float | None = None  # frames per second, if the source says so
+    sources: tuple[str, ...]  # origin of each trajectory, for messages
+    control_hz: float | None = None  # frames per second, if the source declares it
     skipped: tuple[str, ...] = ()  # entries of the source that were left out
-    cameras: Mapping[str, Sequence[Clip]] = field(default_factory=dict)  # where the T_i frames of every trajectory lie
+    cameras: Mapping[str, Sequence[Clip]] = field(default_factory=dict)  # references to T_i frames of every trajectory
 
     @property
     def num_labels(self) -> int:
@@ -53,16 +52,16 @@ class Recordings:
 
     @property
     def moving(self) -> np.ndarray:
-        """Which state columns change within a recording, as goals do not: bool ``[d]``."""
+        """Which state columns change within any recording (goals do not): bool ``[d]``."""
         return np.any([(frames[1:] != frames[:-1]).any(0) for frames in self.states], axis=0)
 
     def filmed(self, spans: Iterable[tuple[int, Sequence[int] | np.ndarray]]) -> dict[str, list[Clip]]:
-        """Where the frames of trajectories, by their numbers, lie in some of their rows."""
+        """Selects camera frames by pairs of trajectory number and rows."""
         chosen = list(spans)
         return {name: [clips[number].take(rows) for number, rows in chosen] for name, clips in self.cameras.items()}
 
     def cut(self, spans: Sequence[tuple[int, int, int]], skipped: Sequence[str]) -> Recordings:
-        """Keeps of trajectories, by their numbers, the frames from one to the one behind the last."""
+        """Keeps only the given spans: trajectory number, first frame, and end (exclusive)."""
         return replace(
             self,
             states=[self.states[number][start:end] for number, start, end in spans],
@@ -86,26 +85,26 @@ def make_recordings(
     cameras: Mapping[str, Sequence[Clip]] | None = None,
     source: str = "these recordings",
 ) -> Recordings:
-    """Checks arrays and puts them into one form.
+    """Checks arrays and returns them as :class:`Recordings`.
 
     Args:
         states (sequence of array): frames of every trajectory ``[T_i, d]``.
         actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, or
-            None for one without; None for no labels at all. Columns of data frames are matched by their names.
+            None for one without actions; None for no labels at all. Columns of data frames are matched by name.
 
     Keyword Args:
-        action_dim (int, optional): number of action columns, needed where no trajectory has actions.
-        state_names, action_names, sources, control_hz, skipped, cameras: as of :class:`Recordings`. Columns and
+        action_dim (int, optional): number of action columns; required if no trajectory has actions.
+        state_names, action_names, sources, control_hz, skipped, cameras: as in :class:`Recordings`. Columns and
             trajectories without a name are numbered.
-        source (str): what messages call the whole.
+        source (str): name of the recordings in messages.
 
     Returns:
         Recordings: checked, with names.
 
     Raises:
-        DataError: with all faults: no trajectories, other widths than in the first, fewer than two frames, states
-            that are no numbers or not finite, infinite actions, a number of actions that is neither ``T`` nor
-            ``T - 1``, an action column with few numbers, names that do not fit.
+        DataError: listing all faults: no trajectories, other widths than in the first, fewer than two frames, states
+            that are not finite numbers, infinite actions, neither ``T`` nor ``T - 1`` actions, an action column with few
+            values, names that do not match.
 
     Examples:
         >>> import numpy as np
@@ -139,8 +138,8 @@ def make_recordings(
         raise DataError(source, f"{option('action_dim')} must be a positive whole number, got {action_dim!r}")
     if wide is None:
         wide = 1
-        cure = f"say in {option('action_dim')} how many columns an action has, or in {option('action_columns')} which"
-        problems += [] if faults else [f"no trajectory has actions: {cure} columns of a table are actions"]
+        cure = f"give the number of action columns in {option('action_dim')}, or the action columns of tables in"
+        problems += [] if faults else [f"no trajectory has actions: {cure} {option('action_columns')}"]
     elif action_dim is not None and action_dim != wide:
         problems.append(f"actions have {wide} columns, {option('action_dim')} says {action_dim}")
     given_states = _names(state_names, width, "state", problems)
@@ -164,10 +163,10 @@ def make_recordings(
             wanted = f"wanted one per frame ({len(seen)}) or one per transition ({len(seen) - 1})"
             faults.append((name, f"{len(done)} actions for {len(seen)} frames; {wanted}"))
         elif infinite.any():
-            faults.append((name, f"the action of step {infinite.argmax()} is infinite; NaN means that it is unknown"))
+            faults.append((name, f"the action of step {infinite.argmax()} is infinite; mark unknown actions by NaN"))
     if lost:
         said = f"{some([name for name, _ in lost])}: states are not finite, first at {lost[0][1]}"
-        problems.append(f"{said}: fill them, or {option('resample')} recordings without actions, which leaves them out")
+        problems.append(f"{said}: fill them, or {option('resample')} recordings without actions, which skips them")
     problems += _sparse([array for array in known if array is not None and array.shape[1] == wide], given_actions)
     if control_hz is not None:
         problems += wrong_rate(control_hz, "control_hz")
@@ -193,7 +192,7 @@ def make_recordings(
 
 
 def wrong_rate(value: Any, name: str) -> list[str]:
-    """Returns a message if frames per second are no positive number."""
+    """Returns a list with a message if a rate is no positive number, else an empty list."""
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and not np.iscomplexobj(value)
     if number and 0 < value < math.inf:
         return []
@@ -201,7 +200,7 @@ def wrong_rate(value: Any, name: str) -> list[str]:
 
 
 def one_each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:
-    """Returns what an option says of every column, or once for all; another number of columns is a problem more."""
+    """Returns an option's value for each column, given once or per column; adds a problem if the number differs."""
     said = (given,) * wide if isinstance(given, str) else tuple(given)
     if len(said) != wide:
         problems.append(f"{option(what)} names {len(said)} columns, there are {wide}")
@@ -209,9 +208,9 @@ def one_each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any
 
 
 def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
-    if getattr(values, "ndim", None) == 2:  # arrays, and data frames, which would be a list of their names
+    if getattr(values, "ndim", None) == 2:  # arrays and data frames; list(frame) would be its column names
         raise DataError(source, f"{what} must be a list of recordings {wanted}, got one array {list(values.shape)}")
-    with contextlib.suppress(TypeError, RuntimeError):  # what is no sequence; nested tensors
+    with contextlib.suppress(TypeError, RuntimeError):  # not a sequence; nested tensors
         if not isinstance(values, (str, Path, Mapping)):
             return list(values)
     kind = type(values).__name__
@@ -222,14 +221,14 @@ def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
 def _by_name(
     tables: list[Any], names: Sequence[str] | None, what: str, labels: Sequence[str], faults: list[tuple[str, str]]
 ) -> tuple[list[Any], Sequence[str] | None]:
-    """Brings the columns of data frames into one order, that of ``names`` or of the first; other names are faults."""
+    """Orders the columns of data frames as in ``names`` or the first; other column names are faults."""
     heads = [list(getattr(table, "columns", ())) for table in tables]
     order = next(filter(None, heads), [])
-    if not all(isinstance(name, str) for name in order):  # pandas counts what has no names
+    if not all(isinstance(name, str) for name in order):  # pandas numbers columns without names
         return tables, names
     for label, head in zip(labels, heads, strict=True):
         if head and (odd := set(head) ^ set(order)):
-            faults.append((label, f"{what} here and before do not both have the columns {some(sorted(map(str, odd)))}"))
+            faults.append((label, f"columns of {what} differ from those before by {some(sorted(map(str, odd)))}"))
     order = list(names) if names is not None and set(names) == set(order) else order
     ordered = [
         table[order] if head and set(head) == set(order) else table for table, head in zip(tables, heads, strict=True)
@@ -238,7 +237,7 @@ def _by_name(
 
 
 def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str, str]]) -> np.ndarray | None:
-    """Numbers of a trajectory as float64, NaN where they are masked or None; else there is a fault more."""
+    """Converts a trajectory to float64, NaN where it is masked or None; adds a fault and returns None on failure."""
     try:
         if isinstance(value, torch.Tensor):
             value = value.detach().cpu().resolve_conj().resolve_neg()
@@ -262,7 +261,7 @@ def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str
 
 
 def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:
-    """Names action columns that are known in less than half of the steps in which another one is."""
+    """Reports action columns that are known in less than half as many steps as another one."""
     known = np.isfinite(np.concatenate(actions)).sum(0) if actions else np.zeros(0, dtype=int)
     sparse = [
         f"{name!r} (known in {count})" for name, count in zip(names, known, strict=False) if 2 * count < known.max()
@@ -270,8 +269,8 @@ def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:
     if not sparse:
         return []
     return [
-        f"{known.max()} steps have actions, but action column {', '.join(sparse)} is mostly empty, and only steps in"
-        " which all columns are known are labels: repeat its last value where it holds on, or drop it in"
+        f"{known.max()} steps have actions, but action column {', '.join(sparse)} is mostly empty; a label needs all"
+        " columns: repeat its last value where it still applies, or drop it with"
         f" {option('drop_columns')}"
     ]
 
@@ -280,12 +279,12 @@ def _names(given: Sequence[str] | None, width: int, kind: str, problems: list[st
     if given is None:
         return tuple(f"{kind}_{index}" for index in range(width))
     if isinstance(given, str):
-        problems.append(f"{kind}_names must be a name for each of {width} columns, got the text {given!r}")
+        problems.append(f"{kind}_names must be a list of {width} names, got the text {given!r}")
     names = tuple(str(name) for name in given)
     if not all(name.strip() for name in names):
         problems.append(f"{kind}_names holds an empty name")
     if len(names) != width:
-        problems.append(f"{kind}_names names {len(names)} columns, there are {width}")
+        problems.append(f"{kind}_names has {len(names)} names for {width} columns")
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         problems.append(f"{kind}_names holds {', '.join(repeated)} more than once")
