@@ -32,7 +32,7 @@ def test_a_counter_splits_and_sorts():
     np.testing.assert_array_equal(read(frame_index=[2, 0, 1, 3, 5, 4]).states[0][:, 0], X[[1, 2, 0, 3, 5, 4]])
     mixed = read(traj_id=[0, 1, 0, 1, 0, 1], frame_index=[0, 0, 1, 1, 2, 2])
     np.testing.assert_array_equal(np.stack(mixed.states)[..., 0], [X[::2], X[1::2]])
-    with pytest.raises(DataError, match="episode_id 0 comes back"):
+    with pytest.raises(DataError, match="episode_id 0 returns"):
         read(episode_id=[0, 0, 1, 1, 0, 0])
     rows = np.random.default_rng(1).permutation(30)
     by_time = read(x=rows, time=rows / 20)
@@ -45,7 +45,7 @@ def test_all_that_tells_episodes_apart_counts():
     both = read(session=[0, 0, 0, 0, 1, 1], trial=[0, 0, 1, 1, 0, 0])
     assert [frames[:, 0].tolist() for frames in both.states] == X.reshape(3, 2).tolist()
     assert [len(frames) for frames in read(session=[0, 0, 0, 0, 1, 1], done=[0, 1, 0, 1, 0, 1]).states] == [2, 2, 2]
-    with pytest.raises(DataError, match="trial 0 of session 0 comes back"):
+    with pytest.raises(DataError, match="trial 0 of session 0 returns"):
         read(trial=[0, 0, 1, 1, 0, 0], session=[0] * 6)
 
 
@@ -220,5 +220,5 @@ def test_a_rate_against_the_stamps_is_warned_of():
     with pytest.warns(UserWarning, match=r"'time' \(it says 100 frames .* 20: if its stamps are right"):
         assert read(control_hz=20.0, time=np.arange(6) / 100).control_hz == 20
     gap = 1e4 * np.array([0, 1, 2, 3, 60, 61])
-    with pytest.warns(UserWarning, match=r"'timestamp' \(its frames are 1 to 57 usual steps apart\) does not count"):
+    with pytest.warns(UserWarning, match=r"'timestamp' \(its frames are 1 to 57 usual steps apart\) is overridden"):
         read(control_hz=100.0, timestamp=gap)

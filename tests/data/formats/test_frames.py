@@ -184,7 +184,7 @@ def test_frames_of_a_video(version, tmp_path):
     with pytest.raises(ValueError, match=r"frame \d+: PyAV cannot decode .*mp4.*ffmpeg -i OLD"):
         read(recordings, "front", 1)
     last.unlink()
-    with pytest.raises(ValueError, match=r"frame \d+: .*mp4 is not there \(any more\): convert the data again"):
+    with pytest.raises(ValueError, match=r"frame \d+: .*mp4 is missing: convert the data again"):
         read(recordings, "front", 1)
 
 
@@ -228,7 +228,7 @@ def test_what_is_missing_is_named(tmp_path):
     (tmp_path / "run_1" / "top" / "000004.png").unlink()
     with pytest.raises(
         DataError,
-        match=r"run_1.npz: camera 'top' has 2 frames .*give .* top_times.npy .*leave .* out by drop_columns .* top",
+        match=r"run_1.npz: camera 'top' has 2 frames .*give .* top_times.npy .*drop the camera with drop_columns .* top",
     ):
         read_recordings(tmp_path)
     (tmp_path / "run_1" / "wrist.npy").unlink()

@@ -101,7 +101,7 @@ def test_chosen_features(tmp_path):
 
 def test_faults(tmp_path):
     root = write(tmp_path)
-    with pytest.raises(DataError, match="'observation.images.front' is an image .video.: embed it first"):
+    with pytest.raises(DataError, match="'observation.images.front' is an image .video. and cannot be part of the"):
         read_lerobot(root, observations=["observation.images.front"])
     with pytest.raises(DataError, match="has no feature 'observation.sate'; it has observation.state, "):
         read_lerobot(root, observations=["observation.sate"])
@@ -111,7 +111,7 @@ def test_faults(tmp_path):
 
 def test_a_silent_description_of_missing_actions(tmp_path):
     features = {name: feature for name, feature in FEATURES.items() if name != "action"}
-    with pytest.raises(DataError, match="info.json does not say how many columns an action has"):
+    with pytest.raises(DataError, match="info.json does not give the number of action columns"):
         read_lerobot(write(tmp_path, actions="missing", features=features))
 
 
@@ -132,7 +132,7 @@ FILES = [
     (edited("observation.state", put(3, None)), "trajectory episode 1: states are not finite, first at frame 3"),
     (edited("action", put(5, lambda row: row[:1])), "FILE: column 'action' has rows of 1 and 7 numbers"),
     (edited("action", lambda rows: ["up"] * len(rows)), "FILE: column 'action' must hold numbers or lists of numbers"),
-    (edited("action", lambda rows: [1.0] * len(rows)), "FILE: column 'action' holds double, that of another file list"),
+    (edited("action", lambda rows: [1.0] * len(rows)), "FILE: column 'action' holds double, but list"),
     (lambda t: t.slice(0, 0), "1 episodes are missing: 1"),
     (lambda t: t.slice(0, 4), "FILE: episode 1 has 4 rows, its description says 6"),
     (edited("frame_index", put(5, 9)), "FILE: column 'frame_index' of episode 1 must count 0, 1, 2, ..."),
@@ -175,7 +175,7 @@ def test_missing_episodes_are_told(tmp_path):
 def test_rows_of_an_episode_that_is_not_described_are_told(tmp_path):
     root = write(tmp_path, version="v2.1")
     (root / "meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 6}\n')
-    with pytest.raises(DataError, match="the description of episodes lacks 1, of which there are rows: name in episod"):
+    with pytest.raises(DataError, match="the description of episodes lacks 1, which have rows: name in episod"):
         read_lerobot(root)
     assert read_lerobot(root, episodes=[1]).sources == ("episode 1",)
 

@@ -1,15 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""LeRobot data sets (formats 2.x and 3.0) of any robot, with pyarrow alone.
+"""Reads LeRobot data sets (formats 2.x and 3.0) of any robot; needs only pyarrow.
 
 ::
 
     meta/info.json                     features with their names, fps, totals
     meta/episodes.jsonl                number of rows of every episode                  (2.x)
-    meta/episodes/**/*.parquet         the same                                         (3.0)
+    meta/episodes/**/*.parquet         number of rows of every episode                  (3.0)
     data/**/*.parquet                  one row per frame: observation.state, action, episode_index, frame_index
 
-How the rows are spread over files (one per episode, many episodes per file) does not matter here: they are put together
-by ``episode_index`` and ``frame_index``.
+Rows are assembled by ``episode_index`` and ``frame_index``, whether a file holds one episode or many.
 """
 
 from __future__ import annotations
@@ -30,17 +29,17 @@ from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, read_json, refuse, some
 
 PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
-SURROUNDINGS = "observation.environment_state"  # its columns are told by their names, which begin like it
+SURROUNDINGS = "observation.environment_state"  # its column names get the prefix "environment_state_"
 EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
 IMAGES = ("image", "video")
 INFO = "meta/info.json"
-_LARGEST = 1 << 40  # bytes of a file of rows
+_LARGEST = 1 << 40  # bytes of a data file
 
 
 def read_lerobot(
     root: str | Path, *, observations: Sequence[str] | None = None, episodes: Sequence[int] = (), **options: Any
 ) -> Recordings:
-    """Reads a data set in format 2.x or 3.0, which declares its rate by ``fps``; rows without actions have no label.
+    """Reads a data set in format 2.x or 3.0, with its rate ``fps``; rows without actions have no label.
 
     The options are those of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
@@ -52,7 +51,7 @@ def read_lerobot(
     usable = [name for name in observed if name not in images and known[name].get("dtype") != "string"]
     chosen = usable if observations is None else list(observations)
     problems = [
-        f"feature {name!r} is an image ({known[name].get('dtype')}): embed it first, it cannot be part of the state"
+        f"feature {name!r} is an image ({known[name].get('dtype')}) and cannot be part of the state: embed it first"
         for name in chosen
         if name in images
     ]
@@ -77,8 +76,8 @@ def read_lerobot(
     ]
     refuse(root, problems)
     if ACTION not in first and not width:
-        silent = "no file has actions, and info.json does not say how many columns an action has"
-        raise DataError(root, f"{silent}: say it in {option('action_dim')}")
+        fault = "no file has actions, and info.json does not give the number of action columns"
+        raise DataError(root, f"{fault}: pass {option('action_dim')}")
     names = [label for name in chosen for label in _names(known[name], name, first[name].shape[1])]
     if len(set(names)) < len(names):  # two features with the same names of columns
         names = [label for name in chosen for label in _names({}, name, first[name].shape[1])]
@@ -111,26 +110,26 @@ def read_lerobot(
 
 
 def read_info(root: str | Path) -> dict[str, Any]:
-    """Reads the description of a data set, or says what is wrong with it."""
+    """Reads the description of a data set; raises a DataError if it is invalid."""
     file = Path(root).expanduser() / INFO
     if not file.is_file():
         raise FileNotFoundError(f"no LeRobot data set in {root}: it has no {INFO}")
     info = read_json(file)
     features = info.get("features") or {}
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
-        raise DataError(file, "its features must be dictionaries by name")
+        raise DataError(file, "'features' must be a dictionary of dictionaries")
     if (version := str(info.get("codebase_version", "v3.0")))[:3] not in ("v2.", "v3."):
-        raise DataError(file, f"its codebase_version is {version}; formats 2.x and 3.x are read")
+        raise DataError(file, f"its codebase_version is {version}, wanted 2.x or 3.x")
     return info | {"features": features}
 
 
 def read_rows(
     root: str | Path, features: Sequence[str], *, flags: Sequence[str] = (), episodes: Sequence[int] = ()
 ) -> tuple[dict[int, dict[str, Any]], list[str]]:
-    """Reads of every episode, by its number, columns of numbers, and actions and flags if there are any.
+    """Reads columns of numbers, with actions and flags if present, of every episode by its number.
 
-    They are float64 ``[T, d]``, NaN where a row is empty; ``frame_index`` is ``[T]``. ``file`` is where the rows lie.
-    Columns of the files that are not read come second.
+    They are float64 ``[T, d]``, NaN where a row is empty; ``frame_index`` is ``[T]``, ``file`` their file. The second
+    value lists the columns that are not read.
     """
     root = Path(root).expanduser()
     table, unread = _read_table(root, (*features, EPISODE, FRAME), (ACTION, TIME, *flags))
@@ -154,7 +153,7 @@ def read_rows(
     rows: dict[int, dict[str, Any]] = {}
     unlisted = [number for number in found.tolist() if expected and not episodes and number not in expected]
     if unlisted:
-        said = f"the description of episodes lacks {some(unlisted)}, of which there are rows"
+        said = f"the description of episodes lacks {some(unlisted)}, which have rows"
         problems.append(f"{said}: name in {option('episodes')} those to read")
     for number, start, end in zip(found.tolist(), starts, ends, strict=True):
         if episodes and number not in episodes:
@@ -171,9 +170,9 @@ def read_rows(
 
 
 def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
-    """The rows of all files, sorted: columns that are needed, those wanted that there are, and ``__filename``.
+    """Reads the sorted rows of all files: needed columns, wanted columns if present, and ``__filename``.
 
-    The names of columns that are not read come second.
+    The second value names the columns that are not read.
     """
     pyarrow = import_pyarrow()
     files = sorted((root / "data").rglob("*.parquet"))
@@ -202,7 +201,7 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
             if kind is None:
                 faults.append((str(file), f"column {name!r} must hold numbers or lists of numbers, got {got}"))
             elif kind != kinds[name]:
-                faults.append((str(file), f"column {name!r} holds {got}, that of another file {kinds[name]}"))
+                faults.append((str(file), f"column {name!r} holds {got}, but {kinds[name]} in another file"))
     refuse(root, gathered(faults))
     try:
         data = pyarrow.dataset.dataset(files, schema=pyarrow.schema(list(kinds.items())), format="parquet")
@@ -213,7 +212,7 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
 
 
 def _expected_lengths(root: Path) -> dict[int, int | None]:
-    """Rows of every episode as the description has it, None where it only says that there is such an episode."""
+    """Returns the number of rows of every described episode; None if only the episode's number is known."""
     listed, tables = root / "meta/episodes.jsonl", sorted((root / "meta/episodes").rglob("*.parquet"))
     try:
         if listed.is_file():
@@ -224,18 +223,18 @@ def _expected_lengths(root: Path) -> dict[int, int | None]:
         else:
             return dict.fromkeys(range(int(read_info(root).get("total_episodes") or 0)))
         return {int(entry[EPISODE]): int(entry["length"]) for entry in entries}
-    except Exception as error:  # a damaged list can be wrong in any way
+    except Exception as error:  # damaged lists may raise any exception
         raise DataError(root, f"the list of its episodes cannot be read: {error!r}") from error
 
 
 def _announced(info: Mapping[str, Any], feature: str = ACTION) -> int:
-    """Number of columns of a feature that ``info.json`` announces, 0 if it is silent."""
+    """Returns the number of columns of a feature in ``info.json``, 0 if it gives none."""
     shape = (info["features"].get(feature) or {}).get("shape") or [0]
     return int(shape[0]) if isinstance(shape, list) and isinstance(shape[0], int) else 0
 
 
 def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
-    """Names of a feature's columns: a list (in a list), ``{"motors": [...]}``, ``{"pan": 0, ...}``, or made up."""
+    """Returns a feature's column names: a list (in a list), ``{"motors": [...]}``, ``{"pan": 0, ...}``, or numbers."""
     given, short = feature.get("names"), name.removeprefix(PREFIX)
     if isinstance(given, Mapping):
         listed = next(iter(given.values()), None)

@@ -103,7 +103,7 @@ def make_recordings(
 
     Raises:
         DataError: listing all faults: no trajectories, other widths than in the first, fewer than two frames, states
-            that are not finite numbers, infinite actions, neither ``T`` nor ``T - 1`` actions, an action column with few
+            that are not finite numbers, infinite actions, neither ``T`` nor ``T - 1`` actions, action columns with few
             values, names that do not match.
 
     Examples:

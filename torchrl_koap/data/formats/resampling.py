@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings at another rate: what a state and an action are between two recorded frames."""
+"""Resamples recordings: interpolates states, and holds or sums actions between recorded frames."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torchrl_koap.data.formats.recordings import Recordings, one_each, wrong_rat
 from torchrl_koap.files import DataError, option, refuse, some
 from torchrl_koap.lookup import lookup
 
-# kinds of actions by name: whether they add up over the frames of a longer step; None where the name does not tell
+# kinds of actions: whether they add up over the frames of a longer step; None if the kind does not determine it
 ADDS_UP = {"delta": None, "change": True, "velocity": False, "absolute": False, "raw": False}
-LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
-MOST = 2.0  # new frames in one recorded step
-GAP = 2.5  # steps without a frame, above which a trajectory ends: one lost frame leaves two, and clocks jitter
-_LEVELS = 10  # a column of no more integers is a switch
-_SAME = 1e-3  # share of a step that is rounding
-_UNIT, _MOSTLY = 0.01, 0.9  # how far the length of a quaternion may be from 1; share of frames in which it is that
+LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range and this many times the median step
+MOST = 2.0  # largest number of new frames per recorded step
+GAP = 2.5  # steps without a frame after which a trajectory ends: one lost frame leaves two, and clocks jitter
+_LEVELS = 10  # a column with at most this many values, all integers, is a switch
+_SAME = 1e-3  # rounding error, as a share of a step
+_UNIT, _MOSTLY = 0.01, 0.9  # tolerance of a quaternion's norm; share of the frames that must be within it
 
 
 def resampled(
@@ -30,20 +30,20 @@ def resampled(
     *,
     times: Sequence[np.ndarray] | None = None,
 ) -> Recordings:
-    """Brings recordings to a fixed rate, ``control_hz`` frames per second.
+    """Resamples recordings to a fixed rate, ``control_hz`` frames per second.
 
-    States are interpolated linearly. Where a column leaps (a wrapped angle, a quaternion that changes its sign), and in
-    columns of at most ten integers (a switch), the nearest frame counts, as of cameras. Changes over one frame are
-    summed over the new step; any other action is the current one at its beginning. A step with an unlabelled part has
-    no label. A gap of more than 2.5 steps, recorded or new, ends a trajectory; ``skipped`` counts these.
+    States are interpolated linearly. The nearest frame is used where a column leaps (a wrapped angle, a quaternion that
+    changes sign), in columns of at most ten integers (a switch), and for cameras. Changes over one frame are summed
+    over the new step; other actions take their value at its beginning. A step with an unlabelled part has no label. A
+    gap of more than 2.5 steps, recorded or new, ends a trajectory; ``skipped`` counts these.
 
-    The kind of action is as for :func:`~torchrl_koap.data.make_demonstrations`; ``times`` are the seconds of every
-    frame ``[T_i]``, rising, where they are not as ``recordings.control_hz`` says.
+    ``action_kind`` is as for :func:`~torchrl_koap.data.make_demonstrations`. ``times`` are the increasing times of
+    every frame ``[T_i]`` in seconds. Default: evenly spaced by ``recordings.control_hz``.
 
     Raises:
-        DataError: with all faults: no rate, more than two new frames in a recorded step, labels of the kind
-            ``"delta"``, which does not tell what becomes of them, no trajectory of two new frames.
-        ValueError: for an unknown kind of action.
+        DataError: listing all faults: no rate, more than two new frames in a recorded step, labels of the ambiguous
+            kind ``"delta"``, no trajectory of two new frames.
+        ValueError: if a kind of action is unknown.
     """
     known = recordings.control_hz
     unfit: list[str] = []
@@ -64,13 +64,13 @@ def resampled(
     if dense:
         problems.append(
             f"{control_hz:g} Hz is more than twice the rate of {some(dense)}: {option('resample')} may be at"
-            f" most {MOST / max(usual):.4g}, else most frames would be made up"
+            f" most {MOST / max(usual):.4g}, else most frames would be interpolated"
         )
     problems += unfit
     if not unfit and recordings.num_labels and None in summing:
         problems.append(
             "actions of kind 'delta' may be changes over one frame, which add up over a longer step, or velocities,"
-            f" which hold on: pass {option('action_kind')} 'change' or 'velocity', or 'raw' for torques"
+            f" which are held: pass {option('action_kind')} 'change' or 'velocity', or 'raw' for torques"
         )
     refuse("these recordings", problems)
     adding = np.array(summing, dtype=bool)
@@ -112,7 +112,7 @@ def resampled(
 
 
 def leap_bounds(trajectories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the step above which a column leaps, and its usual step, infinite where it never moves: both ``[d]``."""
+    """Returns the step above which a column leaps, and its median step, infinite if it never moves: both ``[d]``."""
     steps = np.abs(np.concatenate([np.diff(frames, axis=0) for frames in trajectories]))
     spans = np.ptp(np.concatenate(trajectories), axis=0)
     usual = np.array([np.median(moved) if len(moved := step[step > 0]) else np.inf for step in steps.T])
@@ -120,7 +120,7 @@ def leap_bounds(trajectories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndar
 
 
 def quaternion_starts(trajectories: Sequence[np.ndarray]) -> list[int]:
-    """Finds where quaternions begin in ``[T_i, d]``: four neighbouring columns of length 1 in most frames."""
+    """Returns the first columns of quaternions in ``[T_i, d]``: four neighbouring columns, norm 1 in most frames."""
     return [
         start
         for start in range(trajectories[0].shape[1] - 3)
@@ -132,7 +132,7 @@ def quaternion_starts(trajectories: Sequence[np.ndarray]) -> list[int]:
 
 
 def sign_flips(frames: np.ndarray, starts: Sequence[int]) -> np.ndarray:
-    """Marks the steps ``[T - 1, d]`` in which a quaternion of four columns changes its sign."""
+    """Marks the steps ``[T - 1, d]`` in which a quaternion of four columns changes sign."""
     flips = np.zeros((len(frames) - 1, frames.shape[1]), dtype=bool)
     for start in starts:
         turn = frames[:, start : start + 4]
@@ -143,7 +143,7 @@ def sign_flips(frames: np.ndarray, starts: Sequence[int]) -> np.ndarray:
 def _states(
     frames: np.ndarray, times: np.ndarray, new: np.ndarray, bounds: np.ndarray, starts: Sequence[int]
 ) -> np.ndarray:
-    """States ``[T, d]`` at new times within the recorded ones."""
+    """Returns states ``[T, d]`` at new times within the recorded ones."""
     before = np.clip(np.searchsorted(times, new, side="right") - 1, 0, len(times) - 2)
     share = np.clip((new - times[before]) / (times[before + 1] - times[before]), 0, 1)[:, None]
     step = frames[before + 1] - frames[before]
@@ -155,7 +155,7 @@ def _states(
 
 
 def _actions(steps: np.ndarray, times: np.ndarray, new: np.ndarray, adding: np.ndarray, room: float) -> np.ndarray:
-    """Actions ``[T - 1, a]`` of the steps between new times: summed, or the current ones."""
+    """Returns the actions ``[T - 1, a]`` of the steps between new times: summed or held."""
     held = steps[np.searchsorted(times[:-1], new[:-1] + room, side="right") - 1]
     if not adding.any():
         return held

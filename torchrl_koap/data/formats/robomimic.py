@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings from HDF5 files in robomimic's layout, or in ALOHA's.
+"""Reads recordings from HDF5 files in the layout of robomimic or ALOHA.
 
 ::
 
@@ -7,8 +7,8 @@
     data/demo_0/obs/<name>   [T, d] or [T] numbers, side by side the state; frames of a camera [T, H, W, 3]
                              or JPEG or PNG files [T, bytes]
     data/demo_0/actions      [T, a]; may be missing
-    data/demo_0/next_obs     optional; its last row is the frame behind the last action, the others repeat obs
-    data/demo_0/dones        optional, as time stamps, counters and numbers of episodes: [T] beside obs
+    data/demo_0/next_obs     optional; its last row is the frame after the last action, the others repeat obs
+    data/demo_0/dones        optional, like time stamps, counters and numbers of episodes: [T] beside obs
 
     observations/<name>      [T, d] in ALOHA's layout, a demonstration per file
     observations/images/<name>   frames of a camera
@@ -35,12 +35,12 @@ from torchrl_koap.files import DataError, gathered, option, refuse
 from torchrl_koap.lookup import import_extra
 
 NEXT = "next_obs"
-BESIDE = ("episode", "frame", "start", "end")  # what entries beside the observations may be
-_SAME, _ROUNDED = 1e-3, 1e-6  # share of a column's range, and of its numbers, that is rounding
+BESIDE = ("episode", "frame", "start", "end")  # kinds of entries that are read beside obs
+_SAME, _ROUNDED = 1e-3, 1e-6  # rounding errors: share of a column's range, and of its largest number
 
 
 def hdf5_files(source: str | Path) -> list[Path]:
-    """Finds the HDF5 files in a folder, in the order of their numbers; one that is given itself is the only one."""
+    """Returns the HDF5 files of a folder in the order of their numbers, or ``source`` if it is one."""
     beside = sorted(Path(source).glob("[!.]*"), key=lambda path: _number(path.stem))
     found = [Path(source)] if Path(source).is_file() else beside
     return [path for path in found if path.suffix.lower() in (".hdf5", ".h5") and path.is_file()]
@@ -51,10 +51,9 @@ def read_robomimic(
 ) -> Recordings:
     """Reads trajectories from an HDF5 file, or a folder of them.
 
-    Robomimic's declare their rate by ``control_freq`` of ``env_args``. ``observations`` are the entries of ``obs`` that
-    make up the state, in that order. Default: all that are no images, by name. ``next_obs`` is one of the
-    ``drop_columns``, too. The options are those of
-    :func:`~torchrl_koap.data.formats.columns.assemble`.
+    The rate of robomimic's files is ``control_freq`` in ``env_args``. ``observations`` are the entries of ``obs`` that
+    make up the state, in this order. Default: all that are not images, by name. ``drop_columns`` may also hold
+    ``next_obs``. The options are those of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     h5py = import_extra("h5py", "hdf5", "HDF5 files are read with")
     files = hdf5_files(file)
@@ -72,7 +71,7 @@ def read_robomimic(
         skipped += unread
     if len({*rates.values()}) > 1:
         raise DataError(
-            file, f"its files declare other rates: {', '.join(f'{each.name} {hz}' for each, hz in rates.items())}"
+            file, f"its files declare different rates: {', '.join(f'{each.name} {hz}' for each, hz in rates.items())}"
         )
     return assemble(
         pieces,
@@ -88,9 +87,9 @@ def read_robomimic(
 def _read(
     stream: Any, file: Path, observations: Sequence[str] | None, *, use_next: bool
 ) -> tuple[list[Piece], float | None, list[str]]:
-    """Demonstrations, the rate that is declared, and what is not read."""
+    """Returns demonstrations, the declared rate, and the entries that are not read."""
     data = stream.get("data") if "observations" not in stream else {file.stem: _aloha(stream)}
-    if not isinstance(data, Mapping):  # as groups are
+    if not isinstance(data, Mapping):  # h5py groups are mappings
         wanted = (
             "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions), or ALOHA's (observations, action)"
         )
@@ -120,7 +119,7 @@ def _read(
 
 
 def _aloha(stream: Any) -> dict[str, Any]:
-    """The one demonstration of a file in ALOHA's layout, as one in robomimic's."""
+    """Converts the demonstration of a file in ALOHA's layout to robomimic's."""
     beside, observed = {**stream}, {**stream["observations"]}
     observed |= observed.pop("images", {})
     del beside["observations"]
@@ -142,13 +141,13 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
         elif behind and (odd := _other_frame(part[()], last[()])) is not None:
             said = (
                 f"row {odd} of next_obs/{entry} is not row {odd + 1} of obs/{entry}: are frames missing, or out of"
-                f" order? if next_obs means nothing, leave it out by {option('drop_columns')} next_obs"
+                f" order? if next_obs is unused, drop it with {option('drop_columns')} next_obs"
             )
         else:
             states |= spread(entry, np.concatenate([part, last[-1:]] if behind else [part]))
             continue
         faults.append((f"data/{name}", said))
-    if not behind:  # time stamps, counters and ends of episodes may lie beside obs
+    if not behind:  # time stamps, counters and ends of episodes may be beside obs
         frames = len(next(iter(states.values()), ()))
         for entry, part in group.items():
             kind, single = kind_of(entry)[0], len(_shape(part)) > 0 and part.size == len(part)
@@ -158,7 +157,7 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
     cameras = {}
     for film, part in group["obs"].items():
         if len(_shape(part)) == 4 or _is_compressed(part):
-            # where nobody kept the frame behind the last one, that one is taken again
+            # without next_obs of this camera, its last frame is repeated
             last = (len(part) - (film not in following),) if behind else ()
             file = str(Path(part.file.filename).resolve())
             cameras[film] = Clip(file, (*range(len(part)), *last), part.name.removeprefix("/"))
@@ -170,7 +169,7 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
 
 
 def _other_frame(frames: np.ndarray, following: np.ndarray) -> int | None:
-    """The first row ``[T, d]`` that is not the one that followed it by the next observations; None if all are."""
+    """Returns the first row of the next observations ``[T, d]`` that differs from the next frame; None if all match."""
     frames, following = (part.reshape(len(part), -1).astype(np.float64) for part in (frames, following))
     if len(frames) < 2:
         return None
@@ -194,7 +193,7 @@ def _is_table(entry: Any) -> bool:
 
 
 def _is_compressed(entry: Any) -> bool:
-    """Whether every row is the content of a picture's file."""
+    """Checks whether every row is the content of an image file."""
     if len(_shape(entry)) not in (1, 2) or not len(entry) or entry.dtype.kind not in "uOSV":
         return False
     return np.asarray(entry[0]).tobytes().startswith(MAGIC)

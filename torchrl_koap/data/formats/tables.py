@@ -1,18 +1,18 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings from a folder of tables: NumPy archives, CSV or parquet files, a trajectory each.
+"""Reads recordings from a folder of tables, one trajectory each: NumPy archives, CSV or parquet files.
 
 ::
 
-    folder/run_000.npz    states [T, d] (also "state", "observations", "observation", "obs"), actions [T or T - 1, a]
-                          (also "action"), or none; state_names, action_names, control_hz if wanted
+    folder/run_000.npz    states [T, d] (also "state", "observations", "observation", "obs"); optional: actions
+                          [T or T - 1, a] (also "action"), state_names, action_names, control_hz
     folder/run_001.csv    a header; a row per frame; columns "action", "action_*", "Action 0" are actions, "timestamp"
                           or "time" is in seconds, "episode" or "episode_index" splits the file into trajectories, and
                           all others are states; an empty field is NaN
     folder/run_002.parquet  the same; columns may also be lists of numbers
 
-Cameras lie beside a table (:mod:`torchrl_koap.data.formats.frames`).
+Camera frames are beside a table (:mod:`torchrl_koap.data.formats.frames`).
 
-What is not read (further entries of an archive, parquet columns without numbers) is named in ``skipped``.
+``skipped`` names what is not read: other entries of an archive, parquet columns without numbers.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import unknown
 
-# what readers of damaged files raise
+# exceptions of readers for damaged files
 _DAMAGED = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
@@ -45,7 +45,7 @@ _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "fram
 
 
 def table_files(folder: str | Path) -> list[Path]:
-    """Finds the tables in a folder, in the order of their names; one that is given itself is the only one."""
+    """Returns the tables of a folder in the order of their names, or ``folder`` if it is one."""
     found = [Path(folder)] if Path(folder).is_file() else sorted(Path(folder).glob("[!.]*"))
     return [path for path in found if path.suffix.lower() in _READERS and path.is_file()]
 
@@ -53,7 +53,7 @@ def table_files(folder: str | Path) -> list[Path]:
 def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = None, **options: Any) -> Recordings:
     """Reads a folder of tables, or a single one, in the order of their names.
 
-    A table with none of the ``action_columns`` has no actions. In NumPy archives actions are an entry. The options are
+    A table with none of the ``action_columns`` has no actions. NumPy archives hold actions as an entry. The options are
     those of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     folder, files = Path(folder), table_files(folder)
@@ -76,13 +76,13 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     refuse(folder, gathered(faults) or _lacking(pieces, action_columns or ()))
     counted = {name: kind_of(name) for piece in pieces if not piece.declared_hz for name in piece.states}
     counted = {name: kind for name, kind in counted.items() if kind[0] in ("clock", "frame")}
-    if "clock" in [kind for kind, _ in counted.values()]:  # files that say their rate beside files with time stamps
+    if "clock" in [kind for kind, _ in counted.values()]:  # some files declare a rate, others have time stamps
         pieces = [_stamped(piece, counted) for piece in pieces]
     rates = [piece.declared_hz for piece in pieces if piece.declared_hz]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
         if "resample" not in options or len(rates) < len(pieces):
             said = f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second"
-            cure = f"pass {option('resample')} to bring them to one rate, or {option('control_hz')}"
+            cure = f"pass {option('resample')} to resample them to one rate, or {option('control_hz')}"
             raise DataError(folder, f"{said}: {cure}")
         pieces = [_stamped(piece, {"timestamp": ("clock", 1.0)}) for piece in pieces]
     beside = {file.with_suffix("") for file in files}
@@ -97,7 +97,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
 
 
 def _lacking(pieces: Sequence[Piece], action_columns: Sequence[str]) -> list[str]:
-    """Faults of files with some of the action columns and not all, and of columns that no file has."""
+    """Reports files with only some of the action columns, and columns that no file has."""
     every = dict.fromkeys(name for piece in pieces for name in (*piece.states, *(piece.actions or ())))
     lacking = [
         (piece.name, f"lacks {some(missing)} of {option('action_columns')}")
@@ -108,7 +108,7 @@ def _lacking(pieces: Sequence[Piece], action_columns: Sequence[str]) -> list[str
 
 
 def _stamped(piece: Piece, counted: Mapping[str, tuple[str | None, float]]) -> Piece:
-    """A piece that declares its rate with the time stamps and counts of frames that others have, unless it has some."""
+    """Gives a piece that declares a rate the time stamps and frame counts of the others, unless it has its own."""
     if not piece.declared_hz:
         return piece
     rows, stamps = np.arange(piece.frames), np.arange(piece.frames) / piece.declared_hz
@@ -151,7 +151,7 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
             unread.append(name)
             continue
         if flags is not None and kind == "start":
-            flags = np.roll(flags, 1)  # the first frame of an episode lies behind the last one of another
+            flags = np.roll(flags, 1)  # the first frame of an episode follows the last one of another
         states[name] = _frame_entry(name, values, len(frames)) if flags is None else flags
         unclear += [name] if kind is None else []
     if acting is not None:
@@ -163,7 +163,7 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
 
 
 def _declared(entry: np.ndarray | None) -> float | None:
-    """Frames per second, where an archive says it."""
+    """Returns the frames per second that an archive declares, or None."""
     if entry is None:
         return None
     found = as_numbers("control_hz", entry.ravel())
@@ -173,7 +173,7 @@ def _declared(entry: np.ndarray | None) -> float | None:
 
 
 def _named_alike(pieces: list[Piece]) -> list[Piece]:
-    """Archives without names take those of the first archive of their width that has some."""
+    """Names the columns of archives without names like those of the first named archive of the same width."""
 
     def named(columns: Any, made_up: str, others: list[Any]) -> Any:
         if not columns or made_up not in columns:
@@ -197,9 +197,9 @@ def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, 
 
 
 def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:
-    """Flags ``[length]`` of the last frames of episodes, of the lengths, ends or starts that the kind of an entry says.
+    """Converts lengths, ends or starts of episodes, by the kind of an entry, to flags ``[length]`` of last frames.
 
-    Of an entry of no kind they are there if its numbers could be lengths or ends.
+    An entry without kind is converted if its numbers could be any of these; returns None if they could not.
     """
     if values.ndim != 1 or values.dtype.kind not in "iu" or not 0 < len(values) < length:
         return None
@@ -216,11 +216,11 @@ def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | 
 
 
 def _frame_entry(name: str, values: np.ndarray, length: int) -> np.ndarray:
-    """An entry about frames, one number each, or the name of an episode."""
+    """Converts an entry with one number, or name of an episode, per frame."""
     if values.shape not in ((length,), (length, 1)):
         raise ValueError(
-            f"entry {name!r} must have one number for each of {length} frames, or for each episode its end, start or"
-            f" length so that all frames are of one; got {values.dtype} {list(values.shape)}"
+            f"entry {name!r} must have one number for each of {length} frames, or the ends, starts or lengths of"
+            f" episodes that cover all frames; got {values.dtype} {list(values.shape)}"
         )
     found = as_numbers(name, values.ravel())
     if found is None:
@@ -250,7 +250,7 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> Piece:
     if len(rows) < 2:
         raise ValueError("wanted a header and a row per frame")
     header = [" ".join(name.strip("# ").split()) for name in rows[0][1]]
-    header[0] = header[0] or "unnamed: 0"  # the index of the rows, as pandas writes and reads it
+    header[0] = header[0] or "unnamed: 0"  # the row index of pandas
     if None not in map(number_of, header):
         raise ValueError("its first row holds numbers, wanted the names of the columns")
     for place, name in enumerate(header):
@@ -296,7 +296,7 @@ _READERS = {".npz": _read_npz, ".csv": _read_csv, ".parquet": _read_parquet}
 
 
 def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns: Sequence[str] | None) -> Piece:
-    """States and actions of a table with named columns, None where they hold no numbers."""
+    """Splits a table into states and actions; columns are None if they hold no numbers."""
     acting = [name for name in columns if is_action(name)]
     if action_columns is not None:
         acting = [name for name in action_columns if name in columns]  # none: a recording without actions

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings as NumPy archives, or as a LeRobot data set (format 3.0) with or without camera frames."""
+"""Writes recordings as NumPy archives, or as a LeRobot data set (format 3.0) with or without camera frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, option, replacing_file
 
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_CHUNK = 1000  # files in a folder
+_CHUNK = 1000  # files per folder
 
 
 def write_npz(recordings: Recordings, out: Path) -> None:
@@ -44,13 +44,13 @@ def write_lerobot(recordings: Recordings, out: Path) -> None:
 
 
 class LeRobotWriter:
-    """A LeRobot data set that is written episode by episode; :meth:`close` finishes it.
+    """Writes a LeRobot data set episode by episode; :meth:`close` completes it.
 
-    ``state_names`` are the columns of ``observation.state``, ``action_names`` those of ``action``, empty where nothing
-    has any. Frames are the feature ``camera``. ``embodiment`` says who demonstrates, ``task`` what is done, in words.
+    ``state_names`` are the columns of ``observation.state``, ``action_names`` those of ``action``, empty without
+    actions. Frames become the feature ``camera``. ``embodiment`` names the demonstrator, ``task`` describes the task.
 
     Raises:
-        FileExistsError: if the folder holds anything.
+        FileExistsError: if the folder is not empty.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class LeRobotWriter:
     def add(self, states: np.ndarray, actions: np.ndarray | None = None, *, frames: np.ndarray | None = None) -> None:
         """Writes an episode of states ``[T + 1, d]``, actions ``[T, a]`` and camera frames uint8 ``[T + 1, H, W, 3]``.
 
-        LeRobot has an action per row: behind the last frame the one before is repeated.
+        LeRobot stores an action per row, so the last frame repeats the last action.
         """
         number, numbers = len(self._lengths), np.arange(len(states))
         columns: dict[str, Any] = {STATE: states}
@@ -98,7 +98,7 @@ class LeRobotWriter:
         self._lengths.append(len(states))
 
     def close(self) -> Path:
-        """Writes the description, which makes the data set a finished one; returns the folder."""
+        """Writes the description, which completes the data set; returns the folder."""
         lengths = np.array(self._lengths)
         ends, files = lengths.cumsum(), np.arange(len(lengths))
         listed = {
@@ -147,7 +147,7 @@ class LeRobotWriter:
 
 
 def encode_png(frame: np.ndarray) -> bytes:
-    """A picture uint8 ``[H, W, 3]`` as PNG."""
+    """Encodes an image uint8 ``[H, W, 3]`` as PNG."""
     from PIL import Image
 
     buffer = io.BytesIO()
