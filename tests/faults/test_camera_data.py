@@ -116,7 +116,7 @@ FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
     ),
     "a camera absent": (
         "'wrist' has no frames in 1.npz",
-        r"wrist.npy is not there \(any more\)",
+        r"wrist.npy is missing",
         lambda folder: (folder / WRIST).unlink(),
     ),
     "no array": (*("wrist.npy holds no array of numbers",) * 2, lambda folder: (folder / WRIST).write_bytes(b"array")),
