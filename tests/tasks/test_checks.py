@@ -19,7 +19,7 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
         ({"command": "order"}, "command: no part 'order'"),
         ({"actions": {}}, "actions: none"),
         ({"state": {"tool": "plan"}}, "state: part 'tool' has an unknown feature 'plan'; known: plain, plane"),
-        ({"state": {"command": "plain"}}, "'command' repeats the command, which gives hidden actions away"),
+        ({"state": {"command": "plain"}}, "'command' repeats the command, which reveals hidden actions"),
         ({"hidden": ("tool", "box_xy", "box_tan_yaw")}, "state: nothing remains"),
         ({"actions": {"x": "m"}}, r"actions: wanted 'x': Action\('m'\), got 'm'"),
         (
@@ -34,9 +34,9 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
         ({"observation_parts": {**TOY["observation_parts"], "more": ("tool_0",)}}, "columns named twice: tool_0"),
         (
             {"scene": Scene(bodies=(BOX, LID), shared_starts=HERE)},
-            "scene: bodies have starts of their own or share them, not both",
+            "scene: give shared_starts or starts of bodies, not both",
         ),
-        ({"scene": Scene(bodies=(BOX, replace(LID, starts=())))}, "scene: no region is for the body 'lid'"),
+        ({"scene": Scene(bodies=(BOX, replace(LID, starts=())))}, "scene: body 'lid' has no start region"),
         (
             {"scene": Scene(bodies=(replace(BOX, starts=()), replace(LID, starts=())), shared_starts=HERE)},
             "scene.shared_starts: 1 regions for 2 bodies",

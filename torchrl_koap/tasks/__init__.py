@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a task is: columns, goal, modes, looks, and the names of the code that simulates it; no simulator."""
+"""Tasks: columns, goal, modes, appearance, and the names of the simulation code, which is not imported here."""
 
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.columns import Columns

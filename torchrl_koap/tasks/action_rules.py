@@ -1,10 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What an action means, and how decoded numbers become actions: absolute targets and grippers.
+"""Meaning of action columns, and rules that turn decoded numbers into actions: absolute targets and grippers.
 
 D3IL's data hold no gripper command: their action is the next measured width, and the environment opens above 0.075 m.
-While the fingers open, the next widths are numbers that mean "close" when sent, so a policy that sends them never
-opens. The command of a gripper is therefore 0.08 m as long as the fingers are on the way to open, and the next width
-otherwise.
+While the fingers open, the next widths are below that and mean "close", so a policy that sends them never opens. The
+gripper command is therefore 0.08 m while the fingers are opening, and the next width otherwise.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ import torch
 from torch import Tensor
 
 OPEN_ABOVE = 0.075  # m; a greater gripper command opens the fingers, any other closes them
-PLANNED_OPEN_ABOVE = 0.07  # m; half way from a box held to fingers open: plans err by some millimetres
-OPEN = 0.08  # m; distance of the fingers
+PLANNED_OPEN_ABOVE = 0.07  # m; half way between holding a box and open: plans err by some millimetres
+OPEN = 0.08  # m; distance of open fingers
 OPENING = 5  # control steps that the fingers need to open
-_MOVES = 1e-4
+_MOVES = 1e-4  # m; larger increases of the width are movement
 ActionKind = Literal["delta", "absolute", "raw", "gripper"]
 
 
@@ -30,12 +29,12 @@ class Action:
 
     Args:
         unit (str): such as ``"m"``, ``"rad"``, ``"N"`` or ``""``; errors are averaged over columns of one unit.
-        kind (str): ``"delta"``: a change of a command or a velocity, small where the robot stands still;
-            ``"absolute"``: a command itself; ``"raw"``: anything else, such as a torque or a normalised
-            target, of which nothing is assumed; ``"gripper"``: an absolute one that is read off planned widths.
-        column (int, optional): state column that a ``"delta"`` moves, that an ``"absolute"`` action is the target of
-            (controllers then decode the distance to it), or in which a ``"gripper"`` tells its width.
-        constant (float, optional): what it always is, whatever is decoded. Default: it differs.
+        kind (str): ``"delta"``: a change of a command or a velocity, small when the robot stands still;
+            ``"absolute"``: the command itself; ``"gripper"``: an absolute command computed from planned widths;
+            ``"raw"``: anything else, such as a torque or a normalised target; nothing is assumed about it.
+        column (int, optional): state column that a ``"delta"`` moves, that is the target of an ``"absolute"`` action
+            (controllers then decode the distance to it), or that holds the width of a ``"gripper"``.
+        constant (float, optional): constant value that overrides the decoded one. Default: none.
     """
 
     unit: str = ""
@@ -48,25 +47,25 @@ class Action:
 class ActionRule:
     """Turns decoded actions into those that the robot takes."""
 
-    # action column and state column of a gripper whose command is read off the widths (:func:`gripper_command`)
+    # action column and state column of a gripper whose command follows from its widths (:func:`gripper_command`)
     gripper: tuple[int, int] | None = None
-    # action column and state column of each action of which the controller has decoded the distance from the state
+    # action column and state column of each action that the controller decodes as a distance from the state
     distances: Sequence[tuple[int, int]] = ()
-    constants: Mapping[int, float] = field(default_factory=dict)  # what action columns always are, by number
+    constants: Mapping[int, float] = field(default_factory=dict)  # constant action columns by number
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
         """Returns the actions ``[*B, T, act]`` in states ``[*B, T, d]``."""
         actions = shift_actions(actions, states, self.distances)
         for entry, value in self.constants.items():
             actions[..., entry] = value
-        if self.gripper is not None:  # the last frame, which nothing follows, stays as it is
+        if self.gripper is not None:  # the last frame has no next width and stays as decoded
             entry, column = self.gripper
             actions[..., :-1, entry] = gripper_command(states[..., column], open_above=PLANNED_OPEN_ABOVE)
         return actions
 
 
 def shift_actions(actions: Tensor, states: Tensor, distances: Sequence[tuple[int, int]], sign: int = 1) -> Tensor:
-    """Adds to actions ``[*B, act]`` the states ``[*B, d]`` that they are distances from; with ``sign`` -1 subtracts."""
+    """Adds states ``[*B, d]`` to actions ``[*B, act]`` that are distances from them; ``sign`` -1 subtracts them."""
     moved = actions.clone()
     for entry, column in distances:
         moved[..., entry] = moved[..., entry] + sign * states[..., column]
@@ -74,7 +73,7 @@ def shift_actions(actions: Tensor, states: Tensor, distances: Sequence[tuple[int
 
 
 def gripper_command(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:
-    """Computes gripper commands ``[*B, T - 1]`` (m; above 0.075 opens) from widths ``[*B, T]`` (m), open above one."""
+    """Computes gripper commands ``[*B, T - 1]`` (m; above 0.075 opens); widths ``[*B, T]`` (m) above one are open."""
     now, following = width[..., :-1], width[..., 1:]
     padded = torch.cat([following, width[..., -1:].expand(*width.shape[:-1], OPENING - 1)], -1)
     soon = padded.unfold(-1, OPENING, 1).amax(-1)

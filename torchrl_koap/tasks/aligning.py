@@ -26,7 +26,7 @@ _POSES = dict(zip((*_BOX, *_TARGET), (3, 4, 3, 4), strict=True))  # their column
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether the tray is near to its target and turned like it, bool ``[*B]`` of states ``[*B, d]``."""
+    """Returns whether the tray is at its target with the same yaw, bool ``[*B]``, for states ``[*B, d]``."""
     part = {name: state[..., columns] for name, columns in task.state_slices.items()}
     distance = (part["box_position"] - part["target_position"]).norm(dim=-1)
     cosine = torch.nn.functional.cosine_similarity(part["box_quaternion"], part["target_quaternion"], dim=-1)

@@ -17,7 +17,7 @@ from torchrl_koap.tasks.task import Defaults, Task
 FINISH_Y = 0.35  # m
 ROD_RADIUS = 0.01  # m
 ROW_Y = (-0.1, 0.08, 0.26)  # y of the rows of cylinders (m)
-ROW_REACH = 0.03  # m before and behind a row of cylinders: the gap is the one at the first frame within it
+ROW_REACH = 0.03  # m before and behind a row of cylinders: the first frame within it decides the gap
 # name, x, y, radius, half height (m)
 OBSTACLES = (
     ("row1", 0.5, ROW_Y[0], 0.03, 0.07),
@@ -27,19 +27,19 @@ OBSTACLES = (
     ("row3_mid", 0.5, ROW_Y[2], 0.025, 0.1),
     ("row3_right", 0.65, ROW_Y[2], 0.025, 0.1),
 )
-# whether each of the gaps was passed, two, three and four of the rows, in every mode
+# for every mode, whether each gap was passed; the rows have two, three and four gaps
 _FLAGS = tuple(
     tuple(int(gap in gaps) for gap in range(9)) for gaps in itertools.product((0, 1), (2, 3, 4), (5, 6, 7, 8))
 )
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether the tool is behind the finish line, bool ``[*B]`` of states ``[*B, d]``."""
+    """Returns whether the tool is behind the finish line, bool ``[*B]``, for states ``[*B, d]``."""
     return state[..., 1] > FINISH_Y
 
 
 def mode_of_path(path: np.ndarray) -> int:
-    """Returns the mode of recorded positions ``[T, 2]`` of the tool (m): on which side it passes the cylinders."""
+    """Returns the mode of tool positions ``[T, 2]`` (m) by the gaps that they pass; -1 if a row is not reached."""
     mode = 0
     for y in ROW_Y:
         cylinders = [x for _, x, row, *_ in OBSTACLES if row == y]

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Whether the facts of a task fit each other."""
+"""Checks that the fields of a task are consistent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENTROPIES = ("all", "contexts", "solved_contexts")
 
 
 def check_task(task: Task) -> None:
-    """Checks a task."""
+    """Raises a ValueError that lists all faults of a task."""
     faults = [*_own_faults(task), *_action_faults(task), *(list(_part_faults(task)) or _column_faults(task))]
     faults += _body_faults(task)
     if faults:
@@ -27,7 +27,7 @@ def _own_faults(task: Task) -> Iterator[str]:
     if not task.name or not isinstance(task.name, str):
         yield f"name: wanted a name, got {task.name!r}"
     elif set("/\\") & set(task.name) or task.name in (".", ".."):
-        yield f"name: part of the names of files, it may hold no / or \\, got {task.name!r}"
+        yield f"name: used in file names, so it may hold no / or \\, got {task.name!r}"
     if not task.observation_parts:
         yield "observation_parts: none"
     if task.modes.entropy not in ENTROPIES:
@@ -40,15 +40,15 @@ def _action_faults(task: Task) -> Iterator[str]:
     if not task.actions:
         yield "actions: none"
     actions: Mapping[str, Any] = task.actions
-    strange = {name: action for name, action in actions.items() if not isinstance(action, Action)}
-    if strange:
-        yield from (f"actions: wanted {name!r}: Action({given!r}), got {given!r}" for name, given in strange.items())
+    invalid = {name: action for name, action in actions.items() if not isinstance(action, Action)}
+    if invalid:
+        yield from (f"actions: wanted {name!r}: Action({given!r}), got {given!r}" for name, given in invalid.items())
         return
     for name, action in actions.items():
         if action.kind not in get_args(ActionKind):
             yield f"actions: {name!r} is of kind {action.kind!r}; known: {', '.join(get_args(ActionKind))}"
         elif action.kind == "raw" and action.column is not None:
-            yield f"actions: {name!r} is raw, of which no column is known, got column {action.column}"
+            yield f"actions: {name!r} is raw, which has no column, got column {action.column}"
     if task.defaults.commands and (task.command is None or not task.delta_actions):
         yield "defaults.commands: no action is the change of a command that the observation repeats (command)"
     if sum(action.kind == "gripper" for action in actions.values()) > 1:
@@ -71,12 +71,12 @@ def _part_faults(task: Task) -> Iterator[str]:
         if kind not in FEATURES:
             yield f"state: part {part!r} has an unknown feature {kind!r}; known: {', '.join(sorted(FEATURES))}"
     if task.command is not None and task.command in task.state:
-        yield f"state: {task.command!r} repeats the command, which gives hidden actions away"
+        yield f"state: {task.command!r} repeats the command, which reveals hidden actions"
 
 
 def _column_faults(task: Task) -> Iterator[str]:
     if not task.state_parts:
-        yield "state: nothing remains without the command and the hidden parts"
+        yield "state: no part is left besides the command and the hidden parts"
         return
     names = task.observation_names
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -102,8 +102,8 @@ def _body_faults(task: Task) -> Iterator[str]:
             yield f"interchangeable: no body {name!r}"
     shared, without = len(task.scene.shared_starts), [body.name for body in task.bodies if not body.starts]
     if shared and len(without) < len(task.bodies):
-        yield "scene: bodies have starts of their own or share them, not both"
+        yield "scene: give shared_starts or starts of bodies, not both"
     elif shared and shared < len(task.bodies):
         yield f"scene.shared_starts: {shared} regions for {len(task.bodies)} bodies"
     elif not shared and 0 < len(without) < len(task.bodies):
-        yield from (f"scene: no region is for the body {name!r}" for name in without)
+        yield from (f"scene: body {name!r} has no start region" for name in without)

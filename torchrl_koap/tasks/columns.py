@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Columns of observation and state: their names and units, and angles without poles.
 
-D3IL hands out ``tan(yaw)``, which has poles, and whole quaternions, of which a box on a table uses one angle. Both
-become a point on the unit circle; ``tan(yaw)`` tells the yaw up to half a turn only.
+D3IL provides ``tan(yaw)``, which has poles, and full quaternions, of which a box on a table uses one angle. Both become
+a point on the unit circle; ``tan(yaw)`` determines the yaw only up to half a turn.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
     return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2)))
 
 
-# what the state shows of a part, and how its columns are called then; those of a plain part keep their names
+# features of parts in the state: function and column names; columns of a plain part keep their names
 FEATURES: dict[str, tuple[Callable[[Tensor], Tensor], tuple[str, ...]]] = {
     "plain": (lambda columns: columns, ()),
-    "plane": (lambda position: position[..., :2], ("x", "y")),  # its height is that of the surface it lies on
+    "plane": (lambda position: position[..., :2], ("x", "y")),  # for bodies on a surface, whose height is constant
     "tan_yaw": (double_yaw, ("cos_2yaw", "sin_2yaw")),
     "quaternion": (yaw_of, ("cos_yaw", "sin_yaw")),
 }
@@ -50,16 +50,16 @@ class Columns:
     """Names and order of the columns of observation and state.
 
     Args:
-        name (str): whose columns they are.
+        name (str): owner of the columns, such as the task.
         observation_parts (dict): parts of the observation in the order of the columns: a number of columns, or their
-            names. Numbered ones are called as the part, with a number if it has several.
+            names. A number gives columns the name of the part, numbered if there are several.
         observation_units (tuple of str): unit of every observation column; empty: see :attr:`known_units`.
-        observation_origin (tuple of float): what was subtracted from every column of the data, so that float32 holds
-            them; robots report and take numbers with it (:class:`~torchrl_koap.modules.Agent`). Empty: nothing.
+        observation_origin (tuple of float): offset subtracted from every column of the data, so that float32 resolves
+            them; robots report and take values with it (:class:`~torchrl_koap.modules.Agent`). Empty: none.
         command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
             never shown to planner or controller. None: the observation holds no command.
-        state (dict): part of the observation to name of its feature (``FEATURES``), in the order of the state. Empty:
-            every part but the command and the hidden ones, unchanged.
+        state (dict): parts of the observation with their feature (``FEATURES``), in the order of the state. Empty:
+            all parts except the command and the hidden ones, unchanged.
         hidden (tuple of str): further parts that planner and controller must not see.
 
     Examples:
@@ -86,7 +86,7 @@ class Columns:
 
     @property
     def command_columns(self) -> slice | None:
-        """Observation columns that repeat the last command, None where none do."""
+        """Observation columns that repeat the last command; None if there are none."""
         return None if self.command is None else self.observation[self.command]
 
     @property
@@ -96,12 +96,12 @@ class Columns:
 
     @property
     def observation_names(self) -> tuple[str, ...]:
-        """Names of the observation columns: those given, else the part's with a number."""
+        """Names of the observation columns: as given, else the part's name with a number."""
         return tuple(name for part in self.observation_parts for name in self._column_names(part))
 
     @cached_property
     def state_parts(self) -> dict[str, str]:
-        """Parts that make up the state, in its order, with the name of their feature."""
+        """Parts of the state in its order, with the name of their feature."""
         if self.state:
             return {name: kind for name, kind in self.state.items() if name not in self.hidden}
         dropped = {self.command, *self.hidden}
@@ -115,7 +115,7 @@ class Columns:
 
     @cached_property
     def state_slices(self) -> dict[str, slice]:
-        """State columns of every part that is seen."""
+        """State columns of every part."""
         return _slices({part: len(self._feature_names(part, kind)) for part, kind in self.state_parts.items()})
 
     @property
@@ -130,14 +130,14 @@ class Columns:
 
     @property
     def known_units(self) -> tuple[str, ...]:
-        """Unit of every observation column; where a task says none, metres of parts called positions, rad of joints."""
+        """Unit of every observation column. Without ``observation_units``: m for positions, rad for joints, by name."""
         called = {"_xy": "m", "_xyz": "m", "_position": "m", "joints": "rad"}
         unit = {part: next((u for end, u in called.items() if part.endswith(end)), "") for part in self.observation}
         return self.observation_units or tuple(unit[part] for part in unit for _ in self._column_names(part))
 
     @property
     def state_units(self) -> tuple[str, ...]:
-        """Unit of every state column: that of its observation column where the part is unchanged, else ``""``."""
+        """Unit of every state column: that of its observation column if the part is plain, else ``""``."""
         given = self.observation_units or ("",) * self.observation_dim
         units: list[str] = []
         for part, kind in self.state_parts.items():
@@ -149,7 +149,7 @@ class Columns:
         """Selects the state ``[*B, d]`` that planner and controller see from observations ``[*B, obs]``.
 
         Raises:
-            ValueError: if the last axis has another size than the task's observation.
+            ValueError: if the last axis differs in size from the task's observation.
         """
         if observation.shape[-1] != self.observation_dim:
             raise ValueError(
@@ -169,7 +169,7 @@ class Columns:
 
 
 def _slices(widths: Mapping[str, int]) -> dict[str, slice]:
-    """Columns of parts that lie side by side."""
+    """Returns the slices of adjacent parts by their widths."""
     slices, start = {}, 0
     for part, width in widths.items():
         slices[part] = slice(start, start + width)
@@ -178,12 +178,12 @@ def _slices(widths: Mapping[str, int]) -> dict[str, slice]:
 
 
 def thousandths(unit: str) -> tuple[str, float]:
-    """Returns the unit in which small values are shown, and the factor to it; metres become millimetres here."""
+    """Returns the unit for showing small values and the factor to it, such as ``("mm", 1e3)`` for metres."""
     return (_THOUSANDTHS[unit], 1e3) if unit in _THOUSANDTHS else (unit, 1.0)
 
 
 def unit_groups(units: Sequence[str]) -> dict[str, list[int]]:
-    """Groups columns by their units, in the order in which the units come."""
+    """Groups columns by unit, in order of appearance of the units."""
     groups: dict[str, list[int]] = {}
     for column, unit in enumerate(units):
         groups.setdefault(unit, []).append(column)

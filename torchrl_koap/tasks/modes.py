@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Modes, the ways in which a task can be done: their number, their names, and how an environment reports them."""
+"""Modes, the ways in which a task can be done: their number, their names, and how environments report them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class Modes:
     """The ways in which a task can be done.
 
     Args:
-        choices (tuple): what a mode is made of, slowest digit first: ``(choice, names of its values)`` each.
-        leaves (tuple): the environment's leaf ``mode`` in every mode, or how it begins there, in the order of their
-            numbers. Empty: there is one mode.
-        entropy (str): over which episodes the entropy of the modes is taken: ``"all"`` successful ones together, or
+        choices (tuple): the choices that make up a mode, each ``(choice, names of its values)``, slowest digit first.
+        leaves (tuple): the environment's leaf ``mode``, or its first entries, for every mode number. Empty: there is
+            one mode.
+        entropy (str): episodes that the entropy of modes is computed over: ``"all"`` successful ones together, or
             per context and then averaged over ``"contexts"`` or ``"solved_contexts"`` (those with a success).
         of_path (str, optional): import string of the function from recorded positions of the tool ``[T, 2]`` (numpy, m)
-            to the number of the mode, -1 while it is not decided; None where the path does not tell.
+            to the number of the mode, -1 if undecided; None if the path does not determine it.
 
     Examples:
         >>> from torchrl_koap.tasks import Modes
@@ -40,11 +40,11 @@ class Modes:
 
     @property
     def number(self) -> int:
-        """Number of modes; 1 where nothing is to choose."""
+        """Number of modes; 1 if there are no choices."""
         return math.prod(len(names) for _, names in self.choices)
 
     def name_of(self, index: int) -> str:
-        """Names a mode by its choices, the slowest first; ``"no mode"`` where the number is none of them."""
+        """Names a mode by its choices, slowest first; ``"no mode"`` for a number out of range."""
         if not 0 <= index < self.number:
             return "no mode"
         words = []
@@ -54,10 +54,10 @@ class Modes:
         return ", ".join(reversed(words))
 
     def index_of(self, leaf: Tensor) -> Tensor:
-        """Numbers the modes of leaves ``mode`` ``[*B, entries]``, int64 ``[*B]``, -1 while none is decided.
+        """Returns the mode numbers of leaves ``mode`` ``[*B, entries]``, int64 ``[*B]``, -1 while undecided.
 
         Raises:
-            ValueError: if a leaf has fewer entries than those of the modes.
+            ValueError: if a leaf has fewer entries than ``leaves``.
         """
         leaves = torch.tensor(self.leaves or ((),), device=leaf.device)
         entries = leaves.shape[-1]
@@ -68,10 +68,10 @@ class Modes:
 
 
 def note_arrivals(orders: np.ndarray, distance: np.ndarray, inside: np.ndarray) -> None:
-    """Notes which bodies have arrived, as D3IL does: at most one per call, the nearest that is not noted yet.
+    """Records which bodies have arrived, as D3IL does: at most one per call, the nearest that is not recorded yet.
 
-    ``orders`` ``[n, bodies]`` get their numbers in the order of arrival, -1 behind the last; ``distance`` (m) and
-    ``inside``, bool, say how far from its goal each body is and whether it is there. One that leaves stays noted.
+    Writes body numbers into ``orders`` ``[n, bodies]`` in order of arrival, -1 after the last. ``distance`` (m) is that
+    of each body from its goal; ``inside``, bool, is whether it is there. Bodies that leave again stay recorded.
     """
     noted = (orders[:, :, None] == np.arange(orders.shape[1])).any(1)
     nearest = np.where(noted, np.inf, distance).argmin(1)

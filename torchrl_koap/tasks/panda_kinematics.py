@@ -6,8 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# offset along the parent's axes (m) and the fixed quarter turns about x that follow it, for joints 1 to 7
-# compiled callers in other files are cached by Numba without regard to this file: clear __pycache__ after a change
+# for joints 1 to 7: offset along the parent's axes (m), then fixed quarter turns about x
+# Numba's cache of compiled callers in other files ignores changes of this file: clear __pycache__ after a change
 LINKS = (
     ((0.0, 0.0, 0.333), 0),
     ((0.0, 0.0, 0.0), -1),

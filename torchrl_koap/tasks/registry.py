@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The tasks there are: registered by import, or found through the entry-point group ``torchrl_koap.tasks``."""
+"""Registry of tasks: registered by import, or found through the entry-point group ``torchrl_koap.tasks``."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ TASKS: dict[str, Task] = {}
 
 
 def register_task(task: Task) -> Task:
-    """Makes a task known by its name, to Python and to every command.
+    """Registers a task by its name, for Python and all commands.
 
-    A task of one's own is registered by importing the module that does so: by hand, with ``koap ... --plugin module``,
-    or through an entry point of the group ``torchrl_koap.tasks`` (a module, or a :class:`Task` in it) of an installed
-    package.
+    To register a task of your own, import the module that calls this function: by hand, with ``koap ... --plugin
+    module``, or through an entry point in the group ``torchrl_koap.tasks`` (a module, or a :class:`Task` in it) of an
+    installed package.
 
     Returns:
-        Task: the task, which may be registered again.
+        Task: the task. Registering an equal task again is allowed.
 
     Raises:
         ValueError: if another task has the name.
@@ -41,10 +41,10 @@ def register_task(task: Task) -> Task:
 
 
 def get_task(name: Task | str) -> Task:
-    """Looks a task up by name; installed packages are asked if the name is not known yet.
+    """Looks a task up by name; searches the entry points of installed packages if the name is unknown.
 
     Returns:
-        Task: the registered task; a task itself.
+        Task: the registered task, or ``name`` if it is a task.
 
     Raises:
         ValueError: if the name is unknown; the message suggests the nearest one.
@@ -64,9 +64,9 @@ def get_task(name: Task | str) -> Task:
 
 
 def task_from(name: str, definition: object) -> Task:
-    """Finds the task of a data set or run: the one that it brings along, as :meth:`Task.to_json` wrote it, or names.
+    """Returns the task of a data set or run: from its definition as :meth:`Task.to_json` wrote it, or by its name.
 
-    A folder that somebody sent must not decide what is run: a definition that names code is refused.
+    A definition that names code is refused: a received folder must not choose the code that runs.
     """
     if definition is None:
         return get_task(name)

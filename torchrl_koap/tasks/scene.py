@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How a task looks from above, in plain numbers: what stands still, and the bodies that a context places."""
+"""Top view of a task in plain numbers: fixed shapes, and the bodies that a context places."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ Region = tuple[tuple[float, float], tuple[float, float]]
 
 @dataclass(frozen=True)
 class Shape:
-    """A circle, rectangle or line that stands still (lengths in m).
+    """A fixed circle, rectangle or line (lengths in m).
 
     Args:
         kind (str): ``"circle"``, ``"rectangle"`` (sides along x and y) or ``"line"``.
         center (tuple of float): x, y of its centre.
-        half (tuple of float): half its extent along x and y; of a circle the radius, twice; of a line the way from its
-            centre to its end.
-        role (str): what it is: ``"obstacle"``, ``"clearance"``, ``"finish"``, ``"region"``, ``"platform"``,
-            ``"wall"``, ``"zone"`` or ``"target"``.
+        half (tuple of float): half its extent along x and y; for a circle the radius, twice; for a line the vector from
+            its centre to its end.
+        role (str): ``"obstacle"``, ``"clearance"``, ``"finish"``, ``"region"``, ``"platform"``, ``"wall"``, ``"zone"``
+            or ``"target"``.
         color (str, optional): ``"red"``, ``"green"``, ``"blue"`` or ``"#rrggbb"``. Default: that of the role.
-        label (str): a word drawn beside it.
+        label (str): text drawn beside it.
 
     Raises:
-        ValueError: for another kind.
+        ValueError: if ``kind`` is another one.
     """
 
     kind: str
@@ -46,19 +46,19 @@ class Shape:
 
 @dataclass(frozen=True)
 class Body:
-    """A body that a context places: what tells its pose, where it may start, and how it looks from above.
+    """A body that a context places: its pose in the observation, its start regions, and its top view.
 
     Args:
         name (str): its name in contexts and messages.
         position (str): part of the observation that begins with its x, y (m).
-        yaw (str): part of the observation that tells its yaw: a quaternion (w, x, y, z) or ``tan(yaw)``; empty where
-            nothing does, its yaw is then 0.
-        starts (tuple): regions, x range and y range (m) each, in any of which it may start.
-        label (str): its name in legends; bodies of the same label share an entry.
+        yaw (str): part of the observation with its yaw: a quaternion (w, x, y, z) or ``tan(yaw)``. Empty: the yaw is
+            0.
+        starts (tuple): regions in which it may start, x range and y range (m) each.
+        label (str): its name in legends; bodies with the same label share an entry.
         color (str): ``"red"``, ``"green"``, ``"blue"``, ``"grey"`` or ``"#rrggbb"``.
         half (tuple of float): half its width and half its depth (m).
-        front (bool): its far side is emphasised, where its orientation matters.
-        still (bool): it stays where it starts.
+        front (bool): whether its far side is emphasised, to show its orientation.
+        still (bool): whether it never moves.
     """
 
     name: str
@@ -77,18 +77,18 @@ class Body:
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands in a task and where the rest of it starts, and the part of the plane that pictures show.
+    """Fixed shapes and movable bodies of a task, where bodies start, and the area that pictures show.
 
     Args:
-        shapes (tuple of Shape): what stands still, in the order in which it is drawn.
-        bodies (tuple of Body): what starts elsewhere in every episode.
-        shared_starts (tuple): regions that the bodies get at random, each to one at most, instead of
+        shapes (tuple of Shape): fixed shapes in drawing order.
+        bodies (tuple of Body): bodies with another start in every episode.
+        shared_starts (tuple): regions that are assigned to the bodies at random, at most one body each, instead of
             ``Body.starts``; there may be more of them than bodies.
-        start_yaw (tuple of float): least and greatest yaw of a body (deg).
-        x (tuple of float): least and greatest x of a picture (m); None shows what is drawn.
-        y (tuple of float): likewise for y.
-        caption (str): what the report adds to the picture of the rollouts.
-        camera (str, optional): camera of the simulator that shows the task best; None where there is none to film with.
+        start_yaw (tuple of float): range of a body's yaw at the start (deg).
+        x (tuple of float, optional): range of x in pictures (m). None: that of the drawing.
+        y (tuple of float, optional): likewise for y.
+        caption (str): text that the report adds to the picture of the rollouts.
+        camera (str, optional): camera of the simulator that shows the task best. None: there is no camera.
 
     Examples:
         >>> from torchrl_koap.tasks import Body, Scene
@@ -108,9 +108,9 @@ class Scene:
 
     @property
     def varies(self) -> bool:
-        """Whether bodies start elsewhere in every episode, so that there are contexts."""
+        """Whether starts of bodies vary over episodes, so that there are contexts."""
         return any(self.starts_of(index) for index in range(len(self.bodies)))
 
     def starts_of(self, index: int) -> tuple[Region, ...]:
-        """Regions in one of which body ``index`` starts."""
+        """Returns the regions that body ``index`` may start in."""
         return self.shared_starts or self.bodies[index].starts

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scooping: a spoon takes pieces out of a bowl; a camera is all that planner and controller see."""
+"""Scooping: a spoon takes pieces out of a bowl; planner and controller see only a camera."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
 BOWL = (0.52, 0.0)  # centre of the bowl (m)
-BOWL_REACH = (0.05, 0.06)  # how far from there it may stand where it moves, x and y (m)
+BOWL_REACH = (0.05, 0.06)  # largest displacement of a moving bowl from there, x and y (m)
 BOWL_RADIUS = 0.055  # of its floor (m)
 RIM_RADIUS, RIM_HEIGHT = 0.11, 0.05  # m
 NUM_PIECES, PIECE_RADIUS = 36, 0.009  # m
@@ -40,9 +40,9 @@ def start_of(context: np.ndarray) -> int:
 
 
 def scores(result: dict[str, Any], episodes: Sequence[TensorDictBase], *_: Any) -> dict[str, Any]:
-    """Returns how often the spoon came over the bowl, and how often it left with a piece from each start position.
+    """Returns whether the spoon came over the bowl, and whether it left with a piece, by start position.
 
-    ``rates`` has by name a bool per rollout (a trajectory ``[T_i]`` each); starts that no episode had are left out.
+    ``rates`` maps names to a bool per rollout (a trajectory ``[T_i]`` each); starts without episodes are left out.
     """
     last = [episode[-1]["next"] for episode in episodes]
     rates = {"spoon over the bowl": [bool(end["mode"][0]) for end in last]}
@@ -84,12 +84,12 @@ _SCOOPING = register_task(
             relative=False,
             recovery=0.0,
             neighbor_recovery=2.0,  # no column is a position that could be displaced
-            # a place read off every frame with an error acts as a velocity: docs/results/scooping.md
+            # with feedback, position errors of the embedded frames act as velocities
             execution={"strategy": "open_loop", "replan_interval": 8, "blend": 0.0},
         ),
     )
 )
-# harder: the bowl stands somewhere else in every episode, and a few demonstrations do not show all the places
+# harder: the bowl has another place in every episode, and a few demonstrations do not cover all places
 _BOWL_REGION = (
     (BOWL[0] - BOWL_REACH[0], BOWL[0] + BOWL_REACH[0]),
     (BOWL[1] - BOWL_REACH[1], BOWL[1] + BOWL_REACH[1]),
@@ -102,7 +102,7 @@ register_task(
         observation_units=_SCOOPING.observation_units + ("m",) * 2,
         hidden=("spoon", "bowl"),
         env_options={"task": "scooping_moving_bowl"},
-        # the nearest other picture may show the bowl elsewhere
+        # the nearest other picture may show the bowl at another place
         defaults=replace(_SCOOPING.defaults, neighbor_recovery=0.0),
         scene=replace(
             _SCOOPING.scene,

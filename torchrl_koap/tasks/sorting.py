@@ -19,14 +19,14 @@ from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import Defaults, Task
 
-# of PO-Sorting: its steps are few, and noise makes predicted actions too small; chosen with one trained planner
+# of PO-Sorting: episodes are short, and noise makes predicted actions too small; chosen with one trained planner
 ACTION_GAIN = 1.15
 COLOURS = ("red", "blue")
 BIN_X = (0.4, 0.625)  # centre of the red and of the blue bin (m)
 BIN_Y = 0.32
 BIN_HALF = 0.1  # a bin reaches this far to both sides
 BIN_RANGE = (0.22, 0.41)  # y between which a box counts as inside (m)
-# walls of a bin, seen from its centre: x, y, half width, half depth (m)
+# walls of a bin, relative to its centre: x, y, half width, half depth (m)
 BIN_WALLS = (
     (0.0, BIN_RANGE[1] - BIN_Y, BIN_HALF, 0.01),
     (-BIN_HALF, 0.0, 0.005, BIN_HALF),
@@ -37,7 +37,7 @@ BOX_HALF = 0.03  # half width of a box (m)
 PLATFORM_X, PLATFORM_Y = (0.2, 0.8), (-0.4, 0.2)  # m
 COMMAND_LEAD = 0.1  # m; scripted demonstrations keep the command within 0.097 of the robot
 PO_NOISE = 0.002  # m; of PO-Sorting, in demonstrations as well as in evaluation; the paper states no figure
-# six regions (x range, y range in m) that are dealt out to the boxes at random
+# six regions (x range, y range in m) that are assigned to the boxes at random
 REGIONS = tuple((x, y) for x in ((0.4, 0.5), (0.55, 0.65)) for y in ((-0.15, -0.1), (-0.05, 0.0), (0.05, 0.1)))
 _CAPTION = (
     " The second panel shows the boxes: pale outlines where they start, paths in their colours, a dot where they end, a"
@@ -52,20 +52,20 @@ def box_colours(num_boxes: int) -> list[int]:
 
 
 def in_bins(boxes: Tensor) -> Tensor:
-    """Says which boxes at ``[*B, boxes, 2]`` (x, y in m) are in the bins of their colours, bool ``[*B, boxes]``."""
+    """Returns which boxes at ``[*B, boxes, 2]`` (x, y in m) are in the bins of their colours, bool ``[*B, boxes]``."""
     x, y = boxes.unbind(-1)
     centre = x.new_tensor(BIN_X)[box_colours(boxes.shape[-2])]
     return ((x - centre).abs() < BIN_HALF) & (y > BIN_RANGE[0]) & (y < BIN_RANGE[1])
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether every box is in the bin of its colour, bool ``[*B]`` of states ``[*B, d]``."""
+    """Returns whether every box is in the bin of its colour, bool ``[*B]``, for states ``[*B, d]``."""
     return in_bins(torch.stack([state[..., task.state_slices[f"{box}_xy"]] for box in task.objects], -2)).all(-1)
 
 
 @functools.cache
 def arrival_orders(num_boxes: int) -> tuple[tuple[int, ...], ...]:
-    """Lists every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes."""
+    """Returns the modes: all orders in which the colours (0 red, 1 blue) can arrive, sorted lexicographically."""
     return tuple(sorted(set(itertools.permutations(box_colours(num_boxes)))))
 
 

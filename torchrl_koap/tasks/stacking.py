@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Stacking: pile three boxes on a target zone with the gripper, in any order; Stacking-1 is over with the first."""
+"""Stacking: pile three boxes on a target zone with the gripper, in any order; Stacking-1 ends with the first box."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ HEIGHT_GAP = 0.03  # m; boxes lie on top of each other if all their heights diff
 # name, half sizes (m)
 BOXES = (("red", (0.03, 0.03, 0.03)), ("green", (0.03, 0.03, 0.03)), ("blue", (0.03, 0.05, 0.03)))
 NAMES = tuple(name for name, _ in BOXES)
-ORDERS = tuple(itertools.permutations(range(3)))  # in which the boxes can arrive: the modes
+ORDERS = tuple(itertools.permutations(range(3)))  # modes: orders of arrival of the boxes
 # where each box starts: x range, y range (m)
 _STARTS = (((0.35, 0.45), (-0.25, -0.15)), ((0.35, 0.45), (-0.1, 0.0)), ((0.55, 0.6), (-0.2, 0.0)))
 _JOINTS = {f"joint {joint}": Action("rad") for joint in range(1, 8)}
 
 
 def _boxes_of(task: Task, state: Tensor) -> Tensor:
-    """Positions of the boxes ``[*B, 3, 3]``."""
+    """Returns the positions of the boxes ``[*B, 3, 3]``."""
     return torch.stack([state[..., task.state_slices[f"{box}_position"]] for box in task.objects], -2)
 
 
@@ -38,18 +38,18 @@ def _in_zone(boxes: Tensor) -> Tensor:
 
 
 def piled(boxes: Tensor) -> Tensor:
-    """Says whether boxes at ``[*B, 3, 3]`` (m) are all in the zone, far enough apart in height, bool ``[*B]``."""
+    """Returns whether boxes at ``[*B, 3, 3]`` (m) are all in the zone, far enough apart in height, bool ``[*B]``."""
     height = boxes[..., 2].sort(-1).values
     return _in_zone(boxes).all(-1) & (height.diff(dim=-1).amin(-1) > HEIGHT_GAP)
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``."""
+    """Returns whether all boxes are piled in the zone, bool ``[*B]``, for states ``[*B, d]``."""
     return piled(_boxes_of(task, state))
 
 
 def first_box_reached(task: Task, state: Tensor) -> Tensor:
-    """Says whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``."""
+    """Returns whether any box is in the zone, bool ``[*B]``, for states ``[*B, d]``."""
     return _in_zone(_boxes_of(task, state)).any(-1)
 
 
@@ -105,7 +105,7 @@ _STACKING = register_task(
             demonstrations=1000,
             planner={"steps": 18000, "network": "mlp"},
             recovery=0.004,
-            commands=True,  # joints follow their commands alike, wherever they are
+            commands=True,  # joints follow their commands in the same way in all poses
         ),
     )
 )
@@ -121,7 +121,7 @@ _STACKING_1 = register_task(
         data_from="stacking",
     )
 )
-# as the paper has it: joints are commanded but not seen
+# as in the paper: joints are commanded but not observed
 register_task(
     replace(
         _STACKING_1,
@@ -132,7 +132,7 @@ register_task(
         robot=tuple(range(4)),  # position of the tool, width of the gripper
         tool_kinematics=None,
         actions=_JOINTS | {"gripper": Action("m", "gripper", column=3)},
-        # what the commands move is not seen: they are read off the scene
+        # the commanded joints are not observed, so commands are inferred from the scene
         defaults=replace(
             _STACKING.defaults,
             method="koap",

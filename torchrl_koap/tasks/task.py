@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a task *is*: observation and action columns, goal, modes, how it looks, and which code simulates it.
+"""Definition of a task: observation and action columns, goal, modes, appearance, and the code that simulates it.
 
-Code is named by import strings (``"package.module:name"``), so that a task is plain data, which can be written to JSON
-beside a data set, and no simulator is imported before it is used.
+Code is named by import strings (``"package.module:name"``). So a task is plain data that can be written to JSON beside
+a data set, and simulators are only imported when used.
 """
 
 from __future__ import annotations
@@ -23,30 +23,29 @@ from torchrl_koap.tasks.modes import Modes
 from torchrl_koap.tasks.scene import Body, Scene
 
 CONTROL_HZ = 1 / 0.035
-# planner and controller see the same window in every task: 2 observed frames, 14 planned ones; 4 actions of each plan
-# are executed
+# the same window for all tasks: 2 observed frames, 14 planned ones; 4 actions of each plan are executed
 HISTORY, HORIZON, REPLAN_INTERVAL = 2, 14, 4
 WINDOW = HISTORY + HORIZON
 
 
 @dataclass(frozen=True)
 class Defaults:
-    """Settings that are a task's own unless a command gives others.
+    """Default settings of a task, which options of a command override.
 
     Args:
-        method (str): what `koap train` trains.
+        method (str): the method that `koap train` trains.
         demonstrations (int): number of scripted demonstrations to record.
         disturbance (float): share of them in which the expert is disturbed.
         relative (bool): plans are displacements from the present state.
         recovery (float, optional): typical shift of the recovery augmentation, in the units of the robot's columns.
-            Default: of every column what it usually changes in a control step.
+            Default: the usual change of each column in a control step.
         neighbor_recovery (float): largest displacement of a window towards the nearest other one, as a share of their
             difference; used if no column is a position that could be shifted.
-        planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
-            another one that is asked for by name comes with its own.
-        controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method`` alone.
-        commands (bool): controllers learn the command that an action leads to, not its change; labels then tell the
-            command, and the observation has to repeat it.
+        planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Sizes apply only to the network given here;
+            other networks use their own.
+        controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset applies only to ``method``.
+        commands (bool): controllers learn the command that results from an action instead of its change. Labels then
+            include the command, which the observation must repeat.
         execution (dict): fields of :class:`~torchrl_koap.Execution`.
     """
 
@@ -64,39 +63,39 @@ class Defaults:
 
 @dataclass(frozen=True, kw_only=True)
 class Task(Columns):
-    """Facts of one task (lengths in m, angles in rad, unless a column says otherwise).
+    """Definition of one task (lengths in m, angles in rad, unless a unit is given).
 
     Args:
-        name (str): name used on the command line and in files.
+        name (str): name on the command line and in files.
         observation_parts (dict): and the other columns, see :class:`~torchrl_koap.tasks.Columns`.
-        actions (dict): name of every action column to its :class:`~torchrl_koap.tasks.Action`.
+        actions (dict): an :class:`~torchrl_koap.tasks.Action` for the name of every action column.
         position (str): the part that pictures draw, ``x, y`` first.
         max_steps (int): control steps after which an episode is truncated.
         control_hz (float): control steps per second.
-        robot (tuple of int): state columns of the robot itself, which recovery shifts and the controller reads.
-        tool_kinematics (str, optional): import string of the function from the robot's joints ``[*B, J]`` to the
-            position of the tool ``[*B, 3]``, where joints are commanded; ``position`` then follows them.
-        planar_parts (tuple of str): parts whose positions and yaws may be moved and turned together for training.
+        robot (tuple of int): state columns of the robot, which recovery shifts and the controller reads.
+        tool_kinematics (str, optional): if joints are commanded, the import string of the function from the robot's
+            joints ``[*B, J]`` to the position of the tool ``[*B, 3]``; ``position`` then follows the joints.
+        planar_parts (tuple of str): parts whose positions and yaws may be shifted and turned together for training.
         interchangeable (tuple): groups of bodies that may be permuted for training.
-        relative_positions (tuple): what the planner reads besides the state: ``(part, seen from part, in the frame of
-            part, yaw of part)``, the last two optional (see :meth:`relative_columns`).
-        goal (str, optional): import string of the function of the task and a state ``[*B, d]`` that says where it is
-            done, bool ``[*B]``.
+        relative_positions (tuple): further inputs of the planner: ``(part, seen from part, in the frame of part, yaw of
+            part)``, the last two optional (see :meth:`relative_columns`).
+        goal (str, optional): import string of a function of the task and states ``[*B, d]``, which returns whether the
+            goal is reached, bool ``[*B]``.
         modes (Modes): the ways in which the task can be done.
         score (str, optional): import string of a function of the result of
             :func:`~torchrl_koap.evaluation.scores.score`, the episodes and their contexts that returns further figures.
         noise (float): standard deviation of the noise on the measured end effector (m), in demonstrations too.
-        env (str, optional): import string of the environment (:mod:`torchrl_koap.envs.registry` says what it has to
-            offer). None: a robot with data and no simulator.
-        env_options (dict): its further keyword arguments.
+        env (str, optional): import string of the environment, with the interface in :mod:`torchrl_koap.envs.registry`.
+            None: a robot with data and no simulator.
+        env_options (dict): further keyword arguments of the environment.
         expert (str, optional): import string of the scripted expert (:mod:`torchrl_koap.envs.experts.recording`).
-        data_from (str, optional): name of the task whose demonstrations are used, if another one.
-        scene (Scene): the bodies that a context places, where they start, and how all looks from above.
+        data_from (str, optional): name of the task whose demonstrations are used. Default: its own.
+        scene (Scene): the bodies that a context places, where they start, and the top view.
         label_levels (tuple of float): shares of labelled windows of the label levels 1, 2, ...
-        defaults (Defaults): settings that are the task's own.
+        defaults (Defaults): default settings of the task.
 
     Raises:
-        ValueError: with every fault found: a part, column or body that does not exist, columns out of range.
+        ValueError: listing all faults: parts, columns or bodies that do not exist, columns out of range.
 
     Examples:
         >>> from torchrl_koap.tasks import Action, Task
@@ -156,16 +155,16 @@ class Task(Columns):
 
     @cached_property
     def targets(self) -> dict[int, int]:
-        """Action column and state column of each absolute action that names the column that it is the target of."""
+        """Action column and target column (in the state) of each absolute action with a target."""
         absolute = {index: a.column for index, a in enumerate(self.actions.values()) if a.kind == "absolute"}
         return {index: column for index, column in absolute.items() if column is not None}
 
     @cached_property
     def moves(self) -> dict[int, int]:
-        """Action column of each command and the state column that it moves; empty where that is not known.
+        """Action column of each command and the state column that it moves; empty if unknown.
 
-        These are the ``targets``, else the changes of a command: they move the columns that the actions name, or where
-        some name none the first ones of the robot.
+        These are the ``targets``, or else the changes of a command. Changes move the columns that the actions name, or
+        the first columns of the robot if some actions name none.
         """
         if self.targets:
             return self.targets
@@ -183,7 +182,7 @@ class Task(Columns):
 
     @property
     def origins(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """What was subtracted from every observation column and every action; None: nothing."""
+        """Offsets subtracted from every observation column and every action; None if there are none."""
         if not self.observation_origin:
             return None
         places = {index: self.observation_origin[self.state_columns[c]] for index, c in self.targets.items()}
@@ -191,28 +190,28 @@ class Task(Columns):
 
     @cached_property
     def gripper(self) -> tuple[int, int] | None:
-        """Action column of the gripper and state column of its width, None where no width commands one."""
+        """Action column of the gripper and state column of its width; None if no gripper is commanded by a width."""
         for index, action in enumerate(self.actions.values()):
             if action.kind == "gripper" and action.column is not None:
                 return index, action.column
         return None
 
     def moved_columns(self) -> tuple[int, ...]:
-        """Returns the state column that each action moves; empty where one of them names none, or is its target."""
+        """Returns the state column that each action moves; empty if an action names none, or there are targets."""
         columns = [action.column for action in self.actions.values() if action.column is not None]
         return tuple(columns) if len(columns) == self.action_dim and not self.targets else ()
 
     @property
     def action_rule(self) -> ActionRule | None:
-        """What has the last word on decoded actions, None if nothing has."""
+        """Rule applied to decoded actions; None if there is none."""
         actions = enumerate(self.actions.values())
         constants = {index: action.constant for index, action in actions if action.constant is not None}
-        told = self.gripper or self.distances or constants
-        return ActionRule(self.gripper, self.distances, constants) if told else None
+        needed = self.gripper or self.distances or constants
+        return ActionRule(self.gripper, self.distances, constants) if needed else None
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """What a context places."""
+        """Bodies that a context places."""
         return self.scene.bodies
 
     @property
@@ -227,12 +226,12 @@ class Task(Columns):
 
     @cached_property
     def tool_position(self) -> Callable[[Tensor], Tensor] | None:
-        """The function from joints to the position of the tool, None where the tool itself is commanded."""
+        """Function from joints to the position of the tool; None if the tool itself is commanded."""
         return resolve(self.tool_kinematics, f"tool_kinematics of task {self.name!r}")
 
     @property
     def tool_columns(self) -> tuple[int, ...] | None:
-        """State columns of a tool position that follows the joints, None where the tool itself is commanded."""
+        """State columns of a tool position that follows the joints; None if the tool itself is commanded."""
         if self.tool_kinematics is None:
             return None
         return tuple(range(self.state_dim)[self.state_slices[self.position]])
@@ -243,13 +242,13 @@ class Task(Columns):
         return next(iter(self.state_parts.items())) == (self.position, "plain")
 
     def controller_columns(self, part: str) -> tuple[int, ...]:
-        """Returns the state columns that a controller reads: the ``"robot"``'s, which actions command, or all."""
+        """Returns the state columns that a controller reads: those of the commanded ``"robot"``, or all."""
         everything = tuple(range(self.state_dim))
         parts = {"robot": self.robot or everything, "all": everything, "related": everything}
         return lookup(parts, part, "part of the state")
 
     def relative_columns(self) -> list[tuple[slice, ...]]:
-        """Returns the state columns of ``relative_positions``: a position, another, a yaw, another yaw."""
+        """Returns the state columns of ``relative_positions``: two positions and up to two yaws each."""
         return [tuple(self.state_slices[name] for name in names) for names in self.relative_positions]
 
     def interchangeable_columns(self) -> list[list[list[int]]]:
@@ -262,41 +261,41 @@ class Task(Columns):
         return [[columns_of(name) for name in group] for group in self.interchangeable if len(group) > 1]
 
     def planar_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-        """Returns the state columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` that move together."""
+        """Returns the state columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` of ``planar_parts``."""
         columns = self.state_slices
         pairs = {name: (columns[name].start, columns[name].start + 1) for name in self.planar_parts}
         yaws = [name for name in self.planar_parts if self.state_parts[name] == "quaternion"]
         return [pair for name, pair in pairs.items() if name not in yaws], [pairs[name] for name in yaws]
 
     def goal_reached(self, state: Tensor) -> Tensor:
-        """Says in which states, planned or recorded, the task is done: bool ``[*B]`` of states ``[*B, d]``.
+        """Returns whether the goal is reached in planned or recorded states ``[*B, d]``, bool ``[*B]``.
 
         Raises:
-            ValueError: if the task has no goal, or the state has another number of columns.
+            ValueError: if the task has no goal, or the number of state columns is wrong.
         """
         if self.goal is None:
-            raise ValueError(f"task {self.name!r} has no goal: give it one, or judge no states")
+            raise ValueError(f"task {self.name!r} has no goal: goal_reached needs one")
         if state.shape[-1] != self.state_dim:
             raise ValueError(f"a state of task {self.name!r} has {self.state_dim} columns, got {state.shape[-1]}")
         return resolve(self.goal, f"goal of task {self.name!r}")(self, state)
 
     def import_strings(self) -> dict[str, str]:
-        """Returns the import strings by the field that has them: the code that using the task may run."""
+        """Returns the import strings by field: the code that the task may run."""
         named = {field: getattr(self, field) for field in ("env", "expert", "goal", "score")}
         named |= {"tool_kinematics": self.tool_kinematics, "modes.of_path": self.modes.of_path}
         return {place: value for place, value in named.items() if value}
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the task as dictionaries, lists, strings and numbers; an object in place of its name is refused."""
+        """Returns the task as dictionaries, lists, strings and numbers; raises a TypeError for other objects."""
         return {name: _plain(value, name) for name, value in asdict(self).items()}
 
     def definition(self) -> dict[str, Any] | None:
-        """Returns the task as data sets and runs keep it; None if it names code, so that its name has to do."""
+        """Returns the task as stored in data sets and runs; None if it names code: only its name is stored then."""
         return None if self.import_strings() else self.to_json()
 
     @classmethod
     def from_json(cls, entries: object) -> Task:
-        """Reads the task that :meth:`to_json` wrote; unknown, missing and unfitting entries are refused."""
+        """Reads the task that :meth:`to_json` wrote; refuses unknown, missing and invalid entries."""
         return dataclass_from_json(cls, entries)
 
 

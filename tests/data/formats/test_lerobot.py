@@ -207,7 +207,7 @@ def test_descriptions_that_are_none(tmp_path):
     for text, message in (
         ("{", "info.json cannot be used: it is no JSON"),
         ("[1]", "must hold an object, got list"),
-        ('{"codebase_version": "v4.0"}', "info.json cannot be used: its codebase_version is v4.0; formats 2.x and 3.x"),
+        ('{"codebase_version": "v4.0"}', "info.json cannot be used: its codebase_version is v4.0, wanted 2.x or 3.x"),
     ):
         (root / "meta/info.json").write_text(text)
         with pytest.raises(DataError, match=message):
