@@ -122,7 +122,7 @@ FILMED: dict[str, tuple[str | None, str, Callable[[Path], Any]]] = {
     "no array": (*("wrist.npy holds no array of numbers",) * 2, lambda folder: (folder / WRIST).write_bytes(b"array")),
     "a damaged picture": (
         None,
-        "'top' of 1.*frame 7 .000007.png. is no picture",
+        "'top' of 1.*frame 7 .000007.png. is no readable image",
         lambda folder: (folder / TOP).write_bytes(b"PNG"),
     ),
 }

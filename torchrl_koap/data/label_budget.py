@@ -151,7 +151,7 @@ class LabelBudget:
             kept[begin:stop] = available[begin:stop]
 
         has_action = torch.from_numpy(kept).to(data.get(keys.ACTION).device).unsqueeze(-1)
-        labelled, told = data.clone().set(keys.HAS_ACTION, has_action), 0
+        labelled, commands_kept = data.clone().set(keys.HAS_ACTION, has_action), 0
         labelled.set(keys.ACTION, torch.where(has_action, data.get(keys.ACTION), math.nan))
         last = labelled.pop(keys.LABEL_COMMAND, None)
         if command is not None:
@@ -160,7 +160,7 @@ class LabelBudget:
                 last = data.get(keys.OBSERVATION)[:, command] if last is None else last
                 labelled.set(keys.LABEL_COMMAND, torch.where(has_action, last, math.nan))
                 blank = labelled.get(keys.OBSERVATION)[:, command].isnan().any(-1, keepdim=True)
-                told = int((blank & has_action).sum())
+                commands_kept = int((blank & has_action).sum())
         touched = np.add.reduceat(kept, starts, dtype=np.int64) > 0
         report = LabelReport(
             unit=self.unit,
@@ -173,7 +173,7 @@ class LabelBudget:
             seed=self.seed,
             available_units=int(usable.sum()),
             available_transitions=int(available.sum()),
-            commands_told=told,
+            commands_told=commands_kept,
         )
         return labelled, report
 

@@ -198,7 +198,7 @@ def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: 
 def unlabelled_warnings(
     trajectories: Sequence[np.ndarray], known: Sequence[bool], called: Sequence[str], names: Sequence[str]
 ) -> Iterator[str]:
-    """Finds columns of ``[T_i, d]`` in which over a tenth of the unlabelled trajectories differ from the labelled ones.
+    """Finds columns of ``[T_i, d]`` in which over 10 % of the unlabelled trajectories differ from the labelled ones.
 
     They differ if most frames lie outside the labelled range, widened by half of it on both sides. They also differ if
     two or more columns that move in all labelled trajectories move at most a tenth as far. ``known`` says which

@@ -47,9 +47,9 @@ def _read_stored(
     data, task = load_ted(folder)
     lengths = trajectory_lengths(data).tolist()
     origin, added = (torch.tensor(part, dtype=torch.float64) for part in task.origins or (0.0, 0.0))
-    observed, behind = (data[key].double() + origin for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION))
+    before, after = (data[key].double() + origin for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION))
     actions = torch.where(data[keys.HAS_ACTION], data[keys.ACTION].double() + added, torch.nan)
-    pairs = zip(observed.split(lengths), behind.split(lengths), strict=True)
+    pairs = zip(before.split(lengths), after.split(lengths), strict=True)
     recordings = make_recordings(
         [torch.cat([frames, following[-1:]]) for frames, following in pairs],
         actions.split(lengths),

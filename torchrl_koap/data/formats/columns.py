@@ -327,8 +327,8 @@ def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:
         for piece in pieces:
             number = len(piece.cameras.get(name, range(piece.frames)))
             if number != piece.frames:
-                told = f"give their times in {name}_times.npy (beside a table with a clock)"
-                yield f"{piece.name}: camera {name!r} has {number} frames for {piece.frames} rows: {told}, {cure}"
+                times = f"give their times in {name}_times.npy (beside a table with a clock)"
+                yield f"{piece.name}: camera {name!r} has {number} frames for {piece.frames} rows: {times}, {cure}"
         where, clip = next((piece.name, piece.cameras[name]) for piece in pieces if name in piece.cameras)
         try:
             with suppress(RuntimeError):  # the extra that reads it is missing; only `koap embed` needs it

@@ -139,9 +139,9 @@ def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
     import h5py
 
     with h5py.File(clip.file, "r") as stream:
-        frames, behind = stream[clip.entry], clip.entry.replace("/obs/", "/next_obs/")
+        frames, next_entry = stream[clip.entry], clip.entry.replace("/obs/", "/next_obs/")
         for number in clip.numbers:  # number T: the last frame of next_obs
-            frame = frames[number] if number < len(frames) else stream[behind][-1]
+            frame = frames[number] if number < len(frames) else stream[next_entry][-1]
             yield frame if frames.ndim == 4 else _decode(np.asarray(frame).tobytes(), number)
 
 

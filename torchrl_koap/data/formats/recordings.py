@@ -145,23 +145,23 @@ def make_recordings(
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
     lost: list[tuple[str, str]] = []
-    for name, seen, done in zip(what, frames, known, strict=True):
-        if seen is not None and seen.shape[1] != width:
-            faults.append((name, f"states have {seen.shape[1]} columns, those before have {width}"))
-        elif seen is not None and len(seen) < 2:
-            faults.append((name, f"{len(seen)} frames; a transition needs two"))
-        elif seen is not None and not np.isfinite(seen).all():
-            frame, column = np.argwhere(~np.isfinite(seen))[0]
+    for name, state, action in zip(what, frames, known, strict=True):
+        if state is not None and state.shape[1] != width:
+            faults.append((name, f"states have {state.shape[1]} columns, those before have {width}"))
+        elif state is not None and len(state) < 2:
+            faults.append((name, f"{len(state)} frames; a transition needs two"))
+        elif state is not None and not np.isfinite(state).all():
+            frame, column = np.argwhere(~np.isfinite(state))[0]
             called = repr(given_states[column]) if len(given_states) == width else column
             lost.append((name, f"frame {frame} in column {called}"))
-        if done is None:
+        if action is None:
             continue
-        infinite = np.isinf(done).any(-1)
-        if done.shape[1] != wide:
-            faults.append((name, f"actions have {done.shape[1]} columns, those before have {wide}"))
-        elif seen is not None and len(done) not in (len(seen) - 1, len(seen)):
-            wanted = f"wanted one per frame ({len(seen)}) or one per transition ({len(seen) - 1})"
-            faults.append((name, f"{len(done)} actions for {len(seen)} frames; {wanted}"))
+        infinite = np.isinf(action).any(-1)
+        if action.shape[1] != wide:
+            faults.append((name, f"actions have {action.shape[1]} columns, those before have {wide}"))
+        elif state is not None and len(action) not in (len(state) - 1, len(state)):
+            wanted = f"wanted one per frame ({len(state)}) or one per transition ({len(state) - 1})"
+            faults.append((name, f"{len(action)} actions for {len(state)} frames; {wanted}"))
         elif infinite.any():
             faults.append((name, f"the action of step {infinite.argmax()} is infinite; mark unknown actions by NaN"))
     if lost:
@@ -172,9 +172,10 @@ def make_recordings(
         problems += wrong_rate(control_hz, "control_hz")
     refuse(source, [*gathered(faults), *problems])
     steps = [
-        np.full((len(seen) - 1, wide), np.nan) if done is None else done[: len(seen) - 1]
-        for seen, done in zip(frames, known, strict=True)
-    ]  # an action of which some columns are unknown is unknown
+        np.full((len(state) - 1, wide), np.nan) if action is None else action[: len(state) - 1]
+        for state, action in zip(frames, known, strict=True)
+    ]
+    # an action with an unknown column counts as unknown
     partly = [int((np.isnan(part).any(-1) & ~np.isnan(part).all(-1)).sum()) for part in steps]
     where = some([f"{number} in {name}" for number, name in zip(partly, what, strict=True) if number])
     steps = [np.where(np.isnan(part).any(-1, keepdims=True), np.nan, part) for part in steps]

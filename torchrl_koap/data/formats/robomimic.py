@@ -105,13 +105,13 @@ def _read(
     chosen = usable if observations is None else list(observations)
     if not chosen:
         faults.append(("data/*/obs", f"no entry is a table of numbers; there are {', '.join(first['obs'])}"))
-    followed = {name for name in demos if use_next and all(entry in data[name].get(NEXT, {}) for entry in chosen)}
-    pieces = [_piece(data[name], name, chosen, faults, behind=name in followed) for name in demos]
+    with_next = {name for name in demos if use_next and all(entry in data[name].get(NEXT, {}) for entry in chosen)}
+    pieces = [_piece(data[name], name, chosen, faults, has_next=name in with_next) for name in demos]
     refuse(file, gathered(faults))
     seen = {name for piece in pieces for name in (*piece.states, *piece.cameras)}
     skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
     skipped += [name for name in sorted(first) if name not in ("obs", NEXT, "actions", *seen)]
-    skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - followed) else []
+    skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - with_next) else []
     skipped += [f"data/{name} (no group)" for name in data if name not in demos]
     said = {"mask": "mask (every demonstration is read)"}
     skipped += [said.get(name, name) for name in stream if "data" in stream and name != "data"]
@@ -126,28 +126,28 @@ def _aloha(stream: Any) -> dict[str, Any]:
     return {"obs": observed} | {"actions" if name == "action" else name: part for name, part in beside.items()}
 
 
-def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]], *, behind: bool) -> Piece:
+def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]], *, has_next: bool) -> Piece:
     states: dict[str, np.ndarray] = {}
-    following = group[NEXT] if behind else {}
+    following = group[NEXT] if has_next else {}
     for entry in chosen:
         part = group["obs"].get(entry)
-        last = following[entry] if behind else part
+        last = following[entry] if has_next else part
         if part is None:
             said = f"obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}"
         elif not _is_table(part):
             said = f"obs/{entry} is {_shape(part)}, no table of numbers: it cannot be part of the state"
         elif _shape(last) != _shape(part):
             said = f"next_obs/{entry} is {_shape(last)}, obs/{entry} is {_shape(part)}"
-        elif behind and (odd := _other_frame(part[()], last[()])) is not None:
+        elif has_next and (odd := _other_frame(part[()], last[()])) is not None:
             said = (
                 f"row {odd} of next_obs/{entry} is not row {odd + 1} of obs/{entry}: are frames missing, or out of"
                 f" order? if next_obs is unused, drop it with {option('drop_columns')} next_obs"
             )
         else:
-            states |= spread(entry, np.concatenate([part, last[-1:]] if behind else [part]))
+            states |= spread(entry, np.concatenate([part, last[-1:]] if has_next else [part]))
             continue
         faults.append((f"data/{name}", said))
-    if not behind:  # time stamps, counters and ends of episodes may be beside obs
+    if not has_next:  # time stamps, counters and ends of episodes may be beside obs
         frames = len(next(iter(states.values()), ()))
         for entry, part in group.items():
             kind, single = kind_of(entry)[0], len(_shape(part)) > 0 and part.size == len(part)
@@ -158,7 +158,7 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
     for film, part in group["obs"].items():
         if len(_shape(part)) == 4 or _is_compressed(part):
             # without next_obs of this camera, its last frame is repeated
-            last = (len(part) - (film not in following),) if behind else ()
+            last = (len(part) - (film not in following),) if has_next else ()
             file = str(Path(part.file.filename).resolve())
             cameras[film] = Clip(file, (*range(len(part)), *last), part.name.removeprefix("/"))
     actions = group.get("actions")
