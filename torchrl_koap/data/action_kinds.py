@@ -22,7 +22,7 @@ CLEARER = 2.0  # one reading leaves this many times less unexplained than the ot
 ASTRAY = 5.0  # times as far from its target as in half of the recordings: another order or unit of columns
 FOLLOWS = 0.8  # above this correlation with a change, an action is a delta even if a level correlates as well
 UNLIKE = 0.5  # a command column that correlates less than this with every action repeats no command
-FEW, MANY = 20, 20_000  # fewest labels to judge by; about as many labels are read at most
+FEW, MANY = 20, 20_000  # fewest labels to judge by; most labels that are read
 
 
 @dataclass(frozen=True)
