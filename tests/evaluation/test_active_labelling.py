@@ -188,7 +188,7 @@ def test_suggest_from_the_shell(copied_run, capsys):
 
 
 def test_unasked_no_more_are_suggested_than_are_left(copied_run, monkeypatch):
-    monkeypatch.setattr(active_labelling, "_FEW", 10)
+    monkeypatch.setattr(active_labelling, "_DEFAULT_COUNT", 10)
     assert len(suggest(copied_run)["suggestions"]) == 6
 
 

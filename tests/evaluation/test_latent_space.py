@@ -236,6 +236,6 @@ def test_a_method_without_latent_actions_gets_a_note(demonstrations, tmp_path):
     assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--method", "linear") == 0
     assert koap("inspect", tmp_path / "run", "--latent-only", "--threads", "1") == 0
     written = json.loads((tmp_path / "run" / "inspect.json").read_text())
-    assert written["latent"] == {"note": "method 'linear' has no latent actions to look into"}
+    assert written["latent"] == {"note": "method 'linear' has no latent actions to analyse"}
     assert written["findings"] == written["latent"]["note"]
     assert not (tmp_path / "run" / "plots" / "latent.png").exists()

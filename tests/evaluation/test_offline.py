@@ -75,7 +75,7 @@ def test_latent_space_and_suggestions(run):
     assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in found
     assert {row["episode"] for row in suggest(run, SuggestConfig(count=7))["suggestions"]} == set(range(3, 10))
     with pytest.raises(
-        ValueError, match="task 'arm' has no environment to make experiments in: name one with --env, or --latent-only"
+        ValueError, match="task 'arm' has no environment to make experiments in: name one with --env, or analyse"
     ):
         inspect(run)
 
@@ -165,7 +165,8 @@ def test_a_controller_worse_than_the_mean_is_a_fault():
     faults = offline_faults({"note": ""}, {"left_out": found, "outside_budget": {"note": ""}})
     assert faults == [
         "action b is worse than always giving its mean (each labelled recording left out in turn): 2000 against 1000"
-        " mrad; mend what `koap validate` warns of, check --action-kind and --robot, or label a recording that moves it"
+        " mrad; fix what `koap validate` warns about, check --action-kind and --robot, or label a recording that"
+        " moves it"
     ]
     models["controller"] = true * torch.tensor([0.2, 0.05])  # well in the other column, which outweighs it
     (fault,) = offline_faults({}, {"left_out": summarise_errors(models, true, torch.tensor([4, 5]), task)})
@@ -183,7 +184,7 @@ def test_a_switch_that_rounding_seldom_gives_is_a_fault_and_has_no_share_in_erro
     found = summarise_errors(models, true, torch.tensor([4, 4, 4, 5, 5]), task)
     assert [row["columns"] for row in found["unit"]] == [["a"], ["brake"]]
     fault = offline_faults({}, {"left_out": found})[-1]
-    assert fault.startswith("action brake is nearest to 1 in only 1 of 3 labels of that value (each labelled")
+    assert fault.startswith("action brake is predicted nearest to 1 in only 1 of 3 labels of that value (each labelled")
 
 
 def test_a_recording_whose_labels_disagree_is_named(tmp_path):

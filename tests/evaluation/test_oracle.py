@@ -66,7 +66,7 @@ def test_wrong_uses():
         policy_of(small_planner()).act(observed, plan, 0)
     attached = policy_of(small_planner())
     attached.attach(AvoidingEnv(1))
-    with pytest.raises(RuntimeError, match="decodes nothing ahead"):
+    with pytest.raises(RuntimeError, match="decodes one action"):
         attached.follower(observed, observed[..., 2:], plan, 2)
     with pytest.raises(ValueError, match="task 'avoiding' has no environment"):
         OracleFollower(replace(TASK, env=None), blend=0.0)

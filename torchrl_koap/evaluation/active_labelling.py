@@ -2,7 +2,7 @@
 r"""Active labelling: which demonstrations to label next, chosen from the latent actions alone.
 
 The covariance :math:`C = (\sum u u^T + \lambda)^{-1}` of a linear decoder under a ridge penalty, over the labelled
-steps, holds no label, so neither do choices made with it. That is also why several can be chosen at once.
+steps, does not depend on the labels' values. Therefore several demonstrations can be chosen before any is labelled.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 
-_MOST_STEPS = 200_000  # that are looked at; neighbours resemble each other
-_FEW = 5  # trajectories that are chosen unasked
-_MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free
+_MOST_STEPS = 200_000  # most steps that are read; adjacent ones are similar
+_DEFAULT_COUNT = 5  # trajectories to choose
+_MEAN_SPREAD = 30.0  # prior deviation of the fitted mean over that of the latent part: hardly penalised
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A demonstration to label, and what it is chosen by when its turn comes, in units of the noise variance."""
+    """A demonstration to label, and its score when it is chosen, in units of the noise variance."""
 
     episode: int
     score: float
 
 
 def variance_reduction(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
-    """Returns by how much the mean leverage over all steps falls if the steps ``[T, m]`` are labelled (A-optimal).
+    """Returns how much the mean leverage over all steps falls if the steps ``[T, m]`` are labelled (A-optimal).
 
-    ``covariance [m, m]`` is that of the decoder without the noise variance, ``moment [m, m]`` the second moment of the
-    latent actions of all steps.
+    ``covariance [m, m]`` is the decoder's without the noise variance, ``moment [m, m]`` the second moment of the latent
+    actions of all steps.
     """
     part = _explained_part(latent, covariance)
     return ((part @ moment) * part).sum().item()
 
 
 def _explained_part(latent: Tensor, covariance: Tensor) -> Tensor:
-    """``P [T, m]`` such that labelling the steps ``latent [T, m]`` takes ``P^T P`` off the covariance (Woodbury)."""
+    """Returns ``P [T, m]``: labelling steps ``latent [T, m]`` subtracts ``P^T P`` from the covariance (Woodbury)."""
     projected = latent @ covariance
     inner = torch.eye(len(latent), dtype=latent.dtype, device=latent.device) + projected @ latent.mT
     return torch.linalg.solve_triangular(torch.linalg.cholesky(inner), projected, upper=False)
@@ -67,31 +67,31 @@ def rank_trajectories(
     bias: bool = False,
     score: Callable[[Tensor, Tensor, Tensor], float] = variance_reduction,
 ) -> list[Suggestion]:
-    r"""Chooses trajectories to label, one after the other, each as if those before it were labelled already.
+    r"""Chooses trajectories to label, one by one, each as if those before it were labelled already.
 
-    Taken is the one whose labels lower the mean predictive variance over *all* steps the most (Bayesian A-optimal
-    design, weighted by the second moment of the latent actions, greedy). It prefers long demonstrations that resemble
-    many others.
+    Each choice is the trajectory whose labels lower the mean predictive variance over *all* steps the most (greedy
+    Bayesian A-optimal design, weighted by the second moment of the latent actions). It prefers long demonstrations that
+    resemble many others.
 
     Args:
         latent (Tensor): latent actions ``[N, m]``.
         episode (Tensor): trajectory of every step ``[N]``.
-        labelled (Tensor): labelled steps, bool ``[N]``. Trajectories with unlabelled steps can be chosen, and only
-            those steps count for the choice.
+        labelled (Tensor): labelled steps, bool ``[N]``. Trajectories with unlabelled steps can be chosen; only those
+            steps count for the choice.
 
     Keyword Args:
-        penalty (float): the ridge, in units of the mean square norm of the labelled latent actions (of all, where none
-            is labelled), as in :class:`~torchrl_koap.modules.RidgeFit`.
-        count (int, optional): trajectories to choose. Default: 5, or all that are left.
-        bias (bool): the decoder has a fitted mean.
-        score (callable): what a trajectory is chosen by, with the arguments of :func:`variance_reduction`.
+        penalty (float): ridge penalty over the mean square norm of the labelled latent actions (of all, if none is
+            labelled), as in :class:`~torchrl_koap.modules.RidgeFit`.
+        count (int, optional): number of trajectories. Default: 5, or all that are left.
+        bias (bool): whether the decoder has a fitted mean.
+        score (callable): score, the highest of which is chosen; arguments as for :func:`variance_reduction`.
 
     Returns:
         list of Suggestion: in the order of choice.
 
     Raises:
-        ValueError: for shapes that disagree, latent actions that are not finite, a penalty that
-            is not positive, a count out of range, or if every step is labelled.
+        ValueError: for shapes that disagree, latent actions that are not finite, a penalty that is not positive, a
+            count out of range, or if every step is labelled.
 
     Examples:
         >>> import torch
@@ -115,7 +115,7 @@ def rank_trajectories(
     names = episode[~labelled].unique().tolist()
     if not names:
         raise ValueError("nothing is left to suggest: every step is labelled")
-    count = min(_FEW, len(names)) if count is None else count
+    count = min(_DEFAULT_COUNT, len(names)) if count is None else count
     if not 1 <= count <= len(names):
         raise ValueError(f"count must be in 1..{len(names)}, the trajectories that are not labelled yet, got {count}")
     rows, scale = _rows(latent.double(), labelled, penalty, bias)
@@ -137,12 +137,12 @@ def rank_trajectories(
 
 
 def _rows(latent: Tensor, labelled: Tensor, penalty: float, bias: bool) -> tuple[Tensor, Tensor]:
-    """Latent actions, with a column for a fitted mean, and the ridge in their squared units."""
+    """Returns latent actions, with a column for a fitted mean, and the ridge penalty in their squared units."""
     reference = latent[labelled] if labelled.any() else latent
     if bias:
         latent, reference = latent - reference.mean(0), reference - reference.mean(0)
     unit = reference.square().sum(-1).mean()
-    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant latent actions: any scale will do
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # all latent actions are 0: any scale will do
     if bias:
         latent = torch.cat([latent, (_MEAN_SPREAD * unit.sqrt()).expand(len(latent), 1)], -1)
     return latent, penalty * unit
@@ -169,16 +169,16 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
 
     Args:
         run (str or Path): a run directory.
-        config (SuggestConfig, optional): how many.
+        config (SuggestConfig, optional): the options.
 
     Returns:
-        dict: what ``suggestions.json`` holds: ``penalty`` of the run's decoder, ``labelled_steps`` and
-        ``labelled_episodes`` that the choice builds on, ``suggestions`` with ``rank``, ``episode``, ``steps`` to label,
-        ``score`` and, where known, ``source``, best first, and ``next``, a command line that trains with them.
+        dict: the contents of ``suggestions.json``: ``penalty`` of the run's decoder; ``labelled_steps`` and
+        ``labelled_episodes`` so far; ``suggestions``, best first, with ``rank``, ``episode``, ``steps`` to label,
+        ``score`` and, where known, ``source``; ``next``, a command line that trains with them.
 
     Raises:
         ValueError: for a count out of range, or a run without latent actions or a decoder in closed form.
-        RunDirectoryError: if the folder is no finished run, or its demonstrations are not there or others.
+        RunDirectoryError: if the folder is no finished run, or its demonstrations are missing or changed.
 
     Examples:
         >>> from torchrl_koap.evaluation import SuggestConfig, suggest
@@ -196,12 +196,12 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     penalty = trained.results.get("decoder_fit", {}).get("penalty")
     if penalty is None:
         raise ValueError(
-            f"the decoder of {trained.folder} was not fitted in closed form and knows no uncertainty:"
+            f"the decoder of {trained.folder} was not fitted in closed form, so its uncertainty is unknown:"
             " train with `--method koap`"
         )
     recorded = trained.data(config.dataset)
     data, report = trained.hide_labels(recorded)
-    each = -(-len(data) // _MOST_STEPS)  # that one step stands for
+    each = -(-len(data) // _MOST_STEPS)  # number of steps that each inferred step represents
     steps = infer_steps(controller, trained.seen(data), every=each)
     ranked = rank_trajectories(
         steps["latent_action"],
@@ -233,7 +233,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     for plugin in config.plugins:
         again += ["--plugin", plugin]
     again += [] if trained.config.labels.unit == "trajectory" else ["--labels.unit", "trajectory"]
-    again += ["--planner.source", str(trained.folder)]  # plans know no labels
+    again += ["--planner.source", str(trained.folder)]  # the planner uses no labels
     return {
         "penalty": penalty,
         "labelled_steps": report.labelled_transitions,

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Closed-loop evaluation of a run directory: rollouts, scores with intervals."""
+"""Closed-loop evaluation of a run directory: rollouts, and scores with intervals."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ if TYPE_CHECKING:
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
-    A task without an environment is judged on recorded data instead
-    (:func:`~torchrl_koap.evaluation.offline.evaluate_offline`), and there is ``eval.json`` alone. Actions outside the
+    A task without an environment is evaluated on recorded data instead
+    (:func:`~torchrl_koap.evaluation.offline.evaluate_offline`), without ``rollouts.safetensors``. Actions outside the
     label budget are read, for evaluation only (``actions.safetensors``).
 
     Args:
         run (str or Path): a run directory, or ``pretrained:NAME``, a trained policy of the repository.
-        config (EvalConfig, optional): how many rollouts, and how. Default: 60 as in training.
+        config (EvalConfig, optional): the options. Default: 60 rollouts with the execution of the training.
 
     Returns:
-        dict: what ``eval.json`` holds: success and entropy with intervals, speed, a row per episode; or, with
+        dict: the contents of ``eval.json``: success and entropy with intervals, speed, a row per episode; or, with
         ``kind`` ``"offline"``, errors of plans and actions, and no success.
 
     Raises:
@@ -81,7 +81,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = find_environment(task, config, trained.cameras)
     errors, actions, data = evaluate_actions(trained, config.dataset)
-    directory = RunDirectory(writable_folder(run, config.out))  # a refused call copies nothing
+    directory = RunDirectory(writable_folder(run, config.out))  # after all checks: a refused call copies nothing
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
@@ -97,14 +97,14 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.env is None:
         result = task_scores(task, result, episodes, where.numbers)
     rows = result.pop("episode")
-    result |= errors | limited_commands(policy)  # of the rollouts alone: what is timed next counts too
+    result |= errors | limited_commands(policy)  # before measure_latency, whose commands would count too
     timed = trained.policy().to(config.device) if policy.execution.strategy == "oracle" else policy
     result |= measure_latency(timed, task.observation_dim)
     result |= {"execution": to_json(policy.execution), "episode": rows}
     result |= where.facts
     if where.record is not None:
         result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
-        # rewards that an error cut short are no return
+        # an episode that an error cut short has no return
         for episode, row in zip(episodes, rows, strict=True):
             row["return"] = None if row["outcome"] == "error" else float(episode["next", "reward"].sum())
         returns = [row["return"] for row in rows if row["return"] is not None]
@@ -122,15 +122,15 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
             result["faults"] += start_faults(sound, data, task) if failed else []
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
-                "no episode ended with a reward of its own, and info does not say at the first step what success is:"
-                " name its entry with --success-key, or compare mean returns"
+                "no episode ended with more than twice any earlier reward, and info has no success entry at the first"
+                " step: name the entry with --success-key, or compare mean returns"
             )
     rollouts = rollouts_to_tensors(
         episodes,
         replace(task, modes=where.modes),
         interval=policy.execution.replan_interval,
     )
-    if where.contexts is not None:  # in full precision: a film of the same episode starts from it
+    if where.contexts is not None:  # in full precision: videos of the episode start from it
         rollouts["context"] = torch.from_numpy(where.contexts)
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
     if actions:
@@ -140,8 +140,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
 
 
 def _judge_offline(run: str | Path, trained: Trained, config: EvalConfig) -> dict[str, Any]:
-    """Evaluation without an environment; rollouts in one of Gymnasium are not overwritten."""
-    choose_contexts(trained.task, config)  # refuses what has no meaning
+    """Evaluates without an environment; refuses to overwrite rollouts in a Gymnasium environment."""
+    choose_contexts(trained.task, config)  # refuses options that need an environment
     earlier = find_run(run) / "eval.json"
     if config.out is None and earlier.is_file() and (env := read_json(earlier).get("env")) is not None:
         raise ValueError(
@@ -162,7 +162,7 @@ def _judge_offline(run: str | Path, trained: Trained, config: EvalConfig) -> dic
 def choose_contexts(task: Task, config: EvalConfig) -> tuple[list[int] | None, np.ndarray | None]:
     """Returns number and pose of the context of every rollout; None where all episodes start alike.
 
-    Too few contexts, and those asked for where there are none, are refused; so are rollouts without an environment.
+    Raises a ValueError for too few contexts, and for options that need contexts or an environment if there are none.
     """
     if task.env is None and config.env is None:
         for name in ("episodes", "rollouts_per_context", "batch_size", "contexts_file"):
@@ -190,24 +190,24 @@ def choose_contexts(task: Task, config: EvalConfig) -> tuple[list[int] | None, n
 
 @dataclass(frozen=True)
 class RolloutEnvironment:
-    """Environment that a run is rolled out in, with its modes and contexts."""
+    """Environment for the rollouts of a run, with its modes and contexts."""
 
-    make_env: Callable[[int], Any]  # of a number of parallel episodes
+    make_env: Callable[[int], Any]  # makes one with this number of parallel episodes
     max_steps: int
     modes: Modes
-    numbers: list[int] | None = None  # of the context of every rollout
+    numbers: list[int] | None = None  # number of the context of every rollout
     contexts: np.ndarray | None = None
-    record: EpisodeRecord | None = None  # of an environment of Gymnasium: what happened in the episodes
-    facts: Mapping[str, Any] = field(default_factory=dict)  # and what it is, for ``eval.json``
+    record: EpisodeRecord | None = None  # what happened in episodes of a Gymnasium environment
+    facts: Mapping[str, Any] = field(default_factory=dict)  # description of it for ``eval.json``
 
 
 def find_environment(
     task: Task, config: EvalConfig, cameras: Mapping[str, Projection] | None = None
 ) -> RolloutEnvironment:
-    """Finds the task's own environment, or the one of Gymnasium that was asked for, whose pictures are embedded.
+    """Finds the task's own environment, or the Gymnasium environment ``config.env``, whose pictures are embedded.
 
-    One that does not exist, has other widths than the task, or does not report success by the key that was asked for is
-    refused, like contexts that do not suffice.
+    Raises an error for an environment that does not exist, has other widths than the task or does not report success
+    under ``success_key``, and for too few contexts.
     """
     numbers, contexts = choose_contexts(task, config)
     if config.env is None:
@@ -219,7 +219,7 @@ def find_environment(
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
 
     if ":" in config.env:
-        with suppress(PluginError):  # making the environment says what is wrong with its module
+        with suppress(PluginError):  # making the environment raises the clearer error
             load_plugins([config.env.partition(":")[0]])
     record = EpisodeRecord()
     make_env = partial(
@@ -245,10 +245,10 @@ def find_environment(
     if not probe.own_limit:  # before rollouts that may take days
         warnings.warn(
             f"environment {config.env!r} has no step limit: an episode that it does not end lasts {probe.max_steps:,}"
-            " steps, the task's limit (--max-steps of `koap convert`); another one:"
+            " steps, the task's limit (--max-steps of `koap convert`); set another with"
             " --env-kwargs max_episode_steps=500",
             stacklevel=2,
         )
     if probe.success_key is None:
-        facts["success"] = "success: an end with more than twice any earlier reward, or what info says later"
+        facts["success"] = "success: an end with more than twice any earlier reward, or a later report in info"
     return RolloutEnvironment(make_env, probe.max_steps, Modes(), record=record, facts=facts)

@@ -1,10 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How far plans and actions lie from what was recorded; no environment needed.
+"""Errors of plans and actions on recorded data; no environment is needed.
 
-Several futures may be right: a sampled plan that differs from the demonstrator's is no error. Therefore scores of the
-whole distribution are computed.
+Several futures may be right: a plan that differs from the demonstration is not wrong. Plans are therefore scored as a
+distribution.
 
-Labels outside the budget are read here, for evaluation only, after the training; how many is in the result.
+Labels outside the budget are read here, for evaluation only, after the training. The result says how many.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 from torchrl_koap.training.controller import FEW_VALUES
 
-SAMPLES = 16  # plans in each situation
-SITUATIONS = 500  # that are looked at, at most
+SAMPLES = 16  # plans per situation
+SITUATIONS = 500  # scored at most
 # frames around a decoded action: enough history and look-ahead for every controller compared
 BEFORE, AFTER = 8, 11
-_MOST_FOLDS = 20  # labelled trajectories that are left out in turn, at most
+_MOST_FOLDS = 20  # largest number of labelled trajectories that are left out in turn
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
-    """Makes the plans ``[*B, H, d]`` that a planner has to beat, of two or more observed states ``[*B, h, d]``."""
+    """Makes the plans ``[*B, H, d]`` that a planner has to beat from two or more observed states ``[*B, h, d]``."""
     now, before = history[..., -1:, :], history[..., -2:-1, :]
     ahead = torch.arange(1, horizon + 1, device=history.device, dtype=history.dtype)[:, None]
     return {
@@ -50,16 +50,16 @@ def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
 
 
 def plan_errors(planner: StatePlanner, data: TensorDictBase, task: Task, *, seed: int = 0) -> dict[str, Any]:
-    """Scores a planner on trajectories that it has not seen, beside standing still and constant velocity.
+    """Scores a planner on unseen trajectories and compares it with standing still and constant velocity.
 
-    There are :data:`SAMPLES` plans in each of at most :data:`SITUATIONS`, spread evenly over all steps whose whole
-    future is recorded.
+    Samples :data:`SAMPLES` plans in each of at most :data:`SITUATIONS` situations. These are spread evenly over all
+    steps whose whole future is recorded.
 
     Returns:
-        dict: ``situations``, ``horizon``, ``samples``, ``unit``: a row per unit of the state columns with their names
-        (``columns``) and, per model, ``energy_score`` and ``best_of`` as ``overall`` and ``per_step`` in that unit,
-        distances over the columns of the unit together; ``relative``: the energy score as a share of that of standing
-        still, the mean over units; ``trajectory``: the relative score per trajectory.
+        dict: ``situations``, ``horizon``, ``samples``; ``unit``: a row per unit of the state columns, with their names
+        (``columns``) and, per model, ``energy_score`` and ``best_of``, each ``overall`` and ``per_step``, from
+        distances in that unit over all its columns; ``relative``: the energy score as a share of that of standing
+        still, mean over units; ``trajectory``: the relative score per trajectory.
     """
     horizon, history = planner.horizon, max(planner.history, 2)  # constant velocity needs two frames
     keys = [STATE, EPISODE]
@@ -94,7 +94,7 @@ def plan_errors(planner: StatePlanner, data: TensorDictBase, task: Task, *, seed
 
 
 def _score(sampled: Tensor, true: Tensor) -> dict[str, dict[str, Any]]:
-    """Rates plans ``[S, N, H, d]`` by energy score and best sample, over all and per step."""
+    """Scores plans ``[S, N, H, d]`` by energy score and best sample, overall and per step."""
     score = energy_score(sampled, true)  # [N, H]
     distance = (sampled - true).norm(dim=-1)  # [S, N, H]
     best, per_step = distance.mean(-1).amin(0).mean(), distance.amin(0).mean(0)
@@ -105,7 +105,7 @@ def _score(sampled: Tensor, true: Tensor) -> dict[str, dict[str, Any]]:
 
 
 def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
-    """Returns the numbers of the trajectories of which no label was in the budget."""
+    """Returns the numbers of the trajectories without a label in the budget."""
     every = data[EPISODE].unique()
     return every[~torch.isin(every, labelled_episodes(labelled).to(every.device))]
 
@@ -114,9 +114,9 @@ def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
 def first_actions(
     controller: nn.Module, data: TensorDictBase, episodes: Tensor | Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Decodes actions on the labelled steps of some trajectories: the same steps for every controller.
+    """Decodes actions on the labelled steps of ``episodes``, the same steps for every controller.
 
-    Returned are predicted and true actions ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
+    Returns predicted and true actions ``[N, act]`` in raw units, and the trajectory of every step ``[N]``.
     """
     wanted = torch.isin(data[EPISODE], torch.as_tensor(episodes, device=data[EPISODE].device))
     numbers, lengths = data[EPISODE][wanted].unique(return_counts=True)
@@ -124,7 +124,7 @@ def first_actions(
     if not len(part):
         return data[ACTION][:0].cpu(), data[ACTION][:0].cpu(), data[EPISODE][:0].cpu()
     windows = cut_windows(part, BEFORE + 1 + AFTER, select=[STATE, ACTION, EPISODE], pad_before=BEFORE)
-    windows = windows[windows[ACTION][:, BEFORE].isfinite().all(-1)]  # the data may lack labels themselves
+    windows = windows[windows[ACTION][:, BEFORE].isfinite().all(-1)]  # recordings may lack actions
     past = min(controller.num_past, BEFORE)
     states = windows[STATE][:, BEFORE - past :].to(device_of(controller))
     predicted = controller(TensorDict({controller.in_keys[0]: states}, [len(states)]))[controller.out_keys[-1]]
@@ -134,21 +134,21 @@ def first_actions(
 def errors_outside_budget(
     controller: nn.Module, data: TensorDictBase, labelled: TensorDictBase, task: Task
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Measures errors on the trajectories that have labels of which none was in the budget.
+    """Measures errors on the trajectories whose labels are all outside the budget.
 
-    The flat data are as the controller sees them, with all labels, and with those of the budget (``labelled``).
-    Returned is what :func:`summarise_errors` finds, or a ``note`` why there is none; and the actions ``predicted`` and
-    ``true`` ``[N, act]``.
+    The flat ``data``, as the controller sees them, have all labels, ``labelled`` those of the budget. Returns the
+    result of :func:`summarise_errors`, or a ``note`` why there is none, and actions ``predicted`` and ``true``
+    ``[N, act]``.
     """
     outside = episodes_outside(data, labelled)
     predicted, true, episode = first_actions(controller, data, outside)
     if not len(true):
         return {"note": "no trajectory outside the budget has labels"}, {}
-    models = _beside(predicted, true, labelled, data, outside, task)
+    models = _with_baselines(predicted, true, labelled, data, outside, task)
     return summarise_errors(models, true, episode, task), {"predicted": predicted, "true": true}
 
 
-def _beside(
+def _with_baselines(
     predicted: Tensor,
     true: Tensor,
     known: TensorDictBase,
@@ -156,12 +156,12 @@ def _beside(
     episodes: Tensor | Sequence[int],
     task: Task,
 ) -> dict[str, Tensor]:
-    """Actions ``[N, act]`` on some trajectories: a controller's, a ridge's on raw frames, the mean of those known."""
+    """Returns actions ``[N, act]`` of a controller, of a ridge on raw frames, and the mean of the known actions."""
     linear = LinearInverseDynamics(known[STATE].shape[-1], task.action_dim).to(known[STATE].dtype)
     fit_closed_form(linear, known)
     fixed = torch.tensor([action.constant is not None for action in task.actions.values()])
     return {
-        "controller": torch.where(fixed, true, predicted),  # as a policy commands: what never changes is what it was
+        "controller": torch.where(fixed, true, predicted),  # a policy repeats constant actions exactly
         "ridge": first_actions(linear, data, episodes)[0],
         "mean_action": known[ACTION][known[HAS_ACTION].squeeze(-1)].mean(0).expand_as(true),
     }
@@ -170,11 +170,10 @@ def _beside(
 def errors_left_out(
     controller: nn.Module, labelled: TensorDictBase, task: Task, columns: Sequence[int]
 ) -> dict[str, Any]:
-    """Measures errors on labels inside the budget: each trajectory in turn is hidden and the decoder fitted again.
+    """Measures errors on labels in the budget: hides each labelled trajectory in turn and refits the decoder.
 
-    What lies before the decoder stays as it was trained: it has seen the states of the trajectory left out. The
-    controller, which reads the state ``columns``, is not changed. Arguments and result as of
-    :func:`errors_outside_budget`.
+    Only the decoder of a copy is fitted again; the rest was trained with the states of the trajectory left out. The
+    controller reads the state ``columns``. Other arguments and the result are those of :func:`errors_outside_budget`.
     """
     episodes = labelled_episodes(labelled)
     if len(episodes) < 2:
@@ -188,8 +187,8 @@ def errors_left_out(
         again = copy.deepcopy(controller)
         fit_closed_form(again, fold, **action_facts(task, columns))
         predicted, true, episode = first_actions(again, labelled, [int(number)])
-        if len(true):  # else its labels lie too near its end
-            folds.append((_beside(predicted, true, fold, labelled, [int(number)], task), true, episode))
+        if len(true):  # otherwise its labels lie too near its end
+            folds.append((_with_baselines(predicted, true, fold, labelled, [int(number)], task), true, episode))
     if not folds:
         return {"note": "no labelled step has enough recorded future to decode its action"}
     models, truths, numbers = zip(*folds, strict=True)
@@ -200,10 +199,10 @@ def errors_left_out(
 def errors_of_chunks(
     policy: DiffusionPolicy, data: TensorDictBase, labelled: TensorDictBase, task: Task, *, seed: int = 0
 ) -> dict[str, Any]:
-    """Errors of sampled actions on the trajectories that have labels of which none was in the budget.
+    """Measures errors of sampled actions on the trajectories whose labels are all outside the budget.
 
-    Judged is the mean of the first actions of :data:`SAMPLES` chunks, in as many situations as plans are judged in; the
-    ridge is a linear policy of the same frames. Arguments, all columns of the state included, and result as of
+    Evaluates the mean of the first actions of :data:`SAMPLES` chunks in at most :data:`SITUATIONS` situations. The
+    ridge is a linear policy that reads the same frames. Arguments, with all state columns, and result are those of
     :func:`errors_outside_budget`.
     """
     history, targets = policy.history, tuple(task.targets.items())
@@ -219,7 +218,7 @@ def errors_of_chunks(
     known = known[known[HAS_ACTION][:, now, 0]]
 
     def moved(action: Tensor, states: Tensor) -> Tensor:
-        """Absolute actions as distances from where their columns are in the present frame."""
+        """Returns absolute actions relative to their state columns in the present frame."""
         return shift_actions(action, states[:, now], targets, sign=-1)
 
     past, device = windows[STATE][:, :history].float(), device_of(policy)
@@ -238,14 +237,14 @@ def errors_of_chunks(
 
 
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:
-    """Takes root mean squared errors of predicted and recorded actions ``[N, act]`` in trajectories ``episode [N]``.
+    """Computes root mean squared errors of predicted actions ``[N, act]``; ``episode [N]`` are their trajectories.
 
     Returns:
         dict: ``labels``, ``trajectories``; ``relative``: the controller's error as a share of that of the mean action,
         root mean square over columns (1: no better than always giving the mean action); ``ridge_relative``: the
-        ridge's likewise; ``unit`` and ``column``: rows with the errors of every model in the unit of the data, raw
-        actions without a unit apart; ``trajectory``: the relative error of each. Rows of raw columns of few numbers
-        have ``values``: how many ``labels`` each has, and in how many the controller came ``nearest`` to it.
+        ridge's likewise; ``unit`` and ``column``: rows with the errors of every model in the unit of the data, with
+        raw actions without a unit in a row of their own; ``trajectory``: the relative error of each. Raw columns with
+        few values have ``values``: how many ``labels`` have each, and for how many the prediction is ``nearest`` to it.
     """
     square = {name: (predicted - true).square() for name, predicted in models.items()}
     units, names = list(task.action_units), task.action_names
@@ -284,7 +283,7 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
 
 
 def _relative(square: dict[str, Tensor], name: str = "controller", where: Tensor | None = None) -> float | None:
-    """Error over that of the mean action; the scale is that of all steps, so that trajectories can be compared."""
+    """Returns an error relative to that of the mean action over all steps, so that trajectories can be compared."""
     scale = square["mean_action"].mean(0)
     own = (square[name] if where is None else square[name][where]).mean(0)
     moves = scale > 0

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Which part of a policy fails: planner, controller, or the data.
 
-Three success rates separate them. The planner alone continues its own plans: the executed part of each becomes the
-next history, nothing is simulated. The controller alone follows the recorded states of demonstrations, as if the
+Three success rates separate them. The planner alone continues its own plans without simulation: the executed part of
+each plan becomes the next history. The controller alone follows the recorded states of demonstrations, as if the
 planner were perfect. Both together are the closed loop.
 """
 
@@ -24,36 +24,36 @@ from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import unit_groups
 
-_MOST_STATES = 4000  # whose distances are measured
+_MOST_STATES = 4000  # largest number of states whose distances are measured
 RECORDED_FUTURE = "recorded_future"
-RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end
+RECORDED = "recorded"  # marks steps whose next state is recorded; after the end, its last state is repeated
 
 
 def hand_on(futures: Tensor) -> TensorDictModule:
-    """Writes the recorded states ``[E, steps, H, d]`` after the current step, the last ones when a record is over."""
+    """Writes the recorded futures ``[E, steps, H, d]`` of one step per call; repeats the last ones at the end."""
     steps = itertools.chain(futures.unbind(1), itertools.repeat(futures[:, -1]))
     return TensorDictModule(steps.__next__, in_keys=[], out_keys=[RECORDED_FUTURE])
 
 
 class RecordedPlanner(nn.Module):
-    """Hands on the recorded future in place of plans, with history and horizon of a planner."""
+    """Returns recorded futures as plans, with history and horizon of a planner."""
 
-    noise_key = RECORDED_FUTURE  # what a policy hands over is no noise here
+    noise_key = RECORDED_FUTURE  # the policy passes this entry to sample() in place of noise
 
     def __init__(self, planner: StatePlanner):
         super().__init__()
         self.history, self.horizon = planner.history, planner.horizon
 
     def sample(self, history: Tensor, future: Tensor) -> Tensor:
-        """The futures ``[*B, H, d]`` that :func:`hand_on` writes, of histories ``[*B, h, d]``."""
+        """Returns the futures ``[*B, H, d]`` of :func:`hand_on` for histories ``[*B, h, d]``."""
         return future.expand(*history.shape[:-2], -1, -1)
 
 
 @torch.no_grad()
 def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: int, seed: int = 0) -> Tensor:
-    """Lets a planner continue its own plans, of each of which ``interval`` states are taken over.
+    """Lets a planner continue its own plans; each contributes its first ``interval`` states.
 
-    Returned are planned states ``[E, max_steps, d]`` (or a few more), the first one the start ``[E, d]``.
+    Returns planned states ``[E, max_steps, d]`` (or a few more), which begin with the start ``[E, d]``.
     """
     generator = torch.Generator().manual_seed(seed)
     states = [start] * planner.history
@@ -65,9 +65,9 @@ def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_
 
 
 def contexts_of(task: Task, observation: Tensor) -> Tensor:
-    """Finds the contexts ``[E, objects, 3]`` (x, y in m, yaw in rad) that first observations ``[E, obs]`` show.
+    """Reads the contexts ``[E, objects, 3]`` (x, y in m, yaw in rad) from first observations ``[E, obs]``.
 
-    ``tan(yaw)`` gives the yaw of a box up to half a turn, which looks the same.
+    ``tan(yaw)`` gives the yaw of a box up to half a turn, after which the box looks the same.
     """
     rows = []
     for body in task.bodies:
@@ -83,7 +83,7 @@ def contexts_of(task: Task, observation: Tensor) -> Tensor:
 
 
 def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
-    """Stacks the states ``[E, max T, H, d]`` after every step of trajectories ``[T_i, d]``, their last one repeated."""
+    """Stacks the states ``[E, max T, H, d]`` after every step of trajectories ``[T_i, d]``; repeats the last one."""
     longest = max(len(path) for path in states)
     ahead = torch.arange(longest)[:, None] + torch.arange(1, horizon + 1)
     return torch.stack([path[ahead.clamp_max(len(path) - 1)] for path in states])
@@ -92,10 +92,10 @@ def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
 def follow_recordings(
     policy: PlanningPolicy, task: Task, data: TensorDictBase, make_env: Callable[[int], Any], *, episodes: int
 ) -> list[TensorDict]:
-    """Rolls out a policy with recorded states in place of plans, one episode for each of as many demonstrations.
+    """Rolls out a policy with recorded states in place of plans, one episode per chosen demonstration.
 
-    They are spread evenly over the data; where some have no action at all, as those of another embodiment, only the
-    others are followed. Episodes have the entry :data:`RECORDED` ``[T, 1]``.
+    At most ``episodes`` demonstrations are chosen, spread evenly over the data. Those without actions, for example of
+    another embodiment, are skipped if others have some. Episodes have the entry :data:`RECORDED` ``[T, 1]``.
     """
     lengths = trajectory_lengths(data).tolist()
     own = torch.isin(data[EPISODE].unique_consecutive(), labelled_episodes(data)).nonzero().squeeze(-1)
@@ -108,7 +108,7 @@ def follow_recordings(
         planner,
         policy.follower,
         state_of=policy.state_of,
-        execution=policy.execution.replaced(temperature=1.0),  # futures come as noise
+        execution=policy.execution.replaced(temperature=1.0),  # it would scale the futures, which replace noise
         limits=policy.limits,
     ).to(device_of(policy))
     futures = recorded_futures([paths[index] for index in chosen], planner.horizon)
@@ -128,9 +128,9 @@ def follow_recordings(
 def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
     """Measures how far executed states lie from the current plan, per part of the state, in its units.
 
-    These are root mean square distances per step ``1 .. interval`` after a plan; none of rollouts ``[T]`` without the
-    entry ``plan``. A part whose columns have several units has an entry for each, such as ``"arm (rad)"``. Of rollouts
-    that follow a recording the steps count that it has, not the standing at its end.
+    Returns root mean square distances per step ``1 .. interval`` after a plan; none if rollouts ``[T]`` lack the entry
+    ``plan``. A part whose columns have several units has an entry for each, such as ``"arm (rad)"``. In rollouts that
+    follow a recording, only steps before its end count.
     """
     columns_of = _columns_by_unit(task)
     errors: dict[str, list[Tensor]] = {name: [] for name in columns_of}
@@ -149,7 +149,7 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
 
 
 def _columns_by_unit(task: Task) -> dict[str, slice | list[int]]:
-    """Columns of the state by its parts, those of one with several units apart."""
+    """Returns the state columns of each part; a part with several units has an entry per unit."""
     found: dict[str, slice | list[int]] = {}
     for name, columns in task.state_slices.items():
         units = unit_groups(task.state_units[columns])
@@ -162,24 +162,24 @@ def _columns_by_unit(task: Task) -> dict[str, slice | list[int]]:
 
 
 def of_position(task: Task, errors: Mapping[str, list[float]]) -> list[float] | None:
-    """Returns those of :func:`tracking_errors` that are of the tool's position, None where the state shows none."""
+    """Returns the :func:`tracking_errors` of the tool's position; None if the state does not hold it."""
     return errors.get(task.position, errors.get(f"{task.position} (m)"))
 
 
 def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *, beyond: float) -> int:
-    """Counts the recorded tool paths from which a controller is further than ``beyond`` (m, root mean square).
+    """Counts the recorded tool paths that a controller misses by more than ``beyond`` (m, root mean square).
 
-    Looked at is the step ``interval`` after each plan, in rollouts of :func:`follow_recordings`.
+    Compares the steps ``interval`` after each plan in rollouts of :func:`follow_recordings`.
     """
     errors = [of_position(task, tracking_errors(task, [episode], interval)) for episode in episodes]
     return sum(error[-1] > beyond for error in errors if error)
 
 
 def distance_to_demonstrations(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:
-    """Measures how far visited states are from the nearest demonstrated one, and demonstrated ones, in spreads.
+    """Measures how far visited and held-out demonstrated states are from the nearest other demonstrated state.
 
-    Every second demonstration is compared with the others, so that both figures are distances to strangers: their 95 %
-    quantiles. Nothing is measured if there is a single demonstration.
+    Every second demonstration is held out, so that neither is compared with itself. Returns 95 % quantiles in units of
+    the states' spread (standard deviation); an empty dict for a single demonstration.
     """
     every = data[EPISODE] % 2 == 0
     known, held_out = data[STATE][every], data[STATE][~every]

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What the numbers of a run mean: every threshold and sentence of ``koap inspect`` and of offline evaluations."""
+"""All thresholds and sentences of ``koap inspect`` and of offline evaluations."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import thousandths
 
 EXPERIMENTS = ("planner_alone", "controller_alone", "both")  # of ``koap inspect``, in the simulator
-MODELS = ("koopman", "reconstruction", "linear", "copy_last")  # whose multi-step errors are compared
-OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"  # entry of figures that read labels of no budget
-NEAR = 0.015  # m; recorded tool paths followed within this are followed well
-GOOD = 0.9  # a success rate of a part that is not at fault
-DATA = "mend what `koap validate` warns of"
-MORE = f"{DATA}, then record more, or train longer (--steps) if plans were still improving"  # what to do about plans
-KIND = f"{DATA}, check --action-kind and --robot, or label a recording that moves it"  # about an action
-ROUND = "round at another threshold, or decide it in your driver; give each of several modes a column of 0 and 1"
-_NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, leave it"
-UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of a loop on labels
-HARDLY = 0.9  # of the error of the mean action: a column that is not learned, which others may hide
-_FAR = 3.0  # standard deviations of the recorded states from the nearest of them
-STAYS = 0.2  # of the way of the demonstrations
-LEAVES = "cut pauses at their ends (`koap convert --trim-still`), or train longer (--steps)"  # what to do about it
-_LEFT = 0.1  # share of recorded paths that a controller may leave
-_ODD, _NOTABLE = 2.0, 0.5  # times the median error of other recordings from which labels are odd; relative error
-_WORSE = 2.0  # times the error of a comparable model from which a latent model counts as worse
+MODELS = ("koopman", "reconstruction", "linear", "copy_last")  # compared by their multi-step errors
+OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"  # key of results that read labels outside the budget
+NEAR = 0.015  # m; largest distance at which a tool follows a recorded path well
+GOOD = 0.9  # smallest success rate of a part that is not at fault
+DATA = "fix what `koap validate` warns about"
+MORE = f"{DATA}, then record more, or train longer (--steps) if plans were still improving"  # advice on plans
+KIND = f"{DATA}, check --action-kind and --robot, or label a recording that moves it"  # advice on actions
+ROUND = "round at another threshold, or choose the value in your driver; give each of several modes a 0/1 column"
+_NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, ignore them"
+UNSTABLE = 3.0  # late commands in a loop on labels, relative to the largest demonstrated one
+HARDLY = 0.9  # share of the mean action's error above which a column is not learned, even if others are
+_FAR = 3.0  # largest distance to the nearest recorded state, in standard deviations of these states
+STAYS = 0.2  # smallest distance from the start, relative to that of demonstrations
+LEAVES = "cut pauses at their ends (`koap convert --trim-still`), or train longer (--steps)"  # advice
+_MAX_LEFT = 0.1  # share of recorded paths that a controller may leave
+_ODD, _NOTABLE = 2.0, 0.5  # labels are odd above: multiple of the others' median error; relative error
+_WORSE = 2.0  # multiple of the error of a comparable model above which a latent model is worse
 
 
 def error_unit(part: str, task: Task) -> tuple[str, float]:
-    """Returns the unit in which errors of a part of the state are shown, none for several, and the factor to it."""
+    """Returns the unit that shows errors of a part of the state (none if there are several) and the factor to it."""
     units = set(task.known_units[task.observation[part]])
     return thousandths(units.pop()) if len(units) == 1 else ("", 1.0)
 
@@ -49,24 +49,24 @@ def describe_inspection(result: Mapping[str, Any], task: Task) -> str:
 
 
 def _describe_experiments(result: Mapping[str, Any]) -> str:
-    """Says which part fails by the three experiments.
+    """Says which part fails in the three experiments.
 
-    Where things are pushed or grasped, recorded tool paths do not answer to where the objects went: there the
-    controller is rated by how near the tool stays to them. A planner whose task has no goal is not rated.
+    Recorded tool paths do not react to where pushed or grasped objects went. There, the controller is rated by how
+    near the tool stays to the paths. A planner whose task has no goal is not rated.
     """
     planner, controller, both = (result[name]["rate"] if name in result else None for name in EXPERIMENTS)
     if both >= GOOD:
-        return "nothing to find: the closed loop succeeds"
+        return "no fault found: the closed loop succeeds"
     parts = [fault for fault in result.get("faults", ()) if "error of the environment" in fault]
     if planner is not None and planner < GOOD:
-        parts.append(f"the planner alone reaches the goal in {planner:.0%} of the episodes only")
+        parts.append(f"the planner alone reaches the goal in only {planner:.0%} of the episodes")
     if "recordings_left" in result:
         left, count = (result["recordings_left"][name] for name in ("count", "episodes"))
-        if left > _LEFT * count:
+        if left > _MAX_LEFT * count:
             paths = f"{left} of {count} recorded tool paths"
             parts.append(f"the controller leaves {paths} by more than {1e3 * NEAR:.0f} mm")
     elif controller is not None and controller < GOOD:
-        parts.append(f"the controller follows recorded states to the goal in {controller:.0%} only")
+        parts.append(f"the controller follows recorded states to the goal in only {controller:.0%}")
     distance = result["distance_to_demonstrations"]
     if distance and distance["visited_95"] > 2 * distance["demonstrated_95"]:
         parts.append("executed states lie far from every demonstration")
@@ -75,15 +75,15 @@ def _describe_experiments(result: Mapping[str, Any]) -> str:
     if controller is None:
         return "planner and controller cannot be tried alone: this environment cannot start where a recording did"
     if planner is None:
-        return "the controller works alone: the planner, or plans that start from executed states, are what is left"
+        return "the controller works alone: the fault is in the planner, or in plans that start from executed states"
     return "planner and controller work alone, not together: plans that start from executed states are worse"
 
 
 def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
     """Says what is wrong with the latent dynamics as a model of the motion; an empty list if nothing is.
 
-    Compared are the errors of :func:`~torchrl_koap.evaluation.latent_space.prediction_errors` after the last step, in
-    the first part of the state.
+    Compares the errors of :func:`~torchrl_koap.evaluation.latent_space.prediction_errors` after the last step, in the
+    first part of the state.
     """
     part = next(iter(multi_step["koopman"]))
     koopman, back, linear, still = (float(multi_step[model][part][-1]) for model in MODELS)
@@ -95,16 +95,16 @@ def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
     if koopman > _WORSE * linear:
         faults.append(f"the latent dynamics predict {_times(koopman, linear)} worse than a linear model on raw states")
     if faults and back > _WORSE * linear:
-        faults.append(f"mapping lifted states back alone loses {_times(back, linear)} what that linear model does")
+        faults.append(f"mapping lifted states back alone errs {_times(back, linear)} as much as that linear model")
     return faults
 
 
 def offline_faults(
     plan: Mapping[str, Any], action: Mapping[str, Any], names: Mapping[int, str] | None = None
 ) -> list[str]:
-    """Says what is worse than what needs no learning, and which labels are odd, by the figures of an evaluation.
+    """Says which errors exceed those of baselines without learning, and which labels are odd.
 
-    ``names`` are what to call trajectories, such as their files.
+    ``names`` are the names of trajectories in sentences, such as their files.
     """
     faults = _odd_labels(action.get("left_out", {}).get("trajectory", ()), names or {})
     for row in plan.get("unit", ()):
@@ -125,14 +125,14 @@ def offline_faults(
             for each in row.get("values", ()):
                 if 2 * each["nearest"] < each["labels"]:
                     faults.append(
-                        f"action {row['name']} is nearest to {each['value']:g} in only {each['nearest']} of"
+                        f"action {row['name']} is predicted nearest to {each['value']:g} in only {each['nearest']} of"
                         f" {each['labels']} labels of that value ({words}): rounding seldom gives it; {ROUND}"
                     )
     return faults
 
 
 def _odd_labels(rows: Sequence[Mapping[str, Any]], names: Mapping[int, str]) -> list[str]:
-    """Names labelled recordings that are predicted far worse than others when each is left out in turn."""
+    """Names labelled recordings whose actions are predicted far worse than others when each is left out in turn."""
     errors = {row["episode"]: row["relative_action_error"] or 0.0 for row in rows}
     if len(errors) < 3:
         return []

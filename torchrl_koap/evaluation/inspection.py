@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which part of a trained run fails (planner, controller, data), and what its latent actions hold."""
+"""Finds which part of a trained run fails (planner, controller or data), and what its latent actions hold."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ from torchrl_koap.training.trained import Trained
 class InspectConfig(EvalConfig):
     """Which part of a trained run fails, and what its latent actions hold.
 
-    In an environment of Gymnasium, which cannot start where a recording did, the closed loop is looked at alone.
+    A Gymnasium environment cannot start where a recording did; there, the controller is not tested alone.
 
     Attributes:
-        latent_only: look into the latent space alone: seconds, without the experiments in the simulator.
+        latent_only: analyse the latent space only, which takes seconds, without experiments in the simulator.
     """
 
     episodes: int = 30
@@ -55,23 +55,23 @@ class InspectConfig(EvalConfig):
 
 @torch_as_before()
 def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, Any]:
-    """Makes the three experiments and looks into the latent space; writes ``inspect.json``.
+    """Runs the three experiments and analyses the latent space; writes ``inspect.json``.
 
-    ``planner_alone`` lets its plans come true, which needs a goal in the states of the task; ``controller_alone``
-    follows recorded states (blind to where objects went), ``both`` is the closed loop. Plans are followed as
-    ``koap eval`` follows them. ``latent`` (:func:`~torchrl_koap.evaluation.latent_space.analyse_latent`) reads labels
-    outside the budget, for evaluation only.
+    ``planner_alone`` takes plans as executed states; it needs a goal in the states of the task. ``controller_alone``
+    follows recorded states, whatever happens to objects; ``both`` is the closed loop. Plans are executed as in
+    ``koap eval``. ``latent`` (:func:`~torchrl_koap.evaluation.latent_space.analyse_latent`) reads labels outside the
+    budget, for evaluation only.
 
     Args:
         run (str or Path): a run directory, or ``"pretrained:NAME"``.
-        config (InspectConfig, optional): how many episodes, and how.
+        config (InspectConfig, optional): the options.
 
     Returns:
-        dict: what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, and ``findings``.
+        dict: the contents of ``inspect.json``: the three experiments, if they ran, ``latent``, and ``findings``.
 
     Raises:
-        ValueError: for a run without a planner, a task without an environment, or if it raises errors in all episodes.
-        RunDirectoryError: if the folder is no finished run, or its demonstrations are not there or others.
+        ValueError: for a run without a planner, a task without an environment, or if all episodes raise errors.
+        RunDirectoryError: if the folder is no finished run, or its demonstrations are missing or changed.
 
     Examples:
         >>> from torchrl_koap.evaluation import InspectConfig, inspect
@@ -83,22 +83,22 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
     task = trained.task
     if task.env is None and config.env is None and not config.latent_only:
         raise ValueError(
-            f"task {task.name!r} has no environment to make experiments in: name one with --env, or --latent-only looks"
-            " into the latent space alone; `koap eval` judges plans and actions on recorded data"
+            f"task {task.name!r} has no environment to make experiments in: name one with --env, or analyse the latent"
+            " space alone with --latent-only; `koap eval` measures plans and actions on recorded data"
         )
     if trained.planner is None and not config.latent_only:
         raise ValueError(f"method {trained.method.name!r} samples actions: it has no planner and controller to compare")
     if config.out is None:
-        writable_folder(run)  # a pretrained run is refused before its data are looked for
+        writable_folder(run)  # refuses a pretrained run before its data are read
     data = trained.data(config.dataset)
     labelled = trained.hide_labels(data)[0][HAS_ACTION].squeeze(-1)
     where = None if config.latent_only else find_environment(task, config, trained.cameras)
-    directory = RunDirectory(writable_folder(run, config.out))  # a wrong call leaves no copy
+    directory = RunDirectory(writable_folder(run, config.out))  # after all checks: a refused call copies nothing
     if where is not None:
         result = _experiments(config, trained, data, where)
-    else:  # what earlier experiments found stays
+    else:  # keeps the results of earlier experiments
         result = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
-    result["latent"] = _look_into(trained, data, labelled)
+    result["latent"] = _analyse(trained, data, labelled)
     result["findings"] = describe_inspection(result, task)
     directory.write_json("inspect.json", result)
     return result
@@ -120,12 +120,12 @@ def _experiments(
         bar.update()
         found["both"] = rate([outcome_of(episode) == "success" for episode in closed])
         if not (closed := [episode for episode in closed if outcome_of(episode) != "error"]):
-            raise ValueError(f"no episode is without an error of the environment: {where.record.faults()[-1]}")
+            raise ValueError(f"every episode ended with an error of the environment: {where.record.faults()[-1]}")
         found |= {
             "plan_to_execution": tracking_errors(task, closed, interval),
             "distance_to_demonstrations": distance_to_demonstrations(task, closed, data),
         }
-        if config.env is None:  # the controller alone follows recordings from where they started
+        if config.env is None:  # needs an environment that starts where a recording did
             followed = follow_recordings(policy, task, data, where.make_env, episodes=config.episodes)
             tracked = tracking_errors(task, followed, interval)
             if task.objects and of_position(task, tracked):
@@ -147,10 +147,10 @@ def _experiments(
     return found
 
 
-def _look_into(trained: Trained, data: TensorDictBase, labelled: Tensor) -> dict[str, Any]:
+def _analyse(trained: Trained, data: TensorDictBase, labelled: Tensor) -> dict[str, Any]:
     controller, task = trained.controller.cpu(), trained.task
     if not isinstance(controller, KoopmanInverseDynamics):
-        return {"note": f"method {trained.config.method!r} has no latent actions to look into"}
+        return {"note": f"method {trained.config.method!r} has no latent actions to analyse"}
     parts = {
         name: places
         for name, part in task.state_slices.items()

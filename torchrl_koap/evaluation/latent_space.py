@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a trained Koopman model has learned: its spectrum, its multi-step errors, and what its latent actions hold.
+"""Analyses a trained Koopman model: its spectrum, its multi-step errors, and what its latent actions hold.
 
-Spectrum and multi-step errors need no label. The linear probe asks whether the true actions lie linearly in the latent
-actions at all; it reads every label, in the budget or not, so it may inform a reader and nothing else.
+Spectrum and multi-step errors need no label. The linear probe tests whether true actions are a linear function of
+latent actions. It reads every label, in the budget or not; therefore its result must only be reported.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.modules.ridge import ridge
 
-HORIZON = 10  # control steps that are predicted
-_MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
+HORIZON = 10  # control steps
+_MOST_WINDOWS = 20000  # more of them change no shown digit of the errors
 
 
 @torch.no_grad()
 def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase, *, every: int = 1) -> TensorDict:
-    """Infers the latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
+    """Infers latent actions of all steps with a whole look-ahead, each once: the steps that a decoder is fitted to.
 
-    Where ``every`` is above 1, one step of so many is looked at. Entries ``[M]``: ``latent_action [M, m]``, ``action``,
-    ``has_action [M]``, ``episode [M]``.
+    Reads one step in ``every``. Returns entries ``[M]``: ``latent_action [M, m]``, ``action``, ``has_action [M]``,
+    ``episode [M]``.
     """
     now = controller.num_past
     table = WindowTable.build(data, controller.num_window_frames, pad_before=now)
@@ -43,17 +43,17 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase, *, eve
 
 
 def split_trajectories(episode: Tensor, labelled: Tensor) -> Tensor:
-    """Draws the numbers of half of the trajectories, two or more, to fit on, those with a label in the budget first.
+    """Draws half of the trajectories to fit on, first those with a label in the budget; returns their numbers.
 
-    The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many. Of every
-    step are given its trajectory ``[N]`` and whether the budget labels it ``[N]``.
+    The other half is then new to a decoder fitted within the budget, unless the budget labels more than half of them.
+    ``episode [N]`` and ``labelled [N]`` are the trajectory of every step and whether the budget labels it.
     """
     names = episode.unique()
     if len(names) < 2:
-        raise ValueError("to fit on half of the trajectories takes at least two, got 1")
+        raise ValueError("fitting on half of the trajectories needs at least two, got 1")
     order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
-    touched = torch.isin(order, episode[labelled].unique())
-    return torch.cat([order[touched], order[~touched]])[: len(names) // 2]
+    in_budget = torch.isin(order, episode[labelled].unique())
+    return torch.cat([order[in_budget], order[~in_budget]])[: len(names) // 2]
 
 
 @torch.no_grad()
@@ -65,20 +65,20 @@ def prediction_errors(
     *,
     horizon: int,
 ) -> dict[str, dict[str, list[float]]]:
-    r"""Measures how far predicted states are from recorded ones, ``1 .. horizon`` steps ahead, for three models.
+    r"""Measures errors of predicted states ``1 .. horizon`` steps ahead for three models.
 
     * ``koopman``: :math:`z_{t+1} = K z_t + B u_t` from :math:`z_t = g_\theta(x_t)`, mapped back by :math:`g_\psi`;
-    * ``linear``: :math:`x_{t+1} = A x_t + C v_t + c` by least squares, with ``v_t`` the frames that ``u_t`` is made of:
+    * ``linear``: :math:`x_{t+1} = A x_t + C v_t + c` by least squares, where ``v_t`` are the frames that ``u_t`` reads:
       the same inputs, no lifting;
     * ``copy_last``: :math:`x_{t+h} = x_t`.
 
-    Beside them ``reconstruction``: :math:`g_\psi(g_\theta(x_{t+h}))`, what the first one cannot do better than.
+    ``reconstruction``, :math:`g_\psi(g_\theta(x_{t+h}))`, is the smallest error that the first one can reach.
 
     Both ``u`` and ``v`` read recorded states *ahead* of every step, so this tests the models; it is no forecast. The
     linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others.
 
-    By model and part the root mean square distance after ``1 .. horizon`` steps is returned, in raw units. A horizon
-    above what a trajectory holds is an error.
+    Returns, by model and part, the root mean square distance after ``1 .. horizon`` steps, in raw units. A horizon that
+    exceeds a trajectory is an error.
     """
     now, length = controller.num_past, controller.num_window_frames + horizon - 1
     table = WindowTable.build(data, length, pad_before=now)
@@ -117,7 +117,7 @@ def _raw(controller: KoopmanInverseDynamics, state: Tensor) -> Tensor:
 
 
 def _frames_read(controller: KoopmanInverseDynamics, states: Tensor, frames: range) -> Tensor:
-    """What the latent actions of some frames read, flat and with a constant: ``[B, len(frames), .]``."""
+    """Returns the inputs of latent actions of some frames, flat, with a constant column: ``[B, len(frames), .]``."""
     read = controller.latent_action.gather(controller.normalize_state(states), frames).flatten(-2).double()
     return torch.cat([read, torch.ones_like(read[..., :1])], -1)
 
@@ -126,7 +126,7 @@ def _fit_linear(controller: KoopmanInverseDynamics, states: Tensor) -> Tensor:
     now = controller.num_past
     normalized = controller.normalize_state(states).double()
     inputs = torch.cat([normalized[:, now], _frames_read(controller, states, range(now, now + 1))[:, 0]], -1)
-    # x_t is among the frames read: only an SVD finds the smallest of the many best answers
+    # x_t is among the frames read, so inputs are collinear: only an SVD finds the minimum-norm solution
     return torch.linalg.lstsq(inputs, normalized[:, now + 1], driver="gelsd").solution
 
 
@@ -140,17 +140,17 @@ def _roll_linear(controller: KoopmanInverseDynamics, weight: Tensor, states: Ten
 
 
 def explained(predicted: Tensor, true: Tensor) -> list[float]:
-    """Returns the share ``R^2`` of the variance of every column ``[N, a]`` that is explained; NaN without variance."""
+    """Returns the explained share ``R^2`` of the variance of every column ``[N, a]``; NaN without variance."""
     left = (predicted - true).double().square().sum(0)
     spread = (true - true.mean(0)).double().square().sum(0)
     return torch.where(spread > 0, 1 - left / spread, torch.nan).tolist()
 
 
 def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[float]:
-    """Returns the ``R^2`` of a linear map from latent ``[N, m]`` to true actions ``[N, act]``, all of which are read.
+    """Returns the ``R^2`` of a linear map from latent ``[N, m]`` to true actions ``[N, act]``; reads all of them.
 
-    It is fitted on the steps ``fit`` (bool ``[N]``) and tested on the others; ``groups`` are the trajectories ``[N]``
-    by which the ridge is chosen.
+    The map is fitted on the steps ``fit`` (bool ``[N]``) and tested on the others. ``groups`` are the trajectories
+    ``[N]`` that cross-validation of the ridge leaves out.
     """
     return explained(ridge(latent[fit], action[fit], groups=groups[fit]).predict(latent[~fit]), action[~fit])
 
@@ -158,15 +158,15 @@ def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[f
 def analyse_latent(
     controller: KoopmanInverseDynamics, data: TensorDictBase, labelled: Tensor, parts: Mapping[str, Sequence[int]]
 ) -> dict[str, Any]:
-    """Measures eigenvalues, multi-step errors (of fewer steps where trajectories are short) and what a probe explains.
+    """Measures eigenvalues, multi-step errors (fewer steps for short trajectories) and the ``R^2`` of a linear probe.
 
-    The flat data ``[N]`` have all labels, as the controller sees them; ``labelled`` are those in the budget, bool
-    ``[N]``, ``parts`` columns of the state by name.
+    The flat data ``[N]``, as the controller sees them, have all labels. ``labelled`` marks those in the budget, bool
+    ``[N]``; ``parts`` are columns of the state by name.
 
     Returns:
         dict: ``eigenvalues``, ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET` the probe, the number of labels it
-        read and the ``R^2`` of the model's own decoder on the same steps; or a ``note`` where fewer than two
-        trajectories have labels.
+        read and the ``R^2`` of the model's own decoder on the same steps; or a ``note`` if fewer than two trajectories
+        have labels.
     """
     eigenvalues = controller.operator.eigenvalues().detach()
     result: dict[str, Any] = {"eigenvalues": {"real": eigenvalues.real.tolist(), "imag": eigenvalues.imag.tolist()}}
@@ -182,7 +182,7 @@ def analyse_latent(
         return result | {OUTSIDE_THE_BUDGET: {"note": note}}
     steps = infer_steps(controller, data[torch.isin(data[EPISODE], known)])
     steps = steps[steps[HAS_ACTION]]
-    if not data[HAS_ACTION].all():  # the data lack labels themselves
+    if not data[HAS_ACTION].all():  # the recordings themselves lack some actions
         fit_on = split_trajectories(steps[EPISODE], torch.zeros(len(steps), dtype=torch.bool))
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()

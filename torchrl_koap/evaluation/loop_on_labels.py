@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The closed loop of a policy without a simulator: labels say how states follow actions, by a linear model."""
+"""The closed loop of a policy without a simulator: a linear model, fitted to labels, predicts the next state."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from torchrl_koap.training.policy_facts import command_ranges
 from torchrl_koap.training.trained import Trained
 
 STEPS, ROBOTS = 300, 16
-AWAY = 1e12  # where states have run away: far from what a network's type can square
-_FEW, _ASIDE = 5, 0.02  # rollouts that say where all start; share of its range by which a column starts elsewhere
-_EXPLAINED = 0.5  # of the variance of changes, below which labels do not say how states follow actions
-_SMOOTH = 8  # frames that are averaged before the way of a rollout is measured
-_DRIFT = 1.0  # standard deviations that recorded actions may end beside their recording
-_ROWS = 4000  # recorded states that distances are measured to
-_PREFERRED = 100.0  # weight of actions: in smooth motions the state alone tells how it goes on
+DIVERGED = 1e12  # a rollout ends beyond this state, far below values whose squares overflow in a network
+_MIN_ROLLOUTS, _START_MARGIN = 5, 0.02  # to compare starts; tolerance, as a share of the range of the column
+_EXPLAINED = 0.5  # smallest share of the variance of changes that a usable linear model explains
+_SMOOTH = 8  # frames that are averaged before distances from the start are measured
+_DRIFT = 1.0  # standard deviations; replayed actions must end nearer to their recording
+_ROWS = 4000  # largest number of recorded states that distances are measured to
+_PREFERRED = 100.0  # weight of actions in the ridge: in smooth motions the state alone predicts the next one
 
-# the next change of observations [n, obs]: linear in action, observation and the change before
+# the next change of observations [n, obs], linear in action, observation and previous change
 Response = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -50,15 +50,15 @@ def check_loop(
 ) -> dict[str, Any]:
     """Rolls a policy out on a ridge regression of the change of states, from recorded starts.
 
-    The policy acts without limits first; if a command leaves its range, it acts once more with them. The ridge is
-    fitted to all labels of the flat data ``[N]``; the demonstrated commands are those of the budget (``labelled``).
+    The policy acts without limits first. If a command leaves its range, the rollout is repeated with limits. The ridge
+    is fitted to all labels of the flat data ``[N]``; the demonstrated commands are those of the budget (``labelled``).
 
     Returns:
         dict: ``steps``, ``robots``, ``explained`` (share of the changes' variance on labels left out),
-        ``largest_command`` and ``largest_command_late`` (in the last third), over the largest demonstrated one,
-        ``distance_to_demonstrations`` (late, 95 % quantile, standard deviations), ``share_of_way`` (how far it
-        gets from its starts, over how far demonstrations get, medians), ``limited_commands``, ``commands``, and
-        sentences in ``faults``; or a ``note`` that says why there is none.
+        ``largest_command`` and ``largest_command_late`` (in the last third), relative to the largest demonstrated one,
+        ``distance_to_demonstrations`` (last third, 95 % quantile, standard deviations), ``share_of_way`` (largest
+        distance from the start, relative to that of demonstrations, medians), ``limited_commands``, ``commands``, and
+        sentences in ``faults``. If the loop cannot be judged, a ``note`` says why.
     """
     task = trained.task
     ranges = command_ranges(task, labelled)
@@ -69,25 +69,25 @@ def check_loop(
         share = f"{max(explained, 0):.0%} of how all state columns change, which is too little"
         return {"note": f"a linear model explains {share}", "faults": []}
     if not _replay_error(response, data) < _DRIFT:
-        return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
+        return {"note": "in the linear model, recorded actions do not reproduce their recordings", "faults": []}
     asked = (execution or ExecutionConfig()).on(trained.execution)
-    trained = replace(trained, cameras={})  # labels hold embeddings
+    trained = replace(trained, cameras={})  # data hold embeddings, not pictures
     free = trained.policy(asked.replaced(limits=math.inf))
     steps = min(STEPS, task.max_steps)
-    commands, *where = _roll(free, response, data, steps, seed)
+    commands, *reached = _roll(free, response, data, steps, seed)
     growth, late = _growth(commands, ends_of(ranges), steps)
     if late > UNSTABLE:
-        # actions of an expert that knew the states without noise tell that noise: states then explain changes wrongly
-        other, others_share = _fit(data, by_states=False)
-        if others_share >= _EXPLAINED and _replay_error(other, data) < _DRIFT:
-            again = _roll(free, other, data, steps, seed)
-            grown = _growth(again[0], ends_of(ranges), steps)
-            if grown[1] < late:
-                response, explained = other, others_share
-                (commands, *where), (growth, late) = again, grown
+        # an expert acts on states without sensor noise: its actions reveal the noise and bias a fit on noisy states
+        without_states, its_share = _fit(data, by_states=False)
+        if its_share >= _EXPLAINED and _replay_error(without_states, data) < _DRIFT:
+            again = _roll(free, without_states, data, steps, seed)
+            other_growth = _growth(again[0], ends_of(ranges), steps)
+            if other_growth[1] < late:
+                response, explained = without_states, its_share
+                (commands, *reached), (growth, late) = again, other_growth
     policy = trained.policy(asked)
     if policy.limits is not None and growth.max() > 1:
-        _, *where = _roll(policy, response, data, steps, seed)
+        _, *reached = _roll(policy, response, data, steps, seed)
     limited = int(policy.limited[0])
     found = {
         "steps": steps,
@@ -95,8 +95,8 @@ def check_loop(
         "explained": explained,
         "largest_command": min(float(growth.max()), 1e30),
         "largest_command_late": min(late, 1e30),
-        "distance_to_demonstrations": where[0],
-        "share_of_way": where[1],
+        "distance_to_demonstrations": reached[0],
+        "share_of_way": reached[1],
         "limited_commands": limited,
         "commands": steps * commands.shape[1],
     }
@@ -104,14 +104,14 @@ def check_loop(
 
 
 def _growth(commands: Tensor, ends: Tensor, steps: int) -> tuple[Tensor, float]:
-    """Commands ``[T, n, act]`` over the largest demonstrated ones ``[T, n]``, and the largest of the last third."""
+    """Returns commands ``[T, n, act]`` over the largest demonstrated ``[T, n]``, and the maximum of the last third."""
     growth = ((commands - ends.mean(-1)) / (ends.diff(dim=-1).squeeze(-1) / 2)).nan_to_num(math.inf).abs()
     growth = growth[..., ends[:, 0].isfinite()].amax(-1)
     return growth, float(growth[2 * len(growth) // 3 :].max()) if len(growth) == steps else math.inf
 
 
 def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
-    """Says how many commands of a policy left the demonstrated range, with a sentence in ``faults`` if any did."""
+    """Counts the commands of a policy that left the demonstrated range; ``faults`` has a sentence if any did."""
     limited, commands = policy.limited.tolist()
     if not limited:
         return {"limited_commands": 0}
@@ -124,29 +124,29 @@ def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
 
 
 def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> list[str]:
-    """Says how many failed rollouts ``[T]`` hardly leave their start, in most columns, against demonstrations."""
+    """Counts failed rollouts ``[T]`` that, in most columns, hardly leave their start compared to demonstrations."""
 
-    def way(rows: Tensor) -> Tensor:
-        smooth = rows.double().unfold(0, min(_SMOOTH, len(rows)), 1).mean(-1)  # sensor noise is no way
+    def reach(rows: Tensor) -> Tensor:
+        smooth = rows.double().unfold(0, min(_SMOOTH, len(rows)), 1).mean(-1)  # sensor noise is not motion
         return (smooth - smooth[:1]).abs().amax(0)
 
     recorded = data[OBSERVATION].split(trajectory_lengths(data).tolist())
-    usual = torch.stack([way(rows) for rows in recorded]).median(0).values
-    ways = [way(episode[OBSERVATION]) / usual for episode in failed if len(episode) >= _SMOOTH]
+    usual = torch.stack([reach(rows) for rows in recorded]).median(0).values
+    ways = [reach(episode[OBSERVATION]) / usual for episode in failed if len(episode) >= _SMOOTH]
     stay = sum(bool(each[usual > 0].median() < STAYS) for each in ways)
     said = f"{stay} of {len(failed)} failed rollouts get less than {STAYS:g} times as far from their start as"
     return [f"{said} demonstrations; {LEAVES}"] if stay else []
 
 
 def start_faults(rollouts: Sequence[TensorDictBase], data: TensorDictBase, task: Task) -> list[str]:
-    """Names columns in which nine in ten of at least five rollouts ``[T]`` start on one side of all recordings."""
-    if len(rollouts) < _FEW:
+    """Names columns in which 90 % of at least five rollouts ``[T]`` start above, or below, all recorded starts."""
+    if len(rollouts) < _MIN_ROLLOUTS:
         return []
     observed = data[OBSERVATION].double()
     (low, high), (least, most) = (torch.aminmax(rows, dim=0) for rows in (observed[begins(data)], observed))
     seen = torch.stack([episode[OBSERVATION][0].double() for episode in rollouts])
-    room = _ASIDE * (most - least)
-    out = (seen.quantile(0.1, 0) > high + room) | (seen.quantile(0.9, 0) < low - room)
+    margin = _START_MARGIN * (most - least)
+    out = (seen.quantile(0.1, 0) > high + margin) | (seen.quantile(0.9, 0) < low - margin)
     origin = torch.tensor((task.origins or (0.0,))[0], dtype=torch.float64)
     table = torch.stack([seen.median(0).values, low, high], -1) + origin.unsqueeze(-1)
     rows = [(task.observation_names[column], *table[column].tolist()) for column in out.nonzero().flatten().tolist()]
@@ -155,16 +155,16 @@ def start_faults(rollouts: Sequence[TensorDictBase], data: TensorDictBase, task:
 
 
 def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, float]:
-    """The ridge of all labelled steps that have one before them; with or without the observations themselves.
+    """Fits a ridge to all labelled steps except first ones; ``by_states`` makes observations an input too.
 
-    Beside it stands the share of the changes' variance that it explains on labels left out.
+    Returns the model and the share of the changes' variance that it explains on labels left out.
     """
     episode, observed = data[EPISODE], data[OBSERVATION].double()
     changes = data["next", OBSERVATION].double() - observed
     rows = (data[HAS_ACTION].squeeze(-1) & ~begins(data)).nonzero().squeeze(-1)
     action = data[ACTION][rows].double()
     seen, size = observed[rows], changes[rows].std(0, correction=0)
-    moving = size > 1e-9 * seen.abs().amax(0)  # goals move no robot
+    moving = size > 1e-9 * seen.abs().amax(0)  # leaves out constant columns, such as goals
     scales = tuple(
         torch.where(scale > 0, scale, 1.0)
         for scale in (
@@ -189,7 +189,7 @@ def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, flo
 
 
 def _replay_error(response: Response, data: TensorDictBase) -> float:
-    """How far recorded actions end beside their recordings, in standard deviations: the median of trajectories."""
+    """Returns how far replayed actions end from their recordings (median of trajectories, standard deviations)."""
     spread = _spread(data)
     apart = []
     for number in labelled_episodes(data)[:ROBOTS].tolist():
@@ -208,9 +208,9 @@ def _replay_error(response: Response, data: TensorDictBase) -> float:
 def _roll(
     policy: PlanningPolicy, response: Response, data: TensorDictBase, steps: int, seed: int
 ) -> tuple[Tensor, float, float]:
-    """Commands ``[steps, n, act]``, fewer where they are no numbers any more, and where the robots get.
+    """Rolls a policy out on a linear model: commands ``[steps, n, act]``, fewer if states diverge.
 
-    The distance to recorded states, and the share of the way that the demonstrations take.
+    Also returns the distance to recorded states and the distance from the start relative to demonstrations.
     """
     observed, first = data[OBSERVATION].double(), begins(data)
     starts = (first.roll(1) & ~first & (observed + observed.roll(1, 0)).isfinite().all(-1)).nonzero().squeeze(-1)
@@ -218,16 +218,16 @@ def _roll(
     now, change = observed[starts], observed[starts] - observed[starts - 1]
     agent, commands, visited = Agent(policy, seed=seed), [], []
     agent.reset()
-    origin, added = policy.origins or (0.0, 0.0)  # the agent reads and tells the robot's numbers
+    origin, added = policy.origins or (0.0, 0.0)  # the agent reads and returns values as the robot reports them
     for _ in range(steps):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FarStateWarning)  # the distance to recorded states tells it
+            warnings.simplefilter("ignore", FarStateWarning)  # the distance to recorded states reports it
             action = agent.act(now + origin).double().cpu() - added
         change = response(now, change, action)
         now = now + change
         commands.append(action)
         visited.append(now)
-        if not (now.abs() < AWAY).all():
+        if not (now.abs() < DIVERGED).all():
             return torch.stack(commands), math.inf, math.inf
     spread, recorded = _spread(data), observed[observed.isfinite().all(-1)]
     ways = [observed[data[EPISODE] == number][1 : steps + 2] for number in data[EPISODE][starts].tolist()]
@@ -240,12 +240,12 @@ def _roll(
 
 
 def _way(moved: Tensor, spread: Tensor) -> Tensor:
-    """The farthest that rows ``[T, obs]`` of differences are from 0, in standard deviations."""
+    """Returns the largest norm of differences ``[T, obs]``, in standard deviations."""
     return (moved / spread).nan_to_num().norm(dim=-1).max()
 
 
 def _spread(data: TensorDictBase) -> Tensor:
-    """Standard deviations of the recorded observations ``[obs]``, 1 for a column that never changes."""
+    """Returns standard deviations of the recorded observations ``[obs]``, 1 for a constant column."""
     observed = data[OBSERVATION].double()
     spread = observed[observed.isfinite().all(-1)].std(0, correction=0)
     return torch.where(spread > 0, spread, 1.0)

@@ -1,10 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Follows plans by the simulator's own inverse map: with it in place of a controller, what fails is the planner's.
+"""Follows plans by an inverse of the simulator in place of a controller: what still fails is due to the planner.
 
-Which command takes the tool where the plan says is found by trying in the simulation: what happens if the command is
-held, and what if it is changed by a little in one direction. An arm under its tracking law answers nearly in
-proportion, so the commands of the next steps follow by least squares (dynamic matrix control: Cutler and Ramaker,
-1980), of which the first one is executed::
+The simulation is run ahead with the command held, and with a small change of it in each direction. An arm under its
+tracking law responds nearly linearly, so least squares give the commands of the next steps (dynamic matrix control:
+Cutler and Ramaker, 1980). The first of these commands is executed::
 
     y_k = held_k + sum_{j < k} S_{k-j} a_j         state after k steps, S the response to a step of the command
     min_a  sum_k |y_k - plan_k|^2  +  smoothness sum_j |a_j - a_{j-1}|^2
@@ -23,15 +22,15 @@ from torchrl_koap.tasks import Task
 
 LOOK_AHEAD = 4  # control steps over which the plan is followed; the arm needs about three to follow a command
 SMOOTHNESS = 0.02  # weight of a change of the action against a distance from the plan
-_REFRESH = 8  # control steps after which the response, which changes with the arm's joints, is tried again
-_PUSH = {"m": 0.004, "rad": 0.01}  # change of a command by which its effect is measured
+_REFRESH = 8  # control steps between measurements of the response, which changes with the arm's joints
+_PUSH = {"m": 0.004, "rad": 0.01}  # change of a command that measures the response
 
 
 class OracleFollower(Follower):
-    """Executes the commands that take the simulated robot where plans say.
+    """Executes the commands that move the simulated robot along plans.
 
-    It reads the simulation, not the observation: nothing that a robot could have. The environment of the task must be a
-    :class:`~torchrl_koap.envs.ManipulationEnv`, and the task must say which state columns its actions move.
+    It reads the simulation in place of the observation, which no real robot can do. The environment of the task must be
+    a :class:`~torchrl_koap.envs.ManipulationEnv`, and the task must say which state columns its actions move.
     """
 
     knows_command = True
@@ -39,7 +38,7 @@ class OracleFollower(Follower):
     def __init__(self, task: Task, *, blend: float):
         super().__init__()
         if task.env is None:
-            raise ValueError(f"task {task.name!r} has no environment, whose simulation the strategy 'oracle' reads")
+            raise ValueError(f"task {task.name!r} has no environment: the strategy 'oracle' needs its simulation")
         self.task, self.blend = task, blend
         self._rule = task.action_rule if task.gripper is not None else None
         self._changes, self._moved = list(task.moves), list(task.moves.values())
@@ -50,7 +49,7 @@ class OracleFollower(Follower):
         self._env: EnvBase | None = None
 
     def attach(self, env: EnvBase) -> None:
-        """Tells the environment whose episodes are about to begin; it must be one that can be looked ahead in."""
+        """Sets the environment whose episodes are about to begin; it must be able to simulate actions ahead."""
         from torchrl_koap.envs.base import ManipulationEnv  # needs a simulator
 
         base = env.base_env if isinstance(env, TransformedEnv) else env
@@ -63,14 +62,14 @@ class OracleFollower(Follower):
         self._matrix = np.zeros((count, LOOK_AHEAD * size, LOOK_AHEAD * size))
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
-        """The action ``[n, 1, act]`` whose effect is nearest to the plan; arguments as for the base class.
+        """Returns the action ``[n, 1, act]`` whose effect is nearest to the plan; arguments as for the base class.
 
-        The first planned state is the present one, which is observed a step late.
+        Observations are one step late, so the first planned state is the present one.
         """
         if self._env is None:
             raise RuntimeError("the strategy 'oracle' does not know its environment: call policy.attach(env) first")
         if steps != 1:
-            raise RuntimeError("the strategy 'oracle' reads the simulation at every step: it decodes nothing ahead")
+            raise RuntimeError("the strategy 'oracle' reads the simulation at every step: it decodes one action")
         bent = blend_plan(states, plan, self.blend)
         rows = np.flatnonzero(~self._env.over)  # the policy leaves out episodes that are over
         action = command_rest(self._rule, states, plan, self.task.action_dim, 1)[:, 0].double().cpu().numpy()
@@ -80,7 +79,7 @@ class OracleFollower(Follower):
         return torch.as_tensor(action, dtype=plan.dtype, device=plan.device).unsqueeze(1)
 
     def _solve(self, rows: np.ndarray, held: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """First actions ``[n, a]`` of those that lead along ``wanted [n, k, a]``; ``held [n, act]`` leave commands."""
+        """Returns first actions ``[n, a]`` that follow ``wanted [n, k, a]``; ``held [n, act]`` keep the commands."""
         steps, size = LOOK_AHEAD, len(self._changes)
         refresh = self._time % _REFRESH == 0
         tries = np.tile(held[None, :, None], (1 + size * refresh, 1, steps, 1))
