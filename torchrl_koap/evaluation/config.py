@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What `koap eval` is asked for."""
+"""Options of `koap eval`."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.device import check_machine
 from torchrl_koap.runs.plugins import Plugins
 
-MOST_EPISODES = 100_000  # kept in memory
+MOST_EPISODES = 100_000  # all are kept in memory
 
 
 @dataclass
 class EvalConfig:
-    """Rollouts of a trained run in closed loop; without an environment plans and actions on recorded data.
+    """Rollouts of a trained run in closed loop; without an environment, its errors on recorded data.
 
     Attributes:
         episodes: number of rollouts.
         seed: seed of the first rollout; rollout i has this seed plus i.
-        execution: how plans become actions; what is not given is the run's.
+        execution: how plans become actions; options not given are the run's.
         out: folder to write to instead of the run's own; the files of the run are copied there.
         env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
         env_kwargs: arguments of gymnasium.make, such as obs_type=state max_episode_steps=300.
@@ -89,6 +89,6 @@ def environment_arguments(words: Sequence[str]) -> dict[str, Any]:
         try:
             found[name] = json.loads({"True": "true", "False": "false", "None": "null"}.get(value, value))
         except ValueError:
-            plain = value.removeprefix("-").replace(".", "", 1)  # 15. and .5 are numbers too, which JSON does not know
+            plain = value.removeprefix("-").replace(".", "", 1)  # JSON rejects 15. and .5
             found[name] = float(value) if "." in value and plain.isdecimal() else value
     return found

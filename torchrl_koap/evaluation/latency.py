@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How long a policy takes per control step, and how many steps of a control loop come too late."""
+"""Measures the time of a policy per control step, and the late steps of a control loop."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.training.trained import Trained
 from torchrl_koap.vision import Observer
 
-_REPEATS = 30  # of a plan and of a step without one, of whose times the medians are
+_REPEATS = 30  # timed steps with a plan, and without; their medians are reported
 
 
 @dataclass
@@ -48,10 +48,10 @@ class LatencyConfig:
 
 @torch.no_grad()
 def measure_latency(policy: PlanningPolicy, observation_dim: int) -> dict[str, float]:
-    """Measures median times of a plan and of a control step between plans, at batch 1; three of each come before.
+    """Measures median times of a plan and of a control step between plans, at batch size 1, after three warm-up calls.
 
-    In ms what a step with a plan takes longer, ``plan_ms``, and ``control_ms``; ``control_hz`` is the rate of control
-    with plans spread over the steps (Hz).
+    Returns ``plan_ms``, which a plan adds to a step, ``control_ms`` of a step without a plan, and ``control_hz``: the
+    mean rate of control (Hz) if a plan is made every ``replan_interval`` steps.
     """
     device = device_of(policy)
     td = TensorDict({policy.in_keys[0]: torch.zeros(1, policy.history, observation_dim)}, [1], device=device)
@@ -63,7 +63,7 @@ def measure_latency(policy: PlanningPolicy, observation_dim: int) -> dict[str, f
             td = policy(td)
             td[ACTION].sum().item()  # waits for a GPU
             times.append((time.perf_counter() - began) * 1e3)
-    with_plan, control = (statistics.median(times[3:]) for times in took.values())  # the first calls warm caches up
+    with_plan, control = (statistics.median(times[3:]) for times in took.values())
     plan = max(with_plan - control, 0.0)
     rate = 1e3 / (control + plan / policy.execution.replan_interval)
     return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
@@ -91,10 +91,10 @@ def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, An
 
 
 def run_control_loop(agent: Agent, observations: Sequence[Any] | np.ndarray, *, control_hz: float) -> dict[str, Any]:
-    """Hands an agent an observation per tick of a clock and counts the actions that come after the next tick.
+    """Gives an agent one observation per control period and counts the actions that take longer than a period.
 
-    Returned are ``steps``, ``late_steps``, ``step_ms`` (what a step may take), and ``p50``, ``p99`` and ``max`` of the
-    time from an observation to its action (ms).
+    Returns ``steps``, ``late_steps``, ``step_ms`` (the period), and ``p50``, ``p99`` and ``max`` of the time from an
+    observation to its action (ms).
     """
     agent.reset(observations[0]) if isinstance(agent, AsynchronousAgent) else agent.reset()
     period, took = 1 / control_hz, []
@@ -106,7 +106,7 @@ def run_control_loop(agent: Agent, observations: Sequence[Any] | np.ndarray, *, 
         pause = tick - time.perf_counter()
         if pause > 0:
             time.sleep(pause)
-        else:  # a late step moves the clock: the next one is not late for that
+        else:  # a late step shifts the clock and does not make the next one late
             tick = time.perf_counter()
     late = sum(seconds > period for seconds in took)
     return {"late_steps": late, "step_ms": 1e3 * period, **percentiles(took)}

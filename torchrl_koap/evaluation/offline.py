@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
-_COMMANDS = "the controller decodes no recorded states: it follows plans by the command that it gave"
+_COMMANDS = "the controller decodes no recorded states: it follows plans from its own last command"
 
 
 def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Evaluates a run on recorded data; a data set that has moved, or is another one, is refused.
+    """Evaluates a run on recorded data; raises an error if the data set is missing or changed.
 
-    Plans are scored on trajectories that the planner has not seen, actions on labels outside the budget and on those
-    inside it, a trajectory left out at a time. The whole policy acts in a linear model of how states follow actions.
+    Plans are scored on trajectories that the planner has not seen. Actions are scored on labels outside the budget and,
+    leaving out one trajectory at a time, inside it. The whole policy acts on a linear model of the robot's response.
 
     Returns:
         tuple: ``kind`` ``"offline"``, ``plan_errors``, ``action_errors`` and ``loop``, ``relative_plan_error`` (1: no
@@ -62,11 +62,11 @@ def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, An
 def evaluate_actions(
     trained: Trained, dataset: str | None = None
 ) -> tuple[dict[str, Any], dict[str, Tensor], TensorDictBase | None]:
-    """Compares decoded actions with labels outside the budget, for evaluation only, beside rollouts in an environment.
+    """Compares decoded actions with labels outside the budget, for evaluation only, in addition to rollouts.
 
-    If the data set is not where it was, and ``dataset`` does not say where it is now, nothing is read; one that was
-    named and is not that of the training is refused. ``action_errors``, what they come to, and the actions are as of
-    :func:`evaluate_offline`; last comes what was read.
+    Nothing is read if the data set is missing and ``dataset`` is not given. A ``dataset`` other than that of the
+    training raises an error. Returns ``action_errors`` with their summary and the actions, as
+    :func:`evaluate_offline`, and the data that were read.
     """
     try:
         data: TensorDictBase | None = trained.data(dataset)
@@ -111,12 +111,12 @@ def _outside_budget(
 def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, Any]) -> dict[str, Any]:
     if trained.planner is None:
         note = f"method {trained.config.method!r} would have to be trained again without each trajectory"
-        hint = "; train it on fewer labels than there are (--labels): the others tell how good it is"
+        hint = "; train it on fewer labels than there are (--labels): the others then measure it"
         return {"note": note + (hint if "note" in outside else "")}
     if trained.method.fit is not None:
         return {"note": _COMMANDS}
     if not trained.method.closed_form:
-        return {"note": "the decoder is not fitted in closed form: leaving a trajectory out would mean to train again"}
+        return {"note": "the decoder is not fitted in closed form: leaving out a trajectory means training again"}
     return errors_left_out(trained.controller.cpu(), trained.seen(labelled), trained.task, trained.columns)
 
 

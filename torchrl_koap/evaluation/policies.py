@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A finished training as a policy, also one that follows plans by the simulator's own inverse map."""
+"""Makes policies from finished trainings, optionally with an inverse of the simulator as controller."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from torchrl_koap.training.trained import Trained
 def load_policy(
     where: str | Path | Trained, *, device: str = "cpu", plugins: Sequence[str] = (), **asked: Any
 ) -> PlanningPolicy:
-    """Makes a policy of a run, or of a file of :meth:`Trained.save`: observations in, an action per step out.
+    """Makes a policy from a run, or from a file of :meth:`Trained.save`: observations in, an action per step out.
 
-    A :class:`~torchrl_koap.modules.PolicyEnv` hands it what it reads; an :class:`~torchrl_koap.modules.Agent` keeps
-    that itself.
+    A :class:`~torchrl_koap.modules.PolicyEnv` provides the entries that it reads; so does an
+    :class:`~torchrl_koap.modules.Agent`.
 
     Args:
-        where (str, Path or Trained): a run directory, ``"pretrained:NAME"``, a file, or what :func:`~torchrl_koap.fit`
-            returned.
+        where (str, Path or Trained): a run directory, ``"pretrained:NAME"``, a file, or the result of
+            :func:`~torchrl_koap.fit`.
 
     Keyword Args:
         device (str): ``"cpu"`` or ``"cuda"``.
-        plugins (sequence of str): modules that register task or method of a file, which cannot have them imported.
-        **asked: fields of :class:`~torchrl_koap.modules.Execution`. What is not asked for is as it was trained for.
+        plugins (sequence of str): modules that register task or method of a file, which cannot import them itself.
+        **asked: fields of :class:`~torchrl_koap.modules.Execution`. Others keep their value of the training.
 
     Returns:
         PlanningPolicy: in evaluation mode, on the device asked for.
@@ -50,9 +50,9 @@ def load_policy(
 
 
 def trained_policy(trained: Trained, asked: ExecutionConfig) -> PlanningPolicy:
-    """Makes a policy of a finished training; options that are None are those of the training."""
+    """Makes a policy from a finished training; options that are None are those of the training."""
     execution, follower = trained.execution, None
     if asked.strategy == "oracle" and trained.method.plans:
-        execution = execution.replaced(gain=1.0)  # it knows how commands are answered
+        execution = execution.replaced(gain=1.0)  # the oracle measures the response itself
         follower = OracleFollower(trained.task, blend=asked.on(execution).blend)
     return trained.policy(asked.on(execution), follower=follower)

@@ -22,8 +22,8 @@ from torchrl_koap.modules import PlanningPolicy, policy_transforms
 from torchrl_koap.modules.execution.policy_env import NOISE, NoiseStreams
 from torchrl_koap.tasks import Task
 
-SHOWN = 6  # columns of plans that are drawn where nobody knows what lies in a plane
-AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
+SHOWN = 6  # most state columns that are drawn for a task without an environment
+AT_ONCE = 500  # default number of parallel episodes
 
 
 @torch.no_grad()
@@ -38,13 +38,12 @@ def roll_out(
     given: Callable[[slice], TensorDictModuleBase] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[TensorDict]:
-    """Runs one episode per seed, on which alone the planner's noise depends; returns each ``[steps]``, cut at its end.
+    """Runs one episode per seed, which alone determines the planner's noise; returns each ``[steps]``, cut at its end.
 
-    ``make_env`` makes an environment of a given number of parallel episodes, of which there are ``batch_size`` (by
-    default :data:`AT_ONCE`); actions depend on it by rounding errors alone, which contacts amplify. ``contexts`` are
-    those ``[objects, 3]`` of every episode.
-    ``given(episodes)`` writes what the planner reads in those episodes in place of start noise. ``progress`` is called
-    with the number of episodes finished.
+    ``make_env`` makes an environment with a given number of parallel episodes, ``batch_size`` (:data:`AT_ONCE` by
+    default). Actions depend on it only by rounding errors, which contacts amplify. ``contexts`` holds the context
+    ``[objects, 3]`` of every episode. ``given(episodes)`` returns a module that writes the planner's input in place of
+    noise. ``progress`` is called with the number of episodes finished.
 
     Raises:
         ValueError: without seeds, for a batch size below 1, or for another number of contexts than of seeds.
@@ -58,13 +57,13 @@ def roll_out(
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
-        env.set_seed(part[0])  # for all that it draws itself
+        env.set_seed(part[0])  # for the environment's own random numbers
         for module in env.modules():  # transforms, and the environment itself, with a generator per episode
             if hasattr(module, "seed_episodes"):
                 module.seed_episodes(part)
         transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
-        env = env.to("cpu")  # or it would take actions from any device
+        env = env.to("cpu")  # so that it moves actions to the CPU
         if given is not None:
             noise = given(slice(begin, begin + len(part)))
         else:
@@ -94,31 +93,30 @@ def roll_out(
 
 
 def device_of(module: nn.Module) -> torch.device:
-    """Returns the device of a module's parameters and buffers, the processor for one without any."""
+    """Returns the device of a module's parameters and buffers, the CPU if it has none."""
     return next(itertools.chain(module.parameters(), module.buffers()), torch.empty(0)).device
 
 
 def observations_of(episode: TensorDict) -> Tensor:
-    """Returns what was seen in an episode ``[T]``, after its last step too: ``[T + 1, obs]``."""
+    """Returns the observations of an episode ``[T]`` and the one after its last step: ``[T + 1, obs]``."""
     return torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]])
 
 
 def rollouts_to_tensors(episodes: Sequence[TensorDict], task: Task, *, interval: int) -> dict[str, Tensor]:
-    """Stacks what the pictures need, padded to the longest episode.
+    """Stacks the tensors that the report draws, padded to the longest episode.
 
-    A plan was made every ``interval`` steps. For a task without an environment the columns that actions are about are
-    kept.
+    A plan was made every ``interval`` steps. For a task without an environment, keeps the columns that actions move.
 
     Returns:
-        dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``
+        dict: ``position`` ``[E, T, 2]`` (NaN after the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``
         ``[E, T, act]``, ``plan`` ``[E, P, H, 2]`` and ``plan_step`` ``[E, P]`` (NaN and -1 padding; empty for open-loop
         execution, whose cache holds actions); where episodes have a context ``object_position`` ``[E, T, objects, 2]``
         and ``context`` ``[E, objects, 3]``; without an environment ``column`` ``[k]``, ``state`` ``[E, T, k]`` and
-        ``state_plan`` ``[E, P, H, k]``, NaN behind the end.
+        ``state_plan`` ``[E, P, H, k]``, NaN after the end.
     """
     pad, last = partial(pad_sequence, batch_first=True), [episode[-1]["next"] for episode in episodes]
     frames = [observations_of(episode) for episode in episodes]
-    bodies = task.bodies if CONTEXT in last[0].keys() else ()  # other environments than the task's tell nothing of them
+    bodies = task.bodies if CONTEXT in last[0].keys() else ()  # other environments than the task's do not report bodies
     starts = [task.observation[part].start for part in (task.position, *(body.position for body in bodies))]
     columns = [slice(start, start + 2) for start in starts]
     paths = [torch.stack([seen[:, part] for part in columns], 1).float() for seen in frames]

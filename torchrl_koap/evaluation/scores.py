@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From rollouts to the numbers that D3IL reports per task, each with its interval.
+"""Computes the numbers that D3IL reports per task from rollouts, each with its interval.
 
-Success rates get Wilson intervals. Entropies get percentile intervals of a bootstrap over what is independent: episodes
-where every episode starts alike, else contexts with all their rollouts.
+Success rates get Wilson intervals. Entropies get percentile intervals of a bootstrap over independent units: episodes
+if all start alike, otherwise contexts with all their rollouts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torchrl_koap.tasks import Modes, Task
 
 
 def outcome_of(episode: TensorDict) -> str:
-    """``"success"``, ``"collision"``, ``"error"`` or ``"timeout"``, from the last frame of an episode."""
+    """Returns ``"success"``, ``"collision"``, ``"error"`` or ``"timeout"``, from the last frame of an episode."""
     last = episode[-1]["next"]
     ends = {"error": FAILED, "success": SUCCESS, "collision": COLLISION}
     return next((name for name, key in ends.items() if key in last.keys() and last[key].item()), "timeout")
@@ -34,13 +34,13 @@ def score(
     *,
     contexts: Sequence[int] | None = None,
 ) -> dict[str, Any]:
-    """Success (in ``rates``) with its 95 % interval, entropy of the modes of successful episodes, a row per episode.
+    """Returns success (``rates``) with its 95 % interval, entropy of the modes of successes, and a row per episode.
 
-    Modes and collisions are told of where there are any. There is a seed per episode of
-    :func:`~torchrl_koap.evaluation.rollouts.roll_out`.
+    Modes and collisions are reported if there are any. ``episodes`` come from
+    :func:`~torchrl_koap.evaluation.rollouts.roll_out`, ``seeds`` are theirs.
 
-    With ``contexts``, the number of the context of every episode, ``mode_entropy`` is the mean over contexts, None
-    below two rollouts per context, and ``pooled_mode_entropy`` that of all successful episodes together.
+    ``contexts`` holds the number of the context of every episode. With it, ``mode_entropy`` is the mean over contexts
+    (None below two rollouts per context) and ``pooled_mode_entropy`` that of all successful episodes together.
     """
     rows: list[dict[str, Any]] = [
         {"seed": seed, "outcome": outcome_of(episode), "steps": len(episode)}
@@ -78,7 +78,7 @@ def _mode_scores(rows: Sequence[dict[str, Any]], modes: Modes, contexts: int | N
 
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
-    value = statistic(units) if len(units) else None  # without successes nothing is known
+    value = statistic(units) if len(units) else None  # undefined without successes
     interval = (None, None) if value is None else bootstrap_interval(units, statistic)
     low, high = (None if end is None else min(max(end, 0.0), 1.0) for end in interval)
     return {name: value, f"{name}_low": low, f"{name}_high": high}
@@ -87,10 +87,10 @@ def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float
 def task_scores(
     task: Task, result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int] | None
 ) -> dict[str, Any]:
-    """Returns the figures of :func:`score` with those that a task adds, by the function that ``Task.score`` names.
+    """Adds the results of the function that ``Task.score`` names to those of :func:`score`.
 
-    What the function returns as ``rates``, a name in words to a bool per rollout, joins the success in ``rates``, with
-    an interval.
+    If the function returns ``rates``, a dict from names in words to a bool per rollout, they join the success in
+    ``rates``, with intervals.
     """
     rule = resolve(task.score, f"score of task {task.name!r}")
     found = {} if rule is None else dict(rule(result, episodes, contexts))
@@ -99,7 +99,7 @@ def task_scores(
 
 
 def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
-    """Tells in which rollouts of Stacking one box at least, and two, were brought to the zone, as ``rates``."""
+    """Returns as ``rates`` in which rollouts of Stacking at least one box, or two, reached the zone."""
     stacked = [int((episode[-1]["next", MODE] >= 0).sum()) for episode in episodes]
     least = {"one box stacked": 1, "two boxes stacked": 2}
     return {"rates": {name: [count >= number for count in stacked] for name, number in least.items()}}

@@ -12,7 +12,7 @@ from scipy.special import entr
 from scipy.stats import binom, binomtest
 
 OUTCOMES = ("timeout", "success", "collision", "error")  # of an episode, by number
-_RESAMPLES, _TAIL = 500, (1 - 0.95) / 2  # of a bootstrap; share outside its interval at either end
+_RESAMPLES, _TAIL = 500, (1 - 0.95) / 2  # of a bootstrap; share outside the interval at each end
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -28,9 +28,9 @@ def rate(good: Sequence[bool]) -> dict[str, float]:
 
 
 def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
-    """Entropy of the modes seen, logarithm base ``num_modes``: 1 if all are equally frequent, 0 for a single one.
+    """Returns the entropy of modes, logarithm base ``num_modes``: 1 if all are equally frequent, 0 for a single one.
 
-    There is a mode ``0 .. num_modes - 1`` per successful episode; D3IL counts no others.
+    ``modes`` holds a mode ``0 .. num_modes - 1`` per successful episode; D3IL counts no others.
     """
     if len(modes) < 2 or num_modes < 2:
         return 0.0
@@ -39,9 +39,9 @@ def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
 
 
 def expected_entropy(episodes: int, num_modes: int) -> float:
-    """Exact mean of the mode entropy of that many episodes whose modes are drawn uniformly.
+    """Returns the exact mean of the mode entropy of ``episodes`` episodes whose modes are drawn uniformly.
 
-    A few episodes cannot fill all modes evenly, so this is below 1: what a policy without preferences scores.
+    A policy without preferences scores this. It is below 1, since a few episodes cannot fill all modes evenly.
     """
     if episodes < 1 or num_modes < 2:
         return 0.0
@@ -51,10 +51,10 @@ def expected_entropy(episodes: int, num_modes: int) -> float:
 
 
 def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsolved: str = "skip") -> float | None:
-    """Mean over contexts of the entropy of the modes seen in each, logarithm base ``num_modes``.
+    """Returns the mean over contexts of the entropy of modes in each, logarithm base ``num_modes``.
 
-    A single rollout per context always gives 0: the figure says something from two on. ``unsolved`` says what contexts
-    without success count: ``"skip"`` leaves them out (Sorting, Stacking), ``"zero"`` counts them as 0 (Aligning). None
+    A single rollout per context always gives 0, so two or more are needed. ``unsolved`` says how contexts without
+    success count: ``"skip"`` leaves them out (Sorting, Stacking), ``"zero"`` counts them as 0 (Aligning). Returns None
     if there is nothing to average.
     """
     values = [mode_entropy(seen, num_modes) for seen in modes if len(seen) or unsolved == "zero"]
@@ -62,10 +62,10 @@ def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsol
 
 
 def bootstrap_interval(units: Sequence, statistic: Callable[[Sequence], float | None]) -> tuple[float, float]:
-    """Percentile interval (95 %) of a statistic under resampling of independent units, shifted by the bias.
+    """Returns the percentile interval (95 %) of a statistic over resampled independent units, corrected for bias.
 
-    Resamples hold fewer distinct units than the sample; an entropy is lower on them. The interval is moved by as much
-    as their mean lies beside the statistic of the sample, which must be defined; of a resample it may be None.
+    Resamples hold fewer distinct units than the sample, so their entropies are lower. The interval is shifted by the
+    statistic of the sample minus the mean of the resamples. Resamples whose statistic is None are left out.
     """
     generator = random.Random(0)
     values = [statistic(generator.choices(units, k=len(units))) for _ in range(_RESAMPLES)]
