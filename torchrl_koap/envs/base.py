@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Base environment of D3IL's tasks: the order of events in one control step (docs/appendix/d3il.md, Simulator).
 
-One control step of the original, kept as it is because a policy experiences it::
+One control step of the original, reproduced because policies experience it::
 
     1. the action becomes a new command
     2. observation, success and failure are read from the state *before* this step's substeps
@@ -37,31 +37,31 @@ class ManipulationEnv(EnvBase):
     A task declares the class attributes and implements the hooks :meth:`_scene`, :meth:`_command`, :meth:`_observe`,
     :meth:`_check` and :meth:`_update_mode`; ``rows`` are indices of environments.
 
-    A task with objects has *contexts*, where they are when an episode starts (:mod:`torchrl_koap.envs.contexts`): drawn
-    at random at every reset, or handed over by ``reset(contexts=...)``.
+    A task with objects has *contexts*, their poses when an episode starts (:mod:`torchrl_koap.envs.contexts`). They are
+    drawn at random at every reset, or given by ``reset(contexts=...)``.
 
-    What a task's table of keys does not list is the same everywhere::
+    The tables of the tasks add to these keys::
 
-        success     [n, 1] bool               latched: the first outcome that is seen stays until the reset
-        collision   [n, 1] bool               likewise, where an episode can end by one
-        context     [n, objects, 3] dtype     where the objects start, x, y (m), yaw (rad); not where there are none
+        success     [n, 1] bool               latched: the first outcome that is observed stays until the reset
+        collision   [n, 1] bool               likewise, if an episode can end by one
+        context     [n, objects, 3] dtype     start of the objects, x, y (m), yaw (rad), if there are any
         reward      [n, 1] dtype              1 where ``success`` else 0
-        terminated  [n, 1] bool               ``success`` or ``collision``; truncated: ``max_steps`` steps are over
+        terminated  [n, 1] bool               ``success`` or ``collision``; truncated: after ``max_steps`` steps
 
     Args:
         num_envs (int): number of environments, the batch size.
         num_threads (int): threads that advance them; results do not depend on it.
         max_steps (int, optional): control steps after which an episode is truncated. Default: the task's.
         seed (int, optional): seed of the random contexts.
-        device (torch.device, optional): device of the tensors handed out; the physics runs on the CPU.
+        device (torch.device, optional): device of returned tensors; the physics runs on the CPU.
         dtype (torch.dtype): floating type of observation, action and reward.
 
     Keyword Args:
         task (Task, optional): a variant of the class's own task.
 
     Raises:
-        ValueError: for sizes below 1, a non-floating dtype, and in use for contexts of a wrong shape or out of range,
-            and actions of a wrong shape or that are not finite.
+        ValueError: for sizes below 1 or a non-floating dtype; in ``reset`` for contexts of a wrong shape or out of
+            range, in ``step`` for actions of a wrong shape or that are not finite.
 
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv  # a task of this base
@@ -73,11 +73,11 @@ class ManipulationEnv(EnvBase):
     TASK: str  # name of the task
     START_JOINTS: tuple[float, ...] = (0.0,) * 7  # after a reset (rad)
     START_HEIGHT = 0.0  # of the free bodies (m)
-    ACTION_BOUND: Any = (-0.012, 0.012)  # least and greatest values of random actions; others are executed too
-    MODE_ENTRIES: int | None = 1  # of the leaf ``mode``; None: one per object
-    MODE_VALUES: int | None = None  # its entries are -1 (undecided) to this - 1, int64; None: flags, bool
-    COLLIDES = False  # an episode can end by a collision
-    CAMERA = "cage"  # of pictures
+    ACTION_BOUND: Any = (-0.012, 0.012)  # least and greatest values of random actions; actions outside are executed too
+    MODE_ENTRIES: int | None = 1  # number of entries of ``mode``; None: one per object
+    MODE_VALUES: int | None = None  # its entries are int64, -1 (undecided) to this - 1; None: bool flags
+    COLLIDES = False  # whether an episode can end by a collision
+    CAMERA = "cage"  # default of render()
     SUBSTEPS = 35  # physics steps (1 ms) per control step
     COMMAND_DIM = 7  # numbers that make up a command
     RESET_WIDTH = controller.FINGER_RESET  # finger target during the reset's substep (m)
@@ -113,11 +113,11 @@ class ManipulationEnv(EnvBase):
         self._set_seed(seed)
 
     def _simulations(self, num_envs: int, num_threads: int) -> Any:
-        """What is simulated; differs where another arm than D3IL's moves."""
+        """Returns the simulations; tasks with another arm than D3IL's override it."""
         return SimulationBatch(compile_scene(self._scene()), num_envs, num_threads)
 
     def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:
-        """What an episode in progress consists of beside the simulation, a row per environment."""
+        """Returns the state of running episodes outside the simulation, a row per environment."""
         entries = len(self.task.objects) if self.MODE_ENTRIES is None else self.MODE_ENTRIES
         return {
             "observation": np.zeros((num_envs, self.task.observation_dim)),
@@ -154,12 +154,12 @@ class ManipulationEnv(EnvBase):
         self.done_spec = Composite({name: done.clone() for name in ("done", "terminated", "truncated")}, shape=shape)
 
     def _begin(self, rows: np.ndarray) -> None:
-        """Writes the first command into ``self._commands[rows]`` after a reset: stay, hand straight down."""
+        """Writes the first command into ``self._commands[rows]`` after a reset: stay, hand pointing down."""
         self._commands[rows, :3] = self.sims.tcp_position[rows]
         self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
 
     def _scene(self) -> Any:
-        """Scene of the task, an ``mjcf.RootElement``."""
+        """Returns the scene of the task, an ``mjcf.RootElement``."""
         raise NotImplementedError
 
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
@@ -168,11 +168,11 @@ class ManipulationEnv(EnvBase):
 
     @abc.abstractmethod
     def _observe(self, rows: np.ndarray) -> np.ndarray:
-        """Observation [len(rows), obs] of the present state and command."""
+        """Returns the observation [len(rows), obs] of the present state and command."""
 
     @abc.abstractmethod
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whether the present state is a success, and whether it is a failure, each bool [len(rows)]."""
+        """Returns whether the present state is a success, and whether it is a failure, each bool [len(rows)]."""
 
     @abc.abstractmethod
     def _update_mode(self, rows: np.ndarray) -> None:
@@ -199,7 +199,7 @@ class ManipulationEnv(EnvBase):
         return self._leaves()
 
     def _start(self, rows: np.ndarray) -> None:
-        """Puts the simulations into their first states, those of ``self._contexts[rows]``."""
+        """Puts the simulations into the start states of ``self._contexts[rows]``."""
         free = [not body.still for body in self.task.bodies]
         places = poses_of(self._contexts[rows][:, free], self.START_HEIGHT) if any(free) else None
         self.sims.reset(rows, np.asarray(self.START_JOINTS), places, width=self.RESET_WIDTH)
@@ -294,7 +294,7 @@ class ManipulationEnv(EnvBase):
         """Simulates action sequences from the present state of the environments ``rows`` and restores it.
 
         Sequences ``[m, len(rows), k, act]`` lead to observations ``[m, len(rows), k, obs]``. Entry ``k`` is the state
-        after actions 0 to ``k``; :meth:`step` observes it one control step later. Another shape is refused.
+        after actions 0 to ``k``; :meth:`step` observes it one control step later. Raises a ValueError for other shapes.
         """
         if actions.ndim != 4 or actions.shape[1] != len(rows) or actions.shape[3] != self.task.action_dim:
             wanted = f"[m, {len(rows)}, k, {self.task.action_dim}] [sequences, environments, control steps, action]"
@@ -312,7 +312,7 @@ class ManipulationEnv(EnvBase):
 
     @property
     def over(self) -> np.ndarray:
-        """Which episodes are decided or have used up their steps, bool [n]."""
+        """Whether each episode is decided or has used up its steps, bool [n]."""
         return self._success | self._collision | (self._steps >= self.max_steps)
 
     def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str | None = None) -> np.ndarray:
@@ -341,9 +341,9 @@ class ManipulationEnv(EnvBase):
         super().close(**kwargs)
 
     def raw_log(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Returns what D3IL's recorder logs for the last control step: of the robot ``[n, ...]``, and of the objects.
+        """Returns what D3IL's recorder logs for the last control step: arrays of the robot, and poses of the objects.
 
-        The command ``des_c_pos`` (m) is among the first; poses are ``[n, objects, 7]`` (m, quaternion).
+        Arrays ``[n, ...]`` include the command ``des_c_pos`` (m); poses are ``[n, objects, 7]`` (m, quaternion).
         """
         robot, poses = self.sims.logged()
         pose = {"des_c_pos": self.commands[:, :3]} if self.COMMAND_DIM == 7 else {}  # joints are in the log already

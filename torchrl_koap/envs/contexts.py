@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Contexts: where the objects of a task lie when an episode begins.
+"""Contexts: poses of the objects of a task at the start of an episode.
 
 A context is ``[objects, 3]``: x, y (m) and yaw (rad) of every object of ``Task.objects``.
 """
@@ -18,7 +18,7 @@ from torchrl_koap.tasks.scene import Scene
 
 TABLE = Path(__file__).with_name("evaluation_contexts.json")
 NUM_EVALUATION_CONTEXTS = 60
-_SLACK = 1e-6  # D3IL keeps contexts in float32
+_SLACK = 1e-6  # m; D3IL stores contexts in float32
 
 
 def _scene(task: Task) -> Scene:
@@ -28,7 +28,7 @@ def _scene(task: Task) -> Scene:
 
 
 def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | int | None = None) -> np.ndarray:
-    """Draws random contexts from the ranges of a task that has some, float64 ``[num, objects, 3]``; a seed will do."""
+    """Draws random contexts from the ranges of a task, float64 ``[num, objects, 3]``; ``generator`` may be a seed."""
     task = get_task(task)
     scene = _scene(task)
     if num < 1:
@@ -50,8 +50,8 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
 def evaluation_contexts(task: Task | str) -> np.ndarray:
     """Returns the fixed table of contexts on which methods are compared, float64 ``[60, objects, 3]``.
 
-    The table (``evaluation_contexts.json``) never changes. Contexts of a task that is not in it are drawn with a seed
-    that its name alone decides.
+    The table (``evaluation_contexts.json``) never changes. For a task that is not in it, contexts are drawn with
+    a seed derived from its name.
     """
     task = get_task(task)
     _scene(task)
@@ -62,7 +62,7 @@ def evaluation_contexts(task: Task | str) -> np.ndarray:
 
 
 def check_contexts(task: Task, contexts) -> np.ndarray:
-    """Returns contexts ``[C, objects, 3]`` in float64; refuses those in which an object lies where it never does."""
+    """Returns contexts ``[C, objects, 3]`` in float64; raises a ValueError for objects outside their regions."""
     scene, contexts = _scene(task), np.asarray(contexts, dtype=np.float64)
     if contexts.ndim != 3 or contexts.shape[1:] != (len(task.objects), 3) or not len(contexts):
         raise ValueError(
@@ -87,7 +87,7 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
 def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
     """Reads D3IL's own context file, a pickled list of contexts, as float64 ``[C, objects, 3]``; refuses other content.
 
-    D3IL's degrees become rad, its further entries are left out. The restricted unpickler reads it.
+    Degrees become rad, and further entries are left out. The restricted unpickler reads the file.
     """
     task = get_task(task)
     _scene(task)
@@ -109,7 +109,7 @@ def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
 
 
 def _arrays(nested) -> list[np.ndarray]:
-    """The position and quaternion arrays of a context, in order, however deep D3IL nests them."""
+    """Returns the position and quaternion arrays of a context in order, however deep D3IL nests them."""
     if isinstance(nested, np.ndarray) and nested.dtype == object:
         nested = nested.tolist()
     if isinstance(nested, (list, tuple)) and any(isinstance(item, (list, tuple)) or np.ndim(item) for item in nested):

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Any environment of Gymnasium as a batch of episodes in which a trained policy can be rolled out."""
+"""Runs any Gymnasium environment as a batch of episodes, for rollouts of a trained policy."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from torchrl_koap.vision.observer import STATE, Observer
 
 @dataclass
 class EpisodeRecord:
-    """What happened in the episodes of all batches that were given it."""
+    """Counts clipped actions and errors in the episodes of all batches that share it."""
 
-    actions: int = 0  # steps that were played
-    clipped: int = 0  # those whose action lay outside the environment's box and was clipped to it
-    clipped_columns: Counter[str] = field(default_factory=Counter)  # how often each column was
+    actions: int = 0  # number of steps
+    clipped: int = 0  # number of steps whose action was clipped to the environment's box
+    clipped_columns: Counter[str] = field(default_factory=Counter)  # number of clipped steps per action column
     # ``seed``, ``step`` and ``error`` of every episode in which the environment raised one
     errors: list[dict[str, Any]] = field(default_factory=list)
 
     def faults(self) -> list[str]:
-        """Returns a sentence about clipped actions, and one about errors, where there are any."""
+        """Returns a sentence about clipped actions, and one about errors, if there are any."""
         found = []
         if self.clipped:
             which = some([f"{name} {count}" for name, count in self.clipped_columns.most_common()])
@@ -50,26 +50,25 @@ class EpisodeRecord:
 
 
 class GymnasiumBatch(EnvBase):
-    """Environments of one Gymnasium id side by side; one whose episode is over waits for the others.
+    """Runs environments of one Gymnasium id in parallel; one whose episode is over waits for the others.
 
-    ``success`` stays True from the step on in which it is reported (:class:`GymnasiumEpisode`). Actions are clipped to
+    ``success`` stays True once it is reported (:class:`GymnasiumEpisode`). Actions are clipped to
     the environment's box. An environment that raises an error, or gives a wrong observation, ends its episode as failed
     (``failed``).
 
-    Observations and actions are those of the data: the task's ``origins`` are subtracted from what environments report
-    and added to what they are told.
+    Observations and actions are those of the data: the task's ``origins`` are subtracted from an environment's
+    observations and added to its actions.
 
-    Where the policy was trained with cameras (``observe``), the environment's observation is a dictionary: its uint8
-    pictures are the frames of the cameras of their names (of the only one whatever their name), its numbers side by
-    side the state.
+    For a policy trained with cameras (``observe``), the environment's observation is a dictionary. Its uint8 pictures
+    are frames of the cameras of the same name (a single one needs no matching name); its numbers are concatenated to
+    the state.
 
-    An episode is truncated after ``max_steps``, by default the environment's own limit, or the task's where it has
-    none. With ``processes`` each environment has a process of its own; ``record`` is told of clipped actions and
-    errors.
+    An episode is truncated after ``max_steps``, by default the environment's own limit, or the task's if it has none.
+    With ``processes`` each environment has a process of its own; ``record`` collects clipped actions and errors.
 
     Raises:
-        ValueError: if there is no such environment, its observations or actions are no flat boxes of the task's
-            widths, or ``info`` has no such success key in a whole episode, of which 1,000 steps are tried.
+        ValueError: if the environment does not exist, its observations or actions are no flat boxes of the task's
+            widths, or ``info`` lacks the success key in a whole episode, of which 1,000 steps are tried.
     """
 
     def __init__(
@@ -147,32 +146,32 @@ class GymnasiumBatch(EnvBase):
         return self._leaves(seen)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen, reward, _, _, told = self._env.step(tensordict.get(ACTION).cpu().numpy() + self._added)
-        self._steps += told["played"]
-        self.record.actions += int(told["played"].sum())
-        self.record.clipped += int(told["clipped"].any(-1).sum())
-        columns = zip(self.task.action_names, told["clipped"].sum(0).tolist(), strict=True)
+        seen, reward, _, _, info = self._env.step(tensordict.get(ACTION).cpu().numpy() + self._added)
+        self._steps += info["played"]
+        self.record.actions += int(info["played"].sum())
+        self.record.clipped += int(info["clipped"].any(-1).sum())
+        columns = zip(self.task.action_names, info["clipped"].sum(0).tolist(), strict=True)
         self.record.clipped_columns.update({name: count for name, count in columns if count})
-        failed = told["error"].astype(bool)
+        failed = info["error"].astype(bool)
         self.record.errors += [
-            {"seed": self._begun_with[index], "step": int(self._steps[index]), "error": told["error"][index]}
+            {"seed": self._begun_with[index], "step": int(self._steps[index]), "error": info["error"][index]}
             for index in np.flatnonzero(failed)
         ]
-        ends = {"done": told["over"], FAILED: failed} | {name: told[name] for name in (*_ENDS[1:], SUCCESS)}
+        ends = {"done": info["over"], FAILED: failed} | {name: info[name] for name in (*_ENDS[1:], SUCCESS)}
         self._state |= {name: torch.from_numpy(flags.astype(bool)).unsqueeze(-1) for name, flags in ends.items()}
         return self._leaves(seen).set("reward", torch.from_numpy(reward).float().unsqueeze(-1))
 
     def _leaves(self, seen: Any) -> TensorDictBase:
-        """What was seen and the state of every episode, as leaves."""
+        """Returns observations and the state of every episode."""
         if self._observe is not None:
             seen = np.stack([self._read(each) for each in iterate(self._env.observation_space, seen)])
         self._state[OBSERVATION] = torch.from_numpy((np.asarray(seen) - self._origin).astype(np.float32))
         return TensorDict({name: value.clone() for name, value in self._state.items()}, self.batch_size)
 
     def _read(self, observation: Any) -> np.ndarray:
-        """The task's observation ``[obs]`` of an environment's dictionary."""
-        frames, numbers = _sorted(dict(entries_of(observation)))
-        named = _named(frames, self._observe)
+        """Returns the task's observation ``[obs]`` from an environment's dictionary."""
+        frames, numbers = _split_pictures(dict(entries_of(observation)))
+        named = _frames_by_camera(frames, self._observe)
         state = np.concatenate([np.ravel(value) for value in numbers.values()]) if numbers else None
         return self._observe(named if state is None else {STATE: state, **named})
 
@@ -183,17 +182,17 @@ class GymnasiumBatch(EnvBase):
 
 
 _ENDS = ("done", "terminated", "truncated")
-# a process that is spawned imports everything again, and knows no environment that a plugin has registered
+# spawned processes import everything again and lack the environments that plugins have registered
 _FORK = "fork" if sys.platform == "linux" else None
 
 
-def _sorted(entries: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Pictures, and numbers, of an observation or of its space."""
+def _split_pictures(entries: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Splits the entries of an observation, or of its space, into pictures and numbers."""
     frames = {name: value for name, value in entries.items() if value.dtype == np.uint8 and len(value.shape) == 3}
     return frames, {name: value for name, value in entries.items() if name not in frames}
 
 
-def _named(frames: Mapping[str, Any], observe: Observer) -> dict[str, Any]:
+def _frames_by_camera(frames: Mapping[str, Any], observe: Observer) -> dict[str, Any]:
     cameras = list(observe.cameras)
     if len(cameras) == len(frames) == 1:
         return {cameras[0]: next(iter(frames.values()))}
@@ -202,8 +201,8 @@ def _named(frames: Mapping[str, Any], observe: Observer) -> dict[str, Any]:
 
 def _check_entries(env_id: str, space: gymnasium.Space, observe: Observer) -> None:
     spaces = dict(entries_of(space.spaces if isinstance(space, gymnasium.spaces.Dict) else space))
-    frames, numbers = _sorted(spaces)
-    missing = [name for name in observe.cameras if name not in _named(frames, observe)]
+    frames, numbers = _split_pictures(spaces)
+    missing = [name for name in observe.cameras if name not in _frames_by_camera(frames, observe)]
     width = sum(int(np.prod(each.shape)) for each in numbers.values())
     if missing or width not in (observe.state_dim, 0):
         lacks = f"camera {missing[0]!r} has no picture" if missing else f"its numbers have {width} columns"

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""One episode of an environment of Gymnasium: what it gives is checked, and its errors end it alone."""
+"""Plays one episode of a Gymnasium environment: checks its observations; an error ends this episode alone."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from gymnasium.wrappers.utils import create_zero_array
 
 SUCCESS_KEYS = ("is_success", "success")
-_ROUNDING = 1e-6  # share of an action that float32 may put it beyond its box
-_BONUS = 2.0  # times the largest reward before: one that rewards the end itself
-_LONGEST_PROBE = 1000  # steps in which a success key that was asked for must come
+_ROUNDING = 1e-6  # float32 may move an action this far beyond its box, relative and absolute
+_BONUS = 2.0  # a final reward above this multiple of all earlier ones means success
+_LONGEST_PROBE = 1000  # steps within which the requested success key must appear
 
 
 class ObservationError(ValueError):
-    """An environment gives no observation, or one of another shape than its space, or with NaN or infinity."""
+    """Raised if an environment returns no observation, one of a wrong shape, or one with NaN or infinity."""
 
 
 class GymnasiumEpisode(gymnasium.Wrapper):
@@ -25,12 +25,12 @@ class GymnasiumEpisode(gymnasium.Wrapper):
 
     A vector environment therefore never resets it; ``index`` is its place there. ``info`` holds ``terminated``,
     ``truncated`` and ``over``; whether the step was ``played`` and which columns of its action were ``clipped`` to the
-    box; ``success``; and as ``error`` what the environment raised in this step or at the reset, which truncates the
-    episode. A wrong observation (:class:`ObservationError`), whose columns have ``names``, is such an error.
+    box; ``success``; and ``error``, the environment's error in this step or at the reset, which truncates the episode.
+    A wrong observation (:class:`ObservationError`) is such an error, which names the column by ``names``.
 
-    Success is what the entry ``success_key`` of the environment's ``info`` says, by default ``is_success`` or
-    ``success`` where there is one, else an episode whose last step terminates it with more than twice the reward of any
-    step before, and more than 0. A walker that falls has a positive reward in all steps, also in its last.
+    Success is the entry ``success_key`` of the environment's ``info``, else ``is_success`` or ``success``. Without
+    one, an episode succeeds if its last step terminates it with a positive reward above twice any earlier one. A
+    positive reward alone is not enough: a walker has one in all steps, also when it falls.
     """
 
     def __init__(
@@ -48,23 +48,23 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         self._error, self._steps, self._over, self._success, self._most = "", 0, True, False, 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode, unless ``options["begin"]``, a bool for each environment, says otherwise."""
+        """Begins an episode unless ``options["begin"]``, a bool per environment, is False for this one."""
         if options is None or options["begin"][self.index]:
             self._error, self._steps, self._over, self._success, self._most = "", 0, False, False, 0.0
             try:
                 self._take(_begin(self.env, seed))
-            except Exception as error:  # told with the first step: an episode without a step has no outcome
+            except Exception as error:  # reported by the first step: an episode without a step has no outcome
                 self._error = f"reset: {say(error)}"
         return self._last, {}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Plays a step, if the episode is not over; its ends are told in ``info`` alone."""
-        told = {"played": not self._over, "terminated": False, "truncated": self._over, "error": ""}
-        told["clipped"], reward = np.zeros(self.env.action_space.shape, bool), 0.0
+        """Plays a step if the episode is not over; only ``info`` reports its end."""
+        report = {"played": not self._over, "terminated": False, "truncated": self._over, "error": ""}
+        report["clipped"], reward = np.zeros(self.env.action_space.shape, bool), 0.0
         if not self._over:
             reward, ends = self._play(action)
-            told |= ends
-        return self._last, reward, False, False, told | {"over": self._over, "success": self._success}
+            report |= ends
+        return self._last, reward, False, False, report | {"over": self._over, "success": self._success}
 
     def _play(self, action: np.ndarray) -> tuple[float, dict[str, Any]]:
         space: Any = self.env.action_space
@@ -77,7 +77,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
                 reward = float(given)
                 self._success |= self._succeeded(info, reward, bool(terminated))
                 self._most = max(self._most, reward)
-            except Exception as error:  # the episode has failed, the others go on
+            except Exception as error:  # this episode fails, the others go on
                 self._error, terminated, truncated = say(error), False, True
         self._steps += 1
         self._over = bool(terminated or truncated or self._steps >= self.max_steps)
@@ -108,19 +108,19 @@ class GymnasiumEpisode(gymnasium.Wrapper):
 
 
 def success_entry(info: Container[str], success_key: str | None) -> str | None:
-    """Returns the entry of ``info`` that says whether the task is done, None where there is none."""
+    """Returns the entry of ``info`` that says whether the task is done; None if there is none."""
     return next((key for key in (SUCCESS_KEYS if success_key is None else (success_key,)) if key in info), None)
 
 
 def say(error: Exception) -> str:
-    """What an error says, in one line."""
+    """Returns type and message of an error in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def find_success_key(env_id: str, env: gymnasium.Env, success_key: str | None) -> str | None:
-    """The entry of ``info`` that says whether the task is done, None where none of a first step does.
+    """Returns the entry of ``info`` that says whether the task is done; None if the first step has none.
 
-    The one that was asked for may come as late as the end of an episode.
+    A requested key may appear as late as the end of an episode.
     """
     space: Any = env.action_space
     action = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
@@ -135,7 +135,7 @@ def find_success_key(env_id: str, env: gymnasium.Env, success_key: str | None) -
                 break
     except ObservationError as error:
         raise ValueError(f"environment {env_id!r}: {error}") from error
-    except Exception:  # the episodes tell
+    except Exception:  # the episodes report it
         return success_key
     found = success_entry(entries, success_key)
     if found is None and success_key is not None:
@@ -145,7 +145,7 @@ def find_success_key(env_id: str, env: gymnasium.Env, success_key: str | None) -
 
 
 def _begin(env: gymnasium.Env, seed: int | None) -> Any:
-    """The first observation of an episode."""
+    """Resets an environment; returns the first observation."""
     given: Any = env.reset(seed=seed)
     if not isinstance(given, tuple) or len(given) != 2:
         raise ObservationError(f"reset() must return an observation and an info, got {type(given).__name__}")
@@ -161,7 +161,7 @@ def _check_shape(seen: Any, wanted: Any) -> None:
 
 
 def entries_of(observation: Any, name: str = "pixels") -> Iterator[tuple[str, Any]]:
-    """Entries of a dictionary in dictionaries by the name of the innermost."""
+    """Yields the entries of nested dictionaries by their innermost name."""
     if isinstance(observation, Mapping):
         for inner, value in observation.items():
             yield from entries_of(value, inner)

@@ -1,19 +1,19 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The environment of a task, as ``Task.env`` names it; and behind Gymnasium's interface, registered by import.
+"""Makes the environment that ``Task.env`` names; import registers D3IL's with Gymnasium, too.
 
-What an environment has to offer, D3IL's (:class:`~torchrl_koap.envs.ManipulationEnv`) or one's own::
+Interface of an environment, D3IL's (:class:`~torchrl_koap.envs.ManipulationEnv`) or your own::
 
     EnvBase          batch-locked, batch size [num_envs]; __init__(num_envs, num_threads=, max_steps=, dtype=, ...)
     max_steps        control steps after which an episode is truncated
-    reset            reset(contexts=[n, bodies, 3]) starts the episodes there, where the task has bodies; x, y (m), yaw
-                     (rad). Without it the environment draws them. One call resets all environments
-    set_seed         of all that it draws; rollouts call it with the seed of their first episode, recordings too
+    reset            reset(contexts=[n, bodies, 3]) places the bodies of the task, if it has any; x, y (m), yaw (rad).
+                     Without it the environment draws them. One call resets all environments
+    set_seed         seeds all that it draws; rollouts and recordings call it with the seed of their first episode
     observation      [n, obs]; success [n, 1] bool, latched until the reset; mode [n, ...], one of Task.modes.leaves
-    collision        [n, 1] bool, where an episode can end by one
-    context          [n, bodies, 3], where the task has bodies
+    collision        [n, 1] bool, if an episode can end by one
+    context          [n, bodies, 3], if the task has bodies
     reward, done, terminated, truncated
 
-Films read ``sims.model`` and ``sims.data`` of MuJoCo where they are there.
+Videos read ``sims.model`` and ``sims.data`` of MuJoCo if they exist.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def make_env(task: Task | str, num_envs: int = 1, *, noisy: bool = False, **opti
     Args:
         task (Task or str): the task, or its name.
         num_envs (int): number of parallel episodes.
-        noisy (bool): the measured end effector is disturbed, as ``Task.noise`` says and policies meet it.
+        noisy (bool): adds ``Task.noise`` to the measured end effector, as in rollouts of policies.
         **options: further arguments of the environment, such as ``num_threads``, ``max_steps`` and ``dtype``. They
-            join, and go before, ``Task.env_options``.
+            override ``Task.env_options``.
 
     Returns:
         EnvBase: the batched environment.
@@ -69,7 +69,7 @@ IDS |= {"Sorting4-v0": "sorting", "Sorting2-v0": "sorting_2", "Sorting6-v0": "so
 
 
 class ManipulationGymEnv(gymnasium.Env):
-    """One environment of a task behind Gymnasium's interface.
+    """Gives one environment of a task Gymnasium's interface.
 
     Observation and action are those of the batched environment in float32, and ``info`` holds
 
@@ -77,7 +77,7 @@ class ManipulationGymEnv(gymnasium.Env):
     key            type                         meaning
     ============== ============================ ====================================================================
     ``success``    bool                         the task is done
-    ``collision``  bool                         only where an episode can end by one (Avoiding)
+    ``collision``  bool                         only if an episode can end by one (Avoiding)
     ``mode``       bool or int64 array          leaf ``mode`` of the batched environment
     ``mode_index`` int                          number of the mode, -1 while it is not decided
     ``context``    float64 ``[objects, 3]``     only in tasks with objects: where they start, x, y (m) and yaw (rad)
@@ -86,7 +86,7 @@ class ManipulationGymEnv(gymnasium.Env):
     Args:
         task (str): name of the task.
         render_mode (str, optional): ``"rgb_array"`` or None.
-        width, height (int): of pictures, in pixels.
+        width, height (int): size of pictures in pixels.
 
     Raises:
         ValueError: for an unknown task, another ``render_mode``, or actions of a wrong shape or that are not finite.
@@ -118,7 +118,7 @@ class ManipulationGymEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; ``options["context"]`` says where objects start ``[objects, 3]``, by default random ones.
+        """Starts an episode; ``options["context"]`` ``[objects, 3]`` places objects, by default at random.
 
         Raises:
             ValueError: for another option, or a context of a wrong shape, out of range, or of a task without objects.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Partial observability as TorchRL transforms: what makes PO-Sorting of Sorting."""
+"""TorchRL transforms for partial observability, as in PO-Sorting."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_koap.tasks import Task, get_task
 
 
 class PartialObservation(ObservationTransform):
-    """Leaves of observations ``[*B, obs]`` what ``Task.state_of`` does: no command, and nothing of ``Task.hidden``.
+    """Reduces observations ``[*B, obs]`` to states, ``Task.state_of``: no command, no columns of ``Task.hidden``.
 
     Raises:
         ValueError: when applied, if the observation has another number of columns than the task.
@@ -41,7 +41,7 @@ class PartialObservation(ObservationTransform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """The specification without the columns that are left out."""
+        """Returns the specification without the removed columns."""
         spec = observation_spec[OBSERVATION]
         shape = (*spec.shape[:-1], self.task.state_dim)
         observation_spec[OBSERVATION] = Unbounded(shape, device=spec.device, dtype=spec.dtype)
@@ -49,12 +49,12 @@ class PartialObservation(ObservationTransform):
 
 
 class EndEffectorNoise(ObservationTransform):
-    """Adds Gaussian noise to the measured end effector, random unless :meth:`seed_episodes` gives seeds.
+    """Adds Gaussian noise to the measured end effector, at random unless :meth:`seed_episodes` gives seeds.
 
-    A seed of the environment does not reach it.
+    The seed of the environment does not affect the noise.
 
     Args:
-        task (Task or str): the task; its part ``Task.position`` is disturbed.
+        task (Task or str): the task; noise is added to its part ``Task.position``.
         sigma (float): standard deviation (m).
 
     Raises:
