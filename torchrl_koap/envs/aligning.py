@@ -23,7 +23,7 @@ WALLS = (
 
 
 def aligned(tray: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Returns whether poses ``[..., 7]`` (m, quaternion) agree: distance, height included, and angle are small."""
+    """Returns whether poses ``[..., 7]`` (m, quaternion) agree: distance in x, y, z and angle are small."""
     distance = np.linalg.norm(tray[..., :3] - target[..., :3], axis=-1)
     same = np.abs((tray[..., 3:] * target[..., 3:]).sum(-1))
     angle = 2 * np.arccos(np.minimum(same, 1.0)) / np.pi
@@ -45,7 +45,7 @@ class AligningEnv(ManipulationEnv):
     ``context``     [n, 2, 3] ``dtype``         start of the tray, and target: x, y (m), yaw (rad)
     =============== ========= ================= ===============================================================
 
-    There is no failure. Unlike the original, exact alignment counts: its rotation distance becomes NaN.
+    There is no failure. Exact alignment counts as success; in the original its rotation distance becomes NaN.
 
     Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
@@ -72,7 +72,7 @@ class AligningEnv(ManipulationEnv):
         super()._begin(rows)
         for row, pose in zip(rows, self.targets[rows], strict=True):
             self.sims.data[row].mocap_pos[0], self.sims.data[row].mocap_quat[0] = pose[:3], pose[3:]
-            self.sims.set_state(row, self.sims.get_state(row))  # the first picture shows the target in its new place
+            self.sims.set_state(row, self.sims.get_state(row))  # or the first picture would show the old target
 
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         parts = (self._commands[:, :3], self.sims.tcp_position, self.sims.object_poses[:, 0], self.targets)
@@ -91,7 +91,7 @@ class AligningEnv(ManipulationEnv):
         self._mode[rows, 0] = np.linalg.norm(gap, axis=1) >= INSIDE_REACH
 
     def raw_log(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """What D3IL's recorder logs, the target among the objects."""
+        """Returns what D3IL's recorder logs, with the target among the objects."""
         robot, tray = super().raw_log()
         return robot, np.concatenate([tray, self.targets[:, None]], axis=1)
 

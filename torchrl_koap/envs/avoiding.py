@@ -26,12 +26,12 @@ class AvoidingEnv(ManipulationEnv):
     ``mode``        [n, 9]    bool              which gaps were passed, of rows of 2, 3 and 4
     =============== ========= ================= ===============================================================
 
-    Collisions are looked at once per control step, as in the original, so a graze in between is missed. Crossing the
-    line while touching is a success.
+    Collisions are checked once per control step, as in the original, so brief touches in between are missed. Crossing
+    the line while touching is a success.
 
-    The commanded height is held at the TCP height after the reset, the orientation at (0, 1, 0, 0). Every episode
-    starts in the same state. Human demonstrators move the command by at most 0.012 m per axis and step, the range of
-    the action spec; larger actions are executed as they are.
+    The commanded height stays at the TCP height after the reset, the orientation at (0, 1, 0, 0). Every episode starts
+    in the same state. Human demonstrators move the command by at most 0.012 m per axis and step, the range of the
+    action spec; larger actions are executed as they are.
 
     Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 

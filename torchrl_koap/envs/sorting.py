@@ -25,7 +25,7 @@ from torchrl_koap.tasks.sorting import (
 )
 
 PLATFORM_TOP = 0.1  # (m)
-_RGB = ((1, 0, 0), (0, 0, 1))  # of the colours
+_RGB = ((1, 0, 0), (0, 0, 1))  # of red and blue
 
 
 class SortingEnv(ManipulationEnv):
@@ -46,8 +46,8 @@ class SortingEnv(ManipulationEnv):
 
     There is no failure; a box that lies in the wrong bin stays there.
 
-    Arrivals are noted as in the original: at most one per control step, and only if the box that is nearest to the
-    centre of its own bin among those not noted yet is inside. A noted box that leaves its bin stays noted.
+    Arrivals are noted as in the original, at most one per control step. Of boxes not noted yet, only the one nearest to
+    the centre of its bin is checked. A noted box that leaves its bin stays noted.
 
     Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
@@ -68,7 +68,7 @@ class SortingEnv(ManipulationEnv):
         0.22457584505012435,
     )
     MODE_ENTRIES, MODE_VALUES = None, 2
-    START_HEIGHT = 0.05  # m; inside the platform, as in the original: the first steps push the boxes up
+    START_HEIGHT = 0.05  # m; inside the platform, as in the original; the first steps push the boxes up
 
     def __init__(self, *args: Any, num_boxes: int = 4, **options: Any):
         task = sorting_task(num_boxes)
@@ -92,7 +92,7 @@ class SortingEnv(ManipulationEnv):
         )
 
     def _inside(self, rows: np.ndarray) -> np.ndarray:
-        """Which boxes are in their bins, height not considered, bool [len(rows), num_boxes]."""
+        """Returns which boxes are in their bins, at any height, bool [len(rows), num_boxes]."""
         return in_bins(torch.from_numpy(self.sims.object_poses[rows, :, :2])).numpy()
 
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +111,7 @@ class SortingEnv(ManipulationEnv):
         for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
             add_free_box(root, name, (BOX_HALF,) * 3, (*_RGB[colour], 1))
         root.attach(panda(link_collisions=True))
-        # bodies of their own, after the boxes: contacts are listed in the order of bodies, as in the original
+        # separate bodies after the boxes, as in the original: contacts are listed in the order of bodies
         platform = root.worldbody.add("body", name="platform", pos=((PLATFORM_X[0] + PLATFORM_X[1]) / 2, -0.1, 0))
         size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)
         platform.add("geom", type="box", size=size, friction=friction, priority=1, rgba=(0.5, 0.5, 0.5, 0.5))

@@ -40,12 +40,12 @@ class StackingEnv(ManipulationEnv):
     The first 20 columns of the observation are those of D3IL's recordings. A box has *arrived* once its centre has
     been within 6 cm (horizontally) of (0.5, 0.2), at most one box per control step. Success with ``num_boxes=3``: all
     three are within 6 cm now and their heights differ by more than 3 cm, whether or not the gripper still holds one;
-    with 1 or 2: so many boxes have arrived. There is no failure.
+    with 1 or 2: that many boxes have arrived. There is no failure.
 
     Args, errors and the order of events are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Raises:
-        ValueError: for another number of boxes than 1, 2 or 3, too.
+        ValueError: also for a number of boxes other than 1, 2 or 3.
 
     Examples:
         >>> from torchrl_koap.envs import StackingEnv
@@ -70,7 +70,7 @@ class StackingEnv(ManipulationEnv):
 
     def __init__(self, *args: Any, num_boxes: int = 3, **options: Any):
         if num_boxes not in (1, 2, 3):
-            raise ValueError(f"num_boxes must be 1, 2 or 3: how many boxes make a success; got {num_boxes!r}")
+            raise ValueError(f"num_boxes must be 1, 2 or 3 (boxes needed for success), got {num_boxes!r}")
         super().__init__(*args, task=get_task("stacking_1" if num_boxes == 1 else "stacking"), **options)
         self.num_boxes = num_boxes
 

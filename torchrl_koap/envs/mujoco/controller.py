@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Compiled controller: inverse kinematics, joint PD, finger force each millisecond (docs/appendix/d3il.md, Controller).
 
-One call advances one simulation by all substeps of a control step without coming back to Python: the compiled loop
-computes the motor commands and calls ``mj_step`` of the MuJoCo library through its address. It holds no interpreter
-lock, so calls for different simulations run in parallel threads. Compiled code is cached on disk by numba.
+One call advances a simulation by all substeps of a control step without returning to Python: the compiled loop
+computes the motor commands and calls ``mj_step`` of the MuJoCo library through its address. It releases the
+interpreter lock, so calls for different simulations run in parallel threads. Compiled code is cached on disk by numba.
 
 Everything here works on one simulation at a time, with plain float64 arithmetic in a fixed order; results therefore do
 not depend on how many simulations or threads there are.
@@ -72,9 +72,9 @@ def _array(address, length):
 
 @njit(cache=True)
 def _substep(step, model, data, pointers, q, speed, width, grasping, log, logged):
-    """One physics step of one simulation in which the joints are pulled to ``q`` [7] (rad) at ``speed`` [7] (rad/s).
+    """Runs one physics step of one simulation with joints pulled to ``q`` [7] (rad) at ``speed`` [7] (rad/s).
 
-    Where it is ``logged``, D3IL's recorder notes the joints after the step and the TCP position at its beginning.
+    If ``logged``, writes a log row as D3IL's recorder: joints after the step, TCP position at its beginning.
     """
     qpos, qvel = _array(pointers[QPOS], 9), _array(pointers[QVEL], 9)
     ctrl, bias = _array(pointers[CTRL], 9), _array(pointers[BIAS], 9)
@@ -125,7 +125,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
 
 @njit(nogil=True, cache=True)
 def track_joints(step, model, data, pointers, rows, commands, widths, grasping, substeps, log):
-    """Holds joints at ``commands`` [n, 7] (rad) for ``substeps`` physics steps; as :func:`track_pose` else."""
+    """Holds joints at ``commands`` [n, 7] (rad) for ``substeps`` physics steps; otherwise as :func:`track_pose`."""
     still = np.zeros(7)
     for row in rows:
         fixed, hand = (step, model, data[row], pointers[row]), (widths[row], grasping[row], log[row])

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Compiled kinematics of the Panda arm: the pose of its tool centre point (TCP), and damped steps towards a pose.
 
-Plain float64 arithmetic in a fixed order (docs/appendix/d3il.md, Controller), which LAPACK does not have everywhere.
+Plain float64 arithmetic in a fixed order (docs/appendix/d3il.md, Controller); LAPACK's order depends on the machine.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EIGENVALUE_MIN, EIGENVALUE_MAX = 0.01, 100.0
 def forward_kinematics(q, axes, origins, tcp, quat):
     """Computes the frames of the arm's joints ``q`` [7] (rad) and the pose of the TCP, in the frame of its base.
 
-    Written are the axes x, y, z of the joints' frames into rows 1-7 of ``axes`` [8, 3, 3] (row 0 ends as the hand's),
+    Writes the axes x, y, z of the joints' frames into rows 1-7 of ``axes`` [8, 3, 3] (row 0 ends as the hand's),
     their ``origins`` [8, 3] (m), the TCP's position ``tcp`` [3] (m) and its quaternion ``quat`` [4] (w, x, y, z).
     """
     axes[0], origins[0] = np.eye(3), 0.0
@@ -122,7 +122,7 @@ def _diagonalise(matrix, vectors):
 
 @njit(cache=True)
 def solve_clipped(matrix, rhs):
-    """Solves ``A x = b`` [6] for symmetric ``A`` [6, 6], its eigenvalues clipped to [0.01, 100] first; both are lost.
+    """Solves ``A x = b`` [6] for symmetric ``A`` [6, 6], its eigenvalues clipped to [0.01, 100]; overwrites both.
 
     Clipping is rarely active. Two cheap tests say so: ``A - 0.01 I`` has a Cholesky factor, and the trace is below 100.
     """
@@ -210,7 +210,7 @@ def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def follow_pose(joints: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Computes the joint targets [n, 7] that the controller reaches when it tracks poses for one control step.
 
-    D3IL's Stacking data were recorded so: a person commanded poses, policies learn the joint targets that followed.
+    D3IL's Stacking data hold these: a person commanded poses, and policies learn the resulting joint targets.
     ``joints`` are the present targets [n, 7] (rad), ``poses`` TCP positions (m) and unit quaternions [n, 7]. Positions
     some centimetres away are reached, and turns for about three quarters.
     """

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pictures of a simulation. Graphics libraries are looked for when the first picture is asked for, never before."""
+"""Draws pictures of a simulation. Graphics libraries are loaded for the first picture, never before."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ INSTALL = (
     "on a machine without display install EGL (apt-get install libegl1) and set MUJOCO_GL=egl, or software rendering"
     " (apt-get install libosmesa6) and set MUJOCO_GL=osmesa"
 )
-# opens a window and graphics memory; nothing but the simulator is imported
+# opens a window and graphics memory; imports only the simulator
 _PROBE = """
 import importlib, mujoco, warnings
 warnings.simplefilter("ignore")
@@ -33,7 +33,7 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 
 def backends() -> list[str]:
-    """Lists the OpenGL back ends to try, in order: the one named by ``MUJOCO_GL``, else what suits this machine."""
+    """Lists the OpenGL back ends to try, in order: the one named by ``MUJOCO_GL``, otherwise those of this platform."""
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if chosen in _SWITCHED_OFF:
         raise RuntimeError(f"rendering is switched off by the environment variable MUJOCO_GL={chosen}")
@@ -49,7 +49,7 @@ def backends() -> list[str]:
 
 
 def open_context(names: Sequence[str], model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """Opens the first back end that a model can be drawn with, its window and graphics memory, or says why none."""
+    """Opens window and graphics memory of the first usable back end; without one, a RuntimeError gives the reasons."""
     reasons = []
     for name in names:
         try:
@@ -65,7 +65,7 @@ def open_context(names: Sequence[str], model: mujoco.MjModel, width: int, height
 
 
 def try_backends() -> dict[str, str]:
-    """Draws with every back end of this system in a process of its own; by name what went wrong, "" where nothing."""
+    """Tries every back end of this system in a process of its own; returns errors by name, "" for none."""
     known = {"darwin": ("cgl", "glfw"), "linux": ("egl", "osmesa", "glfw")}.get(sys.platform, ("glfw",))
     return {name: _try(name) for name in known}
 
@@ -83,9 +83,9 @@ def _try(name: str) -> str:
 
 
 class Renderer:
-    """Draws simulations of one model into arrays [height, width, 3]; without ``shadows`` software takes half the time.
+    """Draws simulations of one model into arrays [height, width, 3].
 
-    Where no OpenGL library can be used, a RuntimeError says what to install.
+    Software rendering takes half the time without ``shadows``. Raises a RuntimeError if no OpenGL library can be used.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, *, shadows: bool = True):
@@ -102,11 +102,11 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
 
-    def __reduce__(self) -> tuple[Any, ...]:  # a copy has a context of its own
+    def __reduce__(self) -> tuple[Any, ...]:  # a copy opens its own context
         return partial(Renderer, shadows=self._shadows), (self._model, *self.size)
 
     def render(self, data: mujoco.MjData, camera: str) -> np.ndarray:
-        """Draws one simulation, uint8 [height, width, 3], by a camera; the arm's prefix may be left out of its name."""
+        """Draws one simulation, uint8 [height, width, 3]; the camera's name needs no arm prefix."""
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
         names = {self._model.camera(index).name.removeprefix("panda/"): index for index in range(self._model.ncam)}
         self._camera.fixedcamid = lookup(names, camera.removeprefix("panda/"), "camera")

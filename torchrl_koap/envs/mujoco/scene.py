@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-import mujoco  # it reads MUJOCO_GL for itself, so before the variable is hidden
+import mujoco  # reads MUJOCO_GL, so it is imported before the variable is hidden
 
 from torchrl_koap.envs.mujoco.kinematics import TIMESTEP
 from torchrl_koap.graphics import no_graphics
@@ -26,8 +26,8 @@ if importlib.util.find_spec("dm_control") is None:
         "the simulators of D3IL's tasks need dm-control, a separate step on Python 3.13 and later: pip install"
         " --no-deps dm-control (it asks for labmaze, which has no wheels there and is not needed)"
     )
-# Importing dm_control opens whatever OpenGL back end it finds (and fails if MUJOCO_GL names one that is not installed),
-# although building a scene needs none. A program that wants dm_control's own renderer imports it before this package.
+# Importing dm_control opens an OpenGL back end (and fails if MUJOCO_GL names one that is not installed), although
+# building a scene needs none. Programs that need dm_control's own renderer must import it before this package.
 if "dm_control._render" in sys.modules:
     from dm_control import mjcf
 else:
@@ -47,7 +47,7 @@ HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z
 
 _TURN = 0.5**0.5
 _TURNS = ((1.0, 0.0, 0.0, 0.0), (_TURN, _TURN, 0.0, 0.0), (_TURN, -_TURN, 0.0, 0.0))  # about x: none, +90, -90 deg
-# mass and centre of mass of the links, by which they hang on each other
+# mass and centre of mass of the links, in the order of the chain
 _MASSES = (
     (3.01399, (-0.0291898, -0.000879465, 0.0566032)),
     (2.77281, (1.1399e-05, -0.0312655, -0.0693733)),
@@ -58,7 +58,7 @@ _MASSES = (
     (1.35761, (0.0510023, 0.00693267, 0.00616899)),
     (0.417345, (0.0103614, 0.0103596, 0.0791078)),
 )
-# their principal inertia and its frame
+# principal inertia of the links and its frame
 _INERTIA = (
     ((0.0126801, 0.0117603, 0.00856656), (0.00411744, 0.564916, 0.0132875, 0.825031)),
     ((0.0164224, 0.0153969, 0.00546286), (0.98466, 0.174481, -0.000101815, 0.000347662)),
@@ -96,12 +96,12 @@ def mesh_folder() -> Path:
 def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3) -> mjcf.RootElement:
     """Builds the arm: 7 hinge joints, 2 finger slides, 9 motors, TCP body, wrist camera, optionally a rod in the hand.
 
-    What can touch something always collides: rod, fingers, finger pads and hand. Names: joints ``joint1`` ...
+    Rod, fingers, finger pads and hand always collide. Names: joints ``joint1`` ...
     ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ... ``link8``, ``hand``, ``tcp``,
     geom ``rod``, camera ``wrist``.
 
-    With ``link_collisions`` the convex hulls of links 0-7 collide with objects and table too. The original lets them
-    collide with each other as well, which joint limits and tasks keep them from; testing takes time.
+    With ``link_collisions`` the convex hulls of links 0-7 collide with objects and table too. Unlike in the original,
+    they do not collide with each other: joint limits and tasks prevent that, and testing takes time.
     """
     folder = mesh_folder()
     root = mjcf.RootElement(model="panda")
@@ -109,7 +109,7 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3
     for name in _MESHES:
         root.asset.add("mesh", name=name, file=str(folder / f"{name}.stl"))
     colour, dark = (0.95, 0.95, 0.95, alpha), (0.25, 0.25, 0.28, alpha)
-    hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
+    hull = {"contype": int(link_collisions), "conaffinity": 0}  # with a conaffinity links would collide with links
 
     body = root.worldbody
     placed = (((0.0, 0.0, 0.0), 0), *LINKS)
@@ -152,7 +152,7 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 0.3
 
 
 def _add_rod(hand: mjcf.Element) -> None:
-    # D3IL leaves the inertia of rod and tip to their shapes, at the density of water
+    # in D3IL the inertia of rod and tip follows from their shapes at the density of water
     radius, length, density = 0.01, 0.3, 1000.0
     mass = density * math.pi * radius**2 * length
     across, along = mass * (3 * radius**2 + length**2) / 12, mass * radius**2 / 2
@@ -187,7 +187,7 @@ def _add_finger(hand: mjcf.Element, side: float, name: str, colour: tuple) -> No
 
 
 def scene() -> mjcf.RootElement:
-    """Builds what all tasks share. They attach the arm after their free bodies, which come first in the state vector.
+    """Builds the part that scenes share. Tasks attach the arm after their free bodies, which come first in the state.
 
     World: x forward, y left, z up, robot base at the origin; the table top lies at z = -0.019 m.
     """
@@ -233,7 +233,7 @@ def compile_scene(root: mjcf.RootElement) -> mujoco.MjModel:
 
 
 def add_free_box(root: mjcf.RootElement, name: str, half: Sequence[float], colour: Sequence[float]) -> None:
-    """Adds a box of 50 g that moves freely; ``half`` its sizes (m)."""
+    """Adds a box of 50 g that moves freely; ``half`` are its half sizes (m)."""
     box = root.worldbody.add("body", name=name)
     box.add("freejoint", name=name)
     box.add("geom", name=name, type="box", size=half, mass=0.05, rgba=colour)

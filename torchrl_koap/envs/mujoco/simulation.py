@@ -15,17 +15,17 @@ from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import PANDA
 
 _NUM_JOINTS = 9  # seven of the arm, two fingers
-_CHUNKS_PER_THREAD = 4  # smaller pieces even out simulations that take longer
+_CHUNKS_PER_THREAD = 4  # smaller pieces balance simulations of unequal duration
 _PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class Simulations:
-    """Simulations that share a model and are advanced together, in one or several threads (one: the caller's).
+    """Simulations that share a model and are advanced together, by several threads or by the caller's.
 
     The result for one simulation depends neither on the others nor on the number of threads.
     """
 
-    _episode: dict[str, np.ndarray]  # what decides the future beside the physics, a row per simulation
+    _episode: dict[str, np.ndarray]  # state outside the physics, a row per simulation
 
     def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
         self.model, self.num_threads = model, num_threads
@@ -35,7 +35,7 @@ class Simulations:
         self._connected = set(vars(self)) - before
 
     def _connect(self) -> None:
-        """Sets what belongs to this process and this object alone; a copy, or what is unpickled, sets its own."""
+        """Sets attributes that copies and unpickled objects must not share but set anew."""
         self._executor: ThreadPoolExecutor | None = None
         self._executor_pid: int | None = None
 
@@ -50,7 +50,7 @@ class Simulations:
         return len(self.data)
 
     def _run(self, advance: Callable[[np.ndarray], None], rows: np.ndarray, substeps: int) -> None:
-        """Advances the simulations ``rows`` by ``substeps``, in threads where there are several of both."""
+        """Advances the simulations ``rows`` by ``substeps``, in threads if there are several of both."""
         timestep = self.model.opt.timestep
         due = [self.data[row].time + substeps * timestep for row in rows]
         if self.num_threads == 1 or len(rows) <= 1:
@@ -63,11 +63,11 @@ class Simulations:
             for future in [self._executor.submit(advance, piece) for piece in pieces]:
                 future.result()
         for row, time in zip(rows, due, strict=True):
-            if abs(self.data[row].time - time) > 0.5 * timestep:  # MuJoCo resets a state that blows up
+            if abs(self.data[row].time - time) > 0.5 * timestep:  # MuJoCo resets a state that diverges
                 raise RuntimeError(f"the simulation of environment {row} became unstable")
 
     def get_state(self, row: int) -> dict[str, np.ndarray]:
-        """Returns everything that decides the future of one simulation."""
+        """Returns the complete state of one simulation."""
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
         mujoco.mj_getState(self.model, self.data[row], physics, _PHYSICS)
         return {"physics": physics} | {name: array[row].copy() for name, array in self._episode.items()}
@@ -77,7 +77,7 @@ class Simulations:
         data = self.data[row]
         mujoco.mj_resetData(self.model, data)
         mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
-        mujoco.mj_forward(self.model, data)  # poses for pictures, contacts; what it changes is put back below
+        mujoco.mj_forward(self.model, data)  # poses for pictures, and contacts; the next line restores what it changes
         mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
         for name, array in self._episode.items():
             array[row] = state[name]
@@ -117,7 +117,7 @@ class SimulationBatch(Simulations):
         self._object_views = [data.qpos[: self._qpos_start] for data in self.data]
 
     def _arrays(self, data: mujoco.MjData) -> list[int]:
-        """Addresses of what the controller reads and writes, in the order of its pointer table."""
+        """Returns the addresses that the controller reads and writes, in the order of its pointer table."""
         joints, speeds = data.qpos[self._qpos_start :], data.qvel[self._qvel_start :]
         bias, tcp = data.qfrc_bias[self._qvel_start :], data.xpos[self._tcp]
         return [array.ctypes.data for array in (joints, speeds, data.ctrl, bias, tcp, data.qpos)]
@@ -187,7 +187,7 @@ class SimulationBatch(Simulations):
         self._run(lambda piece: kernel(*fixed, piece, *arguments), rows, substeps)
 
     def get_state(self, row: int) -> dict[str, np.ndarray]:
-        """Returns everything that decides the future of one simulation, controller included."""
+        """Returns the complete state of one simulation, controller included."""
         data = self.data[row]
         read = {"bias": data.qfrc_bias.copy(), "tcp_position": data.xpos[self._tcp].copy()}
         return super().get_state(row) | read
@@ -202,8 +202,8 @@ class SimulationBatch(Simulations):
     def logged(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Returns what D3IL's recorder logs for the last control step (docs/appendix/d3il.md, Recordings).
 
-        It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins. Joints are in rad; an array
-        ``[n, ...]`` each. Then come the poses of the free bodies [n, objects, 7] (m, quaternion).
+        It records after the *first* substep: ``c_pos`` (m) is the TCP at the beginning of the step. Joints are in rad;
+        all are arrays ``[n, ...]``. The second value are the poses of the free bodies [n, objects, 7] (m, quaternion).
         """
         robot = {name: self._log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
         return robot, self._log[:, controller.LOG_WIDTH :].reshape(len(self), -1, 7).copy()

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scooping: a Panda takes pieces out of a bowl with a spoon and sees embeddings of a camera's frames alone."""
+"""Scooping: a Panda takes pieces out of a bowl with a spoon; the state is the embedding of a camera frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import CAMERA, EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
 from torchrl_koap.vision.encoder import FrozenImageEncoder, load_encoder, projection_of
 
-JOINT_SPEED = 2.5  # rad/s; targets that are further away are gone towards at this speed
+JOINT_SPEED = 2.5  # rad/s; largest speed towards a target
 PIXELS = "pixels"
 
 
@@ -31,31 +31,31 @@ class ScoopingEnv(ManipulationEnv):
     ``observation`` [n, 99]      ``dtype``         0-95 embedding of the camera's frame, 96-98 the spoon's
                                                    position (m), which planner and controller never see
     ``action``      [n, 7]       ``dtype``         joint targets (rad) for the end of the step, absolute
-    ``pixels``      [n, H, W, 3] uint8             the frame, where ``pixels`` was asked for
+    ``pixels``      [n, H, W, 3] uint8             the frame, with ``pixels=True``
     ``success``     [n, 1]       bool              the spoon has left the bowl with a piece on it
     ``mode``        [n, 1]       bool              the spoon has reached over the rim
-    ``context``     [n, 1, 3]    ``dtype``         where the spoon starts, x, y (m); how the pieces lie (rad)
+    ``context``     [n, 1, 3]    ``dtype``         start of the spoon, x, y (m); layout of the pieces (rad)
     =============== ============ ================= ============================================================
 
     A step is a frame of 100 ms, in which the joints' servos are commanded three times (30 Hz), on a straight line from
     the last target to the new one. *Over the rim*: the middle of the spoon's floor is inside the rim's circle and less
     than 5 cm above it. *Success*: afterwards the spoon is 4 cm above the rim and carries a piece for 0.2 s. There is no
-    failure, and what is observed is the present frame, unlike in D3IL's tasks. Where the bowl moves, columns 99 and 100
-    and a second row of the context are its position (m).
+    failure. Unlike in D3IL's tasks, the observation is the present frame. If the bowl moves, columns 99 and 100 and a
+    second row of the context are its position (m).
 
     Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`, and
 
     Keyword Args:
-        task (str): ``"scooping"``, or ``"scooping_moving_bowl"``, whose bowl stands somewhere else in every episode.
-        encoder (FrozenImageEncoder, optional): what embeds the frames. Default: EfficientNet-Lite0 and the projection
+        task (str): ``"scooping"``, or ``"scooping_moving_bowl"``, whose bowl moves between episodes.
+        encoder (FrozenImageEncoder, optional): embeds the frames. Default: EfficientNet-Lite0 and the projection
             of the task that comes with the package.
-        embed (bool): embed the frames. Without, the embedding is zero and neither OpenGL nor weights are needed.
-        pixels (bool): hand the frames out too.
+        embed (bool): embed the frames. If False, the embedding is zero, and neither OpenGL nor weights are needed.
+        pixels (bool): return the frames, too.
 
     Raises:
         ValueError: for an embedding of another size than the task's.
         RuntimeError: if there is no OpenGL library.
-        WeightsError: if there are no weights, or others than those of the projection.
+        WeightsError: if the weights are missing or do not match the projection.
 
     Examples:
         >>> from torchrl_koap.envs import ScoopingEnv
@@ -84,7 +84,7 @@ class ScoopingEnv(ManipulationEnv):
         super().__init__(*args, task=get_task(task), **options)
         self._encoder = chosen
         self._pixels = np.zeros((*self.batch_size, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-        self._hand_out = pixels
+        self._return_pixels = pixels
         self._camera: Renderer | None = None
         if pixels:
             self.observation_spec[PIXELS] = Unbounded(self._pixels.shape, dtype=torch.uint8, device=self.device)
@@ -120,7 +120,7 @@ class ScoopingEnv(ManipulationEnv):
             if self._encoder is not None:
                 embedding = self._encoder.embed(torch.from_numpy(self._pixels[rows])).double().numpy()
         seen = (embedding, self.sims.spoon_position[rows], self.sims.bowl_positions[rows])
-        return np.concatenate(seen, axis=1)[:, : self.task.observation_dim]  # the bowl only where it moves
+        return np.concatenate(seen, axis=1)[:, : self.task.observation_dim]  # the bowl only if it moves
 
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.sims.success[rows], np.zeros(len(rows), dtype=bool)
@@ -130,7 +130,7 @@ class ScoopingEnv(ManipulationEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         rows = self._rows(tensordict, "_step")
-        rows = rows[~self._success[rows]]  # what is over stays as it is, and costs no frame
+        rows = rows[~self._success[rows]]  # finished episodes do not change and need no frame
         self._command(rows, self._checked_action(tensordict, rows))
         self._advance(rows)
         self._steps[rows] += 1
@@ -141,7 +141,7 @@ class ScoopingEnv(ManipulationEnv):
 
     def _leaves(self) -> TensorDictBase:
         leaves = super()._leaves()
-        if self._hand_out:
+        if self._return_pixels:
             leaves.set(PIXELS, self._tensor(self._pixels))
         return leaves
 

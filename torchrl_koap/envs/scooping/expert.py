@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A scripted scooper for both embodiments: over the bowl, down, along its floor, nose up, out; again if it is empty.
+"""A scripted expert for both embodiments: over the bowl, down, along its floor, nose up, out; repeats if empty.
 
 The Panda that holds the spoon moves by inverse kinematics.
 """
@@ -19,33 +19,33 @@ from torchrl_koap.tasks.scooping import FRAME_HZ, START_HEIGHT, STARTS
 
 @dataclass(frozen=True)
 class Habits:
-    """Speed, path and height of an embodiment that moves the spoon."""
+    """Speeds, paths and heights of an embodiment that moves the spoon."""
 
     speed: float  # of the spoon in the air (m/s)
     drag: float  # of the spoon in the bowl (m/s)
     headings: tuple[float, ...]  # direction of the stroke from each start position (rad)
-    heading_sigma: float  # its spread (rad)
+    heading_sigma: float  # standard deviation of the heading (rad)
     wander: float  # typical deviation from the planned path (m)
     tilt: float  # typical roll of the spoon (rad)
-    above: float  # height at which it comes over the bowl (m)
+    above: float  # height of the spoon over the bowl (m)
 
 
 HABITS = {
     "robot": Habits(0.16, 0.07, (-0.8, 0.0, 0.8), 0.12, 0.004, 0.02, 0.13),
     "hand": Habits(0.26, 0.08, (-1.1, 0.35, 1.1), 0.2, 0.005, 0.04, 0.16),
 }
-_STROKE = (-0.025, 0.034)  # from where to where the spoon goes in the bowl, along the heading (m)
+_STROKE = (-0.025, 0.034)  # begin and end of the stroke in the bowl, along the heading (m)
 _NOSE_DOWN, _NOSE_UP = 0.22, -0.5  # rad
-_FLOOR = -0.01  # height that is aimed at in the bowl (m): the spoon is pressed onto the table and scrapes along it
+_FLOOR = -0.01  # commanded height in the bowl (m): below the table, so that the spoon scrapes along it
 
-REST = np.array([0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785])  # rad; the pose that is kept near to
+REST = np.array([0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785])  # rad; joints are pulled towards this pose
 _DAMPING, _PULL = 1e-4, 0.05
 
 
 def rotation_of(yaw: float, pitch: float, roll: float) -> np.ndarray:
     """Computes the axes of a spoon ``[3, 3]``, in columns.
 
-    It is turned by yaw, then by pitch about the turned y, positive nose down, then by roll about the turned x (rad).
+    It is turned by yaw, by pitch about the turned y (positive: nose down), then by roll about the turned x (rad).
     """
     (cy, sy), (cp, sp), (cr, sr) = ((np.cos(angle), np.sin(angle)) for angle in (yaw, pitch, roll))
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
@@ -55,7 +55,7 @@ def rotation_of(yaw: float, pitch: float, roll: float) -> np.ndarray:
 
 
 class SpoonKinematics:
-    """Joints that bring the spoon to a pose, near to those it has now and to a rest pose."""
+    """Inverse kinematics of the spoon; prefers joints near the present ones and a rest pose."""
 
     def __init__(self):
         self._model = scooping_model("robot", pieces=False)
@@ -67,9 +67,9 @@ class SpoonKinematics:
     def solve(
         self, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray | None = None, iterations: int = 40
     ) -> np.ndarray:
-        """Finds joints ``[7]`` (rad) at which the spoon has a position ``[3]`` (m) and its axes a rotation ``[3, 3]``.
+        """Finds joints ``[7]`` (rad) for a position ``[3]`` (m) and a rotation ``[3, 3]`` of the spoon.
 
-        It begins with ``joints``, by default the rest pose, and takes so many steps at most.
+        Starts at ``joints``, by default the rest pose, and takes at most ``iterations`` steps.
         """
         joints = (REST if joints is None else joints).copy()
         for _ in range(iterations):
@@ -90,7 +90,7 @@ class SpoonKinematics:
 
 
 class ScoopingExpert:
-    """The scooper of one episode; it acts, and sees the pieces and its spoon, in simulation ``row`` of a batch."""
+    """Expert of one episode; it acts in simulation ``row`` of a batch and reads pieces and spoon there."""
 
     embodiments = tuple(HABITS)
 
@@ -108,7 +108,7 @@ class ScoopingExpert:
         self.finished = False
 
     def _plan(self) -> list[tuple[np.ndarray, float]]:
-        """Way points of one attempt, each with the speed of the way to it (m/s)."""
+        """Returns the way points of one attempt, each with the speed towards it (m/s)."""
         draw, habits = self._generator, self.habits
         heading = habits.headings[self._start] + habits.heading_sigma * draw.standard_normal()
         ahead = np.array([math.cos(heading), math.sin(heading)])
@@ -139,12 +139,12 @@ class ScoopingExpert:
         ]
 
     def _frames(self) -> Iterator[bool]:
-        """Moves the spoon's pose by a frame, again and again, along the way points of attempt after attempt."""
+        """Moves the spoon's pose along the way points of all attempts, by a frame per iteration."""
         while not self.attempts or (self.attempts < 4 and not self.sims.success[self.row]):
             way = self._plan()
             for end, speed in way:
                 if end is way[-1][0] and self.attempts < 4 and not self.sims.pieces_on_spoon(self.row):
-                    break  # empty: once more
+                    break  # the spoon is empty: next attempt
                 begin = self._pose
                 length = np.linalg.norm(end[:3] - begin[:3]) + 0.06 * np.abs(end[3:] - begin[3:]).max()
                 steps = max(round(1.5 * length / (speed * self._hurry) * FRAME_HZ), 2)
@@ -154,11 +154,11 @@ class ScoopingExpert:
                     yield True
 
     def target(self) -> np.ndarray:
-        """Decides the targets of the next frame ``[nu]``: joints (rad), or place (m) and angles (rad) of the hand."""
+        """Returns targets of the next frame ``[nu]``: joints (rad), or position (m) and angles (rad) of the hand."""
         self.finished = not next(self._way, False)
         self._wander = 0.85 * self._wander + 0.53 * self.habits.wander * self._generator.standard_normal(3)
         pose = self._pose.copy()
-        free = np.clip((pose[2] - 0.03) / 0.1, 0, 1)  # careful in the bowl
+        free = np.clip((pose[2] - 0.03) / 0.1, 0, 1)  # small deviations in the bowl
         pose[:3] += np.array([0.3 + 0.7 * free, 0.3 + 0.7 * free, free]) * self._wander
         if self._arm is None:
             return pose
@@ -166,10 +166,10 @@ class ScoopingExpert:
 
 
 def start_episodes(sims: ScoopingSimulations, rows: np.ndarray, contexts: np.ndarray, arm: SpoonKinematics) -> None:
-    """Starts episodes where contexts ``[len(rows), bodies, 3]`` say.
+    """Starts episodes in contexts ``[len(rows), bodies, 3]``.
 
-    The first row of a context says where the spoon is, x, y (m), and how the pieces lie (rad); the second one, if there
-    is one, where the bowl stands.
+    The first row of a context holds the position of the spoon, x, y (m), and the layout of the pieces (rad); a second
+    row, if there is one, the position of the bowl.
     """
     positions = [np.array([x, y, START_HEIGHT]) for x, y in contexts[:, 0, :2]]
     if sims.embodiment == "hand":

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recording Scooping: camera frames of a robot with its joint targets, or of a hand without."""
+"""Records Scooping: camera frames of a robot with its joint targets, or of a hand without actions."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.tasks.scooping import CAMERA, EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE, STARTS, start_of
 
-AFTERWARDS = 12  # frames that are recorded after a success: a controller's labels end before its look-ahead does
+AFTERWARDS = 12  # frames after a success: labels of the last look-ahead steps cannot train a controller
 MAX_ATTEMPTS = 10
 
 
 @dataclass(frozen=True)
 class VideoReport:
-    """What a recording came to."""
+    """Counts of a recording."""
 
-    embodiment: str  # who was recorded
+    embodiment: str  # "robot" or "hand"
     episodes: int  # demonstrations that were kept
     attempts: int  # demonstrations that were played
-    frames: int  # of those that were kept
-    again: int  # how many of those scooped more than once
+    frames: int  # of the kept demonstrations
+    again: int  # number of kept demonstrations that scooped more than once
 
     def __str__(self) -> str:
         kept = f"{self.episodes} demonstrations by a {self.embodiment}, {self.frames} frames"
@@ -47,7 +47,7 @@ def _context_at(task: Task, start: int, generator: np.random.Generator) -> np.nd
 def _play(
     sims: ScoopingSimulations, expert: ScoopingExpert, renderer: Renderer, columns: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Frames uint8 ``[T + 1, H, W, 3]``, states ``[T + 1, d]`` and targets ``[T, nu]``; None without success."""
+    """Returns frames uint8 ``[T + 1, H, W, 3]``, states ``[T + 1, d]``, targets ``[T, nu]``; None without success."""
     frames, states, targets, after = [], [], [], 0
 
     def look() -> None:
@@ -79,9 +79,9 @@ def record_videos(
 ) -> VideoReport:
     """Records demonstrations of a ``"robot"``, or of a ``"hand"`` without actions, as a LeRobot data set with pictures.
 
-    They begin at the start positions in turn; one that does not succeed is played again, from another place. Robot and
-    hand never share a start. ``progress`` is called with the number of demonstrations recorded and wanted. A folder
-    that is not empty is refused.
+    They begin at the start positions in turn. A failed one is repeated from another place. Robot and hand never share a
+    start. ``progress`` is called with the number of demonstrations recorded and wanted. Raises an error if the folder
+    is not empty.
     """
     task = get_task(task)
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0)):

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scooping simulated: its scene, and batches of it with joint targets in, the spoon's pose and the pieces in it out.
+"""Simulates Scooping in batches: reads joint targets, returns the pose of the spoon and the pieces on it.
 
-The scene has a table, a bowl, free pieces, a camera, and what holds the spoon: a Panda of capsules, or a hand. All are
-primitive shapes, which cost little in software rendering; the arm only roughly has the outline of its meshes.
+The scene has a table, a bowl, free pieces, a camera, and a Panda made of capsules, or a hand, that holds the spoon. All
+are primitive shapes, which are fast in software rendering; the arm roughly has the outline of its meshes.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from torchrl_koap.tasks.scooping import (
 )
 
 TIMESTEP = 1 / 180
-SPOON_HALF = (0.025, 0.023)  # half its length and width inside (m)
+SPOON_HALF = (0.025, 0.023)  # half the inner length and width of the spoon (m)
 WALL = 0.011  # half the height of its walls (m)
-HANDLE = 0.17  # its length (m)
+HANDLE = 0.17  # length of the handle (m)
 _WHITE, _DARK = "0.93 0.93 0.93 1", "0.25 0.25 0.27 1"
 _SKIN, _SLEEVE, _STEEL = "0.85 0.6 0.48 1", "0.2 0.35 0.6 1", "0.2 0.55 0.85 1"
 
@@ -38,7 +38,7 @@ _SKIN, _SLEEVE, _STEEL = "0.85 0.6 0.48 1", "0.2 0.35 0.6 1", "0.2 0.55 0.85 1"
 def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.MjModel:
     """Compiles the scene of a ``"robot"``, a Panda of seven actuated joints, or a ``"hand"``, which moves freely.
 
-    The pieces' free joints come first, then those of what holds the spoon; the bowl is the only mocap body.
+    The pieces' free joints come first, then those of robot or hand; the bowl is the only mocap body.
     """
     holder, kinds = lookup({"robot": (_arm, _ARM_SERVO), "hand": (_hand, _HAND_SERVO)}, embodiment, "embodiment")
     motors = "".join(f'<position name="a{i}" joint="j{i}" kp="{kp}" kv="{kv}"/>' for i, (kp, kv) in enumerate(kinds, 1))
@@ -96,7 +96,7 @@ def _bowl() -> str:
 
 
 def _quat(yaw: float, pitch: float) -> str:
-    """Quaternion of a turn about z after one about y."""
+    """Returns the quaternion of a turn about y, then about z."""
     a, b, c, d = math.cos(yaw / 2), math.sin(yaw / 2), math.cos(pitch / 2), math.sin(pitch / 2)
     return f"{a * c:.6f} {-b * d:.6f} {a * d:.6f} {b * c:.6f}"
 
@@ -106,7 +106,7 @@ def _piece(index: int) -> str:
 
 
 def _spoon() -> str:
-    """A scoop open to the front (x); its origin is the middle of its floor, the handle rises from its back wall."""
+    """Returns a scoop open to the front (x); the origin is the middle of its floor, the handle rises at its back."""
     x, y = SPOON_HALF
     solid = f'class="tool" type="box" rgba="{_STEEL}"'
     return f"""
@@ -128,7 +128,7 @@ _CAPSULES: tuple[tuple[tuple, ...], ...] = (
     (((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)),
     (((0, 0, 0.0), (0, 0, 0.08), 0.045, False),),
 )
-# joints: stiffness (N m / rad) and damping; with the armature a servo of some 50 ms
+# joints: stiffness (N m / rad) and damping; with the armature, servos respond in some 50 ms
 _ARM_SERVO = ((1200, 80),) * 4 + ((500, 34),) * 3
 _HAND_SERVO = ((900, 60),) * 3 + ((12, 0.8),) * 3
 
@@ -149,7 +149,7 @@ def _arm() -> str:
             colour = _DARK if dark else _WHITE
             xml += f'<geom type="capsule" size="{radius}" fromto="{span}" rgba="{colour}" mass="0.8"/>'
         closing += "</body>"
-    # half a turn about x and the flange's eighth of a turn: the tool's x points ahead and its z up at the rest pose
+    # half a turn about x and the flange's eighth of a turn: at the rest pose the tool's x points ahead and z up
     place = f'pos="0 0 {FLANGE + HANDLE}" quat="0 0.923880 -0.382683 0"'
     return f'{xml}<body name="tool" {place} gravcomp="1">{_spoon()}</body>{closing}'
 
@@ -182,10 +182,10 @@ def _hand() -> str:
 
 TICKS = round(CONTROL_HZ / FRAME_HZ)  # commands per frame
 SUBSTEPS = round(1 / (CONTROL_HZ * TIMESTEP))  # per command
-OVER_RIM = RIM_HEIGHT + 0.05  # m; lower than that over the bowl, the spoon has reached over its rim
-LEFT_BOWL = RIM_HEIGHT + 0.04  # m; higher than that, the spoon has left the bowl
-HELD_TICKS = 6  # commands for which a piece has to stay on a spoon that has left the bowl
-_LAYOUTS, _SIDES = 6, 16  # settled layouts of the pieces; turns by which they can be laid
+OVER_RIM = RIM_HEIGHT + 0.05  # m; inside the rim and lower than this, the spoon has reached over the rim
+LEFT_BOWL = RIM_HEIGHT + 0.04  # m; higher than this, the spoon has left the bowl
+HELD_TICKS = 6  # commands for which a piece must stay on the spoon outside the bowl
+_LAYOUTS, _SIDES = 6, 16  # number of settled layouts of the pieces, and of rotations of each
 
 
 class ScoopingSimulations(Simulations):
@@ -212,7 +212,7 @@ class ScoopingSimulations(Simulations):
 
     @property
     def bowl_positions(self) -> np.ndarray:
-        """Where the bowls' centres stand ``[n, 2]``: x, y (m)."""
+        """Centres of the bowls ``[n, 2]``: x, y (m)."""
         return np.stack([data.mocap_pos[0, :2] for data in self.data])
 
     @property
@@ -230,8 +230,8 @@ class ScoopingSimulations(Simulations):
     def reset(self, rows: np.ndarray, joints: np.ndarray, turns, bowls: np.ndarray | None = None) -> None:
         """Starts episodes with ``joints [len(rows), nu]`` (rad; the hand's first three in m).
 
-        ``turns``, a number in -pi to pi each, decide where the pieces lie. ``bowls [len(rows), 2]`` say where the bowls
-        stand (m), by default all in the same place.
+        ``turns``, numbers in -pi to pi, select layout and rotation of the pieces. ``bowls [len(rows), 2]`` are the
+        positions of the bowls (m), by default all at the same place.
         """
         bank = settled_layouts()
         places = np.tile(BOWL, (len(rows), 1)) if bowls is None else bowls
@@ -251,7 +251,7 @@ class ScoopingSimulations(Simulations):
         self.held[rows] = 0
 
     def advance(self, rows: np.ndarray, targets: np.ndarray) -> None:
-        """Advances by one frame: the commands go from the last target to the new one ``[n, nu]`` in equal parts."""
+        """Advances by one frame; commands go in equal steps from the last target to the new one ``[n, nu]``."""
 
         def advance(piece: np.ndarray) -> None:
             for row in piece:
@@ -260,7 +260,7 @@ class ScoopingSimulations(Simulations):
                     data.ctrl[:] = begin + (targets[row] - begin) * tick / TICKS
                     mujoco.mj_step(self.model, data, SUBSTEPS)
                     self._assess(row, data)
-                mujoco.mj_kinematics(self.model, data)  # the spoon where the joints are now
+                mujoco.mj_kinematics(self.model, data)  # updates the spoon to the present joints
                 self.commands[row] = targets[row]
 
         self._run(advance, rows, TICKS * SUBSTEPS)
@@ -276,7 +276,7 @@ class ScoopingSimulations(Simulations):
 
 
 def _poses(data: mujoco.MjData) -> np.ndarray:
-    """Poses of the pieces ``[pieces, 7]``, which can be written."""
+    """Returns a writable view of the poses of the pieces ``[pieces, 7]``."""
     return data.qpos[: 7 * NUM_PIECES].reshape(NUM_PIECES, 7)
 
 
@@ -288,7 +288,7 @@ def _turned(layout: np.ndarray, angle: float) -> np.ndarray:
 
 @functools.cache
 def settled_layouts() -> np.ndarray:
-    """Returns pieces at rest in the bowl ``[layouts, pieces, 3]`` (m), always the same, dropped once per process."""
+    """Returns pieces at rest in the bowl ``[layouts, pieces, 3]`` (m), always the same; computed once per process."""
     model = scooping_model("hand")
     data = mujoco.MjData(model)
     layouts = []
