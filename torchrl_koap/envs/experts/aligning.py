@@ -1,17 +1,17 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scripted expert of Aligning: a joystick player that pushes the tray into the target pose, from inside or outside.
 
-The player picks the contact (a corner inside the tray, or a place on one of its walls) from which one smooth push leads
+The player picks the contact (a corner inside the tray, or a point on one of its walls) from which one smooth push leads
 to the target, and then
 
-    1. travels     with the rod above the tray to the place where it comes down
+    1. travels     with the rod above the tray to the place where it is lowered
     2. lowers      the rod, inside the tray (mode 0) or beside a wall (mode 1)
     3. pushes      and at every control step corrects the rest of the plan
-                   (:mod:`torchrl_koap.envs.experts.push_planning`) by what the tray has really done
-    4. lets go     when nothing more can be reached from this contact, and picks another one: through the middle of the
+                   (:mod:`torchrl_koap.envs.experts.push_planning`) by the observed motion of the tray
+    4. lets go     when this contact brings no more progress, and picks another one: through the middle of the
                    tray (mode 0), or over its walls (mode 1)
 
-From inside, a corner holds the rod best and serves for the way; the last few centimetres are pushed at a wall.
+From inside, a corner holds the rod best and is used for most of the way; the last centimetres are pushed at a wall.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from torchrl_koap.envs.experts.recording import Expert, ar1_noise
 SAFE_HEIGHT = 0.25  # TCP height (m) at which the rod passes over the walls
 PUSH_HEIGHT = (0.150, 0.130)  # inside, outside; the rod's tip is 0.12 m lower
 FULL_PUSH = 0.0095  # m per control step and axis
-SURGE = 0.0025  # m per control step by which the push changes from one step to the next
+SURGE = 0.0025  # m per control step; largest change of the push between steps
 _INSIDE, _OUTSIDE = 0, 1
 _WALL_CONE, _CORNER_CONE = math.radians(26), math.radians(68)
 _CORNERS = 20  # contacts from this one on are corners
-_REACH = (0.30, 0.75, -0.42, 0.60)  # where the rod may come down: x, x, y, y (m)
-_BETWEEN = np.array([0.36, 0.66, -0.28, 0.40])  # where the tray may lie on the way: x, x, y, y (m)
+_REACH = (0.30, 0.75, -0.42, 0.60)  # where the rod may be lowered: x, x, y, y (m)
+_BETWEEN = np.array([0.36, 0.66, -0.28, 0.40])  # where the tray may be on the way: x, x, y, y (m)
 _LEAST, _MOST = ((*_REACH[i::2], *_BETWEEN[i::2]) for i in (0, 1))
 _SWITCH_COST = 5.0
 _ROUND = 0.115  # distance of the rod from the centre on its way around the tray (m)
@@ -41,7 +41,7 @@ _HORIZON = 500  # control steps for which hand noise is drawn
 
 
 def _contacts() -> tuple[np.ndarray, np.ndarray]:
-    """Contacts inside (five on each wall, four corners) and outside (five on each wall), rows of eight numbers."""
+    """Returns contacts inside (five per wall, four corners) and outside (five per wall), rows of eight numbers."""
     inside, outside = [], []
     for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         for offset in (-0.024, -0.012, 0.0, 0.012, 0.024):
@@ -62,7 +62,7 @@ CONTACTS = _contacts()
 class AligningExpert(Expert):
     """Scripted expert of Aligning: pushes trays into their target poses from inside (mode 0) or outside (1).
 
-    It has finished when it has seen the tray in its place and let go.
+    It has finished when it has seen the tray in the target pose and released it.
     """
 
     TASK, most_rows = "aligning", 399
@@ -75,7 +75,7 @@ class AligningExpert(Expert):
         ]
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides changes of the commanded TCP position [n, 3] (m) under observations [n, 20]."""
+        """Returns changes of the commanded TCP position [n, 3] (m) for observations [n, 20]."""
         rows = zip(self._players, self._checked(observation), strict=True)
         actions = np.stack([player.act(row) for player, row in rows])
         self.finished[:] = [player.since_success > player.linger for player in self._players]
@@ -96,7 +96,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> float:
 
 
 class _Player:
-    """One episode: what is being done, with which contact and plan, and the habits drawn from the seed."""
+    """One episode: the present stage, contact and plan, and the habits drawn from the seed."""
 
     def __init__(self, mode: int, context: np.ndarray, generator: np.random.Generator):
         self.mode = mode
@@ -112,7 +112,7 @@ class _Player:
         self.settle = generator.integers(2, 6)
         self.linger = generator.integers(3, 7)
         self.height = PUSH_HEIGHT[mode] + generator.uniform(-0.004, 0.004)
-        self.slip = generator.normal(0.0, 0.002, 2)  # by which the rod comes down beside the intended place
+        self.slip = generator.normal(0.0, 0.002, 2)  # error of the place where the rod is lowered (m)
         self.wobble = ar1_noise(generator, 6, 0.00025, (_HORIZON, 2))
         self._choose(context[0], context[1], None)
 
@@ -132,7 +132,7 @@ class _Player:
         return self.action + np.append(shake, 0.0)
 
     def _choose(self, pose: np.ndarray, target: np.ndarray, rod: np.ndarray | None) -> None:
-        """Picks the contact with the best plan; a rod [2] already at the tray (its frame) prefers near contacts."""
+        """Picks the contact with the best plan; a rod [2] at the tray (in its frame) favours near contacts."""
         turn = (pose[2] - target[2] + math.pi) % (2 * math.pi) - math.pi
         far = _apart(pose, target) > 0.06 or abs(turn) > 0.6
         contacts, least = CONTACTS[self.mode], math.inf
@@ -164,7 +164,7 @@ class _Player:
         return self.pose[:2] + _turned(point, self.pose[2])
 
     def _entry(self) -> np.ndarray:
-        """Where the rod comes down: inside a little before the contact, outside 22 mm off the wall."""
+        """Returns where the rod is lowered: inside, shortly before the contact; outside, 22 mm off the wall."""
         rod = self.contact[4:6]
         if self.mode == _INSIDE:
             return self._in_world(0.35 * rod + self.slip)
@@ -201,7 +201,7 @@ class _Player:
         ahead = _turned(motion(contact, share)[3:], self.pose[2])
         angle = contact[2] + contact[3] * share + self.pose[2]
         speed = min(0.008, 0.002 + 0.1 * length) * self.pace
-        # the arm follows 1.6 control steps late, and gives way by 8 mm under the force that moves the tray
+        # the arm lags by 1.6 control steps, and yields by 8 mm to the force that moves the tray
         hold = self._in_world(anchor) + 1.6 * speed * ahead - self.command[:2]
         hold += 0.008 * np.array([math.cos(angle), math.sin(angle)])
         along = float(hold[0] * ahead[0] + hold[1] * ahead[1])
@@ -210,7 +210,7 @@ class _Player:
         return np.append(self.command[:2] + step, self.height), 0.010
 
     def _felt_contact(self, rod: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The contact where the rod really is along the wall, and the place that the hand holds on to."""
+        """Returns the contact at the rod's real place along the wall, and the anchor that the hand steers to."""
         contact, anchor = self.contact.copy(), self.contact[4:6].copy()
         normal = np.array([math.cos(contact[2]), math.sin(contact[2])])
         along = np.array([-normal[1], normal[0]])
@@ -224,7 +224,7 @@ class _Player:
         return contact, anchor
 
     def _assess(self, rod: np.ndarray, length: float) -> None:
-        """Ends a push that has done what it could: its way is over, the tray rests, or the way grows again."""
+        """Ends a push that makes no more progress: its way is over, the tray rests, or the way grows again."""
         self.progress = 0.9 * self.progress + 0.1 * float(np.abs(self.pose - self.last_pose).sum())
         self.last_pose, self.shortest, self.started = self.pose, min(self.shortest, length), True
         self.stuck += 3 * (length < 0.006) + (self.progress < 2e-4)
@@ -239,7 +239,7 @@ class _Player:
             self.doing = self._let_go
 
     def _behind(self, rod: np.ndarray) -> float:
-        """How far the rod stands behind the tray's centre, along the push (m)."""
+        """Returns how far the rod is behind the tray's centre, along the push (m)."""
         return -(rod[0] * math.cos(self.contact[2]) + rod[1] * math.sin(self.contact[2]))
 
     def _let_go(self) -> tuple[np.ndarray, float]:

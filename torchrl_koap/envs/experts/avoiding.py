@@ -1,13 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scripted expert of Avoiding: a simulated joystick player that takes any of the 24 ways to the finish line.
 
-The player is modelled after the human demonstrators: pauses, pushes that are held and let go, saturation at full
+The player is modelled after the human demonstrators: pauses, pushes that are held and released, saturation at full
 deflection, and a dead zone. In one control step it
 
-    1. looks       at the measured position of a moment ago, adds what it has pushed since, and errs by some millimetres
-    2. decides     sideways: push towards the gap of the next row, hold, let go when there;
+    1. looks       at a measured position with a delay, adds its pushes since, and errs by some millimetres
+    2. decides     sideways: push towards the gap of the next row, hold, release when there;
                    forwards: at cruising speed, slower or not at all while the gap would come too early;
-                   and takes back whatever would run into a cylinder
+                   removes whatever would hit a cylinder
     3. moves the   stick, whose deflection follows the decision over about five control steps, with a slowly
        stick       drifting hand
 """
@@ -32,15 +32,15 @@ GAPS = (
     ((0.262, 0.304), (0.412, 0.440), (0.552, 0.588), (0.700, 0.735)),
 )
 _ROBOT_LAG = 3  # control steps by which the measured position follows the command
-_GLANCE = 4  # control steps between an event and the player's picture of it
+_GLANCE = 4  # control steps after which the player sees an event
 _MEMORY = 12
 _HORIZON = 300  # control steps for which hand noise is drawn
 
 
-# weights [13] by which the deflection follows the decisions of the last steps; rings a little, like a hand
+# weights [13] of the last decisions in the deflection; overshoots a little, like a hand
 _RING = np.sinc(np.arange(-6, 7) / 3.6) * np.hanning(17)[2:-2]
 _HAND = _RING / _RING.sum()
-_HAND_REST = 1 - np.cumsum(_HAND)  # share of a decision that is still to come after so many steps
+_HAND_REST = 1 - np.cumsum(_HAND)  # share of a decision that remains after each step
 
 
 def mode_gaps(mode: int) -> tuple[int, int, int]:
@@ -49,7 +49,7 @@ def mode_gaps(mode: int) -> tuple[int, int, int]:
 
 
 class AvoidingExpert(Expert):
-    """Scripted expert of Avoiding; it has finished when it has let go after the finish line."""
+    """Scripted expert of Avoiding; it has finished when it has released the stick behind the finish line."""
 
     # the human demonstrations have at most 104 rows and pass the cylinders at 3 mm or more
     TASK, most_rows, least_clearance = "avoiding", 120, 0.003
@@ -60,33 +60,33 @@ class AvoidingExpert(Expert):
         self._habits = SimpleNamespace(**{name: np.stack([each[name] for each in drawn]) for name in drawn[0]})
         count = len(modes)
         self._time = 0
-        self._row = np.zeros(count, dtype=np.int64)  # the row whose gap is aimed at; 3 behind the last one
+        self._row = np.zeros(count, dtype=np.int64)  # index of the next row; 3 after the last one
         self._forward = self._habits.cruise[:, 0].copy()  # forwards push that is held
         self._blocked = np.zeros(count, dtype=bool)  # a cylinder was straight ahead
         self._side = np.zeros(count)  # sideways push that is held, m per step
-        self._crossed = np.full(count, -1)  # time at which the finish line was seen crossed
+        self._crossed = np.full(count, -1)  # time at which the player saw the finish line crossed
         self._decisions = np.zeros((count, len(_HAND), 2))  # latest first
         self._commanded: np.ndarray | None = None
         self._measured: np.ndarray | None = None
 
     def touching(self, env: Any) -> np.ndarray:
-        """Where the rod touches a cylinder, bool [n]."""
+        """Returns which rods touch a cylinder, bool [n]."""
         return env.obstacle_contacts().any(1)
 
     @staticmethod
     def clearance(frames: np.ndarray) -> float:
-        """Least distance of a recording ``[T, 4]`` between the rod, taken as upright, and any cylinder (m)."""
+        """Returns the least distance of the rod, taken as upright, from any cylinder in a recording ``[T, 4]`` (m)."""
         path = frames[:, 2:]
         gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
         return min(gaps) - ROD_RADIUS
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides changes of the commanded xy [n, 2] (m) under observations [n, 4]."""
+        """Returns changes of the commanded xy [n, 2] (m) for observations [n, 4]."""
         observation = self._checked(observation)
         seen = self._look(observation)
         decision = self._decide(seen, observation[:, 3])
         self._decisions = np.concatenate([decision[:, None], self._decisions[:, :-1]], axis=1)
-        if self._time == 0:  # some had begun to push before the recording started
+        if self._time == 0:  # some players push before the recording starts
             begun = np.arange(len(_HAND)) <= self._habits.head_start[:, None]
             self._decisions = np.where(begun[..., None], decision[:, None], 0.0)
         push = np.einsum("nkd,k->nd", self._decisions, _HAND) + self._habits.tremor[:, self._time % _HORIZON]
@@ -95,7 +95,7 @@ class AvoidingExpert(Expert):
         return push
 
     def _look(self, observation: np.ndarray) -> np.ndarray:
-        """Where the player believes the command would come to rest if the stick were let go now, [n, 2]."""
+        """Estimates where the command would stop if the player released the stick at once, [n, 2]."""
         commanded, measured = observation[:, :2], observation[:, 2:]
         if self._commanded is None:
             self._commanded = np.repeat(commanded[:, None], _MEMORY, axis=1)
@@ -138,7 +138,7 @@ class AvoidingExpert(Expert):
         return np.where((self._time < self._habits.pause)[:, None], 0.0, decision)
 
     def _may_go_on(self, x: np.ndarray) -> np.ndarray:
-        """Whether the gap is reached with a push that may go on: it is the open side, and the next gap lies there."""
+        """Returns whether the gap is reached and the push may continue, to an open side where the next gap lies."""
         count = np.arange(len(x))
         following = self._habits.gap_x[count, np.minimum(self._row + 1, 3)] - x
         direction = np.sign(self._side)
@@ -147,7 +147,7 @@ class AvoidingExpert(Expert):
         return reached & open_side & (direction != 0) & (following * direction > 0.02) & (self._row < 2)
 
     def _push_sideways(self, way: np.ndarray, steps: np.ndarray, count: np.ndarray) -> None:
-        """Begins, hardens and ends the sideways push, given the way to the gap and the steps left until its row."""
+        """Begins, strengthens and ends the sideways push, given the way to the gap and the steps left until its row."""
         holding = self._side != 0
         there = way * np.sign(self._side) < self._habits.tolerance[count, self._row] * 0.3
         self._side[holding & there] = 0.0
@@ -163,7 +163,7 @@ class AvoidingExpert(Expert):
         self._side[self._time < self._habits.side_pause] = 0.0
 
     def _avoid(self, seen: np.ndarray, decision: np.ndarray, cruise: np.ndarray) -> np.ndarray:
-        """Takes back the part of a decision that would run into a cylinder within the next steps."""
+        """Removes the part of a decision that would hit a cylinder within the next steps."""
         margin = self._habits.margin + self._habits.caution * np.abs(decision[:, 0]) / FULL_PUSH
         self._blocked[:] = False
         ahead = np.arange(1, 5)[None, :, None] * decision[:, None] + seen[:, None]  # [n, 4, 2]
@@ -184,12 +184,12 @@ class AvoidingExpert(Expert):
 
 
 def _draw(mode: int, generator: np.random.Generator) -> dict[str, Any]:
-    """Habits and slips of one episode: everything that is random about it (m and control steps).
+    """Draws the habits and errors of one episode, all that is random about it (m and control steps).
 
-    ``gap_x`` is aimed at in each row (entry 3: behind the last one), reached ``gate`` before the row; the next gap
-    counts once the row is ``release`` behind. ``tolerance``, ``haste``, ``patience``, ``creep`` and ``ease`` shape the
+    ``gap_x`` is the goal in each row (entry 3: after the last one), to be reached ``gate`` before the row; the next gap
+    becomes the goal ``release`` after the row. ``tolerance``, ``haste``, ``patience``, ``creep`` and ``ease`` shape the
     pushes; ``margin`` (``+ caution`` at full sideways push) is the distance kept from cylinders; ``attention`` is the
-    weight of what is seen of the robot against what was pushed; series over time are drifting noise.
+    weight of the observed against the commanded position; series over time are drifting noise.
     """
     uniform, normal = generator.uniform, generator.normal
     gaps = [GAPS[row][gap] for row, gap in enumerate(mode_gaps(mode))]

@@ -1,15 +1,15 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recording demonstrations: scripted experts play the library's own environments, in batches of bounded size.
+"""Records demonstrations of scripted experts in the library's own environments, in batches of bounded size.
 
-An attempt that touches what it must not, takes another mode than asked for, does not finish, or is unlike any human one
-(all but touches, takes too long) is played again with other random draws, after four attempts from another context;
-nothing else is selected, and every discarded attempt is counted in the report.
+An attempt is discarded if it touches a forbidden body, takes another mode than asked for, does not finish, or is unlike
+any human one (passes too near, takes too long). It is repeated with other random draws, after four attempts in another
+context. Nothing else is selected; the report counts every discarded attempt.
 
-A recording into a folder writes every demonstration as it comes, and goes on after an interruption::
+A recording into a folder saves each demonstration when it is done, and continues after an interruption::
 
     folder/
       ted/          all demonstrations as one data set (see torchrl_koap.data.ted)
-      unfinished/   while recording: what was asked for, and a file for every demonstration so far
+      unfinished/   while recording: the request, and a file for every demonstration so far
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from torchrl_koap.files import one_at_a_time, replacing_file
 from torchrl_koap.tasks import Task, get_task
 
 MAX_ATTEMPTS = 20
-BATCH_SIZE = 50  # episodes that are played at once: few enough that the first are over within seconds
+BATCH_SIZE = 50  # parallel episodes; few enough that the first end within seconds
 _PER_CONTEXT = 4  # attempts before an episode gets another context
-_CONTEXT_STREAM = 1  # keeps the draws of contexts apart from those of the players
+_CONTEXT_STREAM = 1  # random stream of contexts, separate from those of the experts
 
 
 class RecordingError(RuntimeError):
-    """An episode whose expert failed in every attempt."""
+    """Raised if an expert fails in every attempt at an episode."""
 
 
 class Take(NamedTuple):
@@ -53,20 +53,20 @@ class Take(NamedTuple):
     number: int
     frames: np.ndarray  # [T, obs]
     actions: np.ndarray  # [T - 1, act]
-    # its mode, its rows (control steps), the attempts that it took, failures (discarded attempts by reason), whether it
-    # was disturbed, and spells: the disturbances of the attempt that was kept
+    # mode, rows (control steps), attempts, failures (discarded attempts by reason), disturbed (bool), and spells (the
+    # disturbances of the attempt that was kept)
     log: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class RecordingReport:
-    """What was recorded, and what it took."""
+    """The demonstrations of a recording, the discarded attempts and the time that it took."""
 
     task: Task
     seed: int
     logs: Sequence[Mapping[str, Any]]  # of each demonstration, in their order
     seconds: float  # of wall-clock time
-    disturbance: float  # share of the demonstrations that was to be disturbed
+    disturbance: float  # requested share of disturbed demonstrations
 
     def each(self, fact: str) -> list[Any]:
         """Returns one fact of every demonstration, such as ``"mode"`` or ``"rows"``."""
@@ -74,7 +74,7 @@ class RecordingReport:
 
     @property
     def notes(self) -> dict[str, Any]:
-        """What ``about.json`` says of the recording. Disturbances are told only where there are any."""
+        """Entries of the recording in ``about.json``; disturbances only if there are any."""
         discarded = {name: sum(counts.get(name, 0) for counts in self.each("failures")) for name in FAULTS}
         notes = {"seed": self.seed, "modes": self.each("mode"), "attempts": self.each("attempts")}
         notes["discarded_attempts"] = discarded
@@ -93,7 +93,7 @@ class RecordingReport:
             chosen = [log["attempts"] for log in self.logs if log["disturbed"]]
             kinds = Counter(kind for spells in self.each("spells") for *_, kind in spells)
             kept = ", ".join(f"{kinds[kind]} {kind}" for kind in KINDS)
-            said += f"; {len(chosen)} disturbed ({kept}), of which the operator recovered in"
+            said += f"; {len(chosen)} disturbed ({kept}), from which the operator recovered in"
             said += f" {len(chosen)} of {sum(chosen)} attempts"
         return said
 
@@ -129,16 +129,16 @@ def iterate_takes(
     disturbance: float | None = None,
     done: Collection[int] = (),
 ) -> Iterator[Take]:
-    """Plays demonstrations one after the other, in their order; memory holds no more than a batch of them.
+    """Plays demonstrations and yields them in order; memory holds no more than a batch of them.
 
-    The modes of the task are balanced: with 24 modes, 96 episodes are four of each; a remainder goes to modes that the
-    seed chooses. Same seed, same demonstrations, whatever ``num_threads`` and ``batch_size``. ``progress`` is told the
-    numbers of demonstrations recorded and wanted; those whose numbers are ``done`` are left out. ``disturbance`` is the
-    share of the demonstrations in which the operator is disturbed, by default the task's.
+    The modes of the task are balanced: with 24 modes, 96 episodes are four of each; the seed chooses modes for a
+    remainder. Demonstrations depend on the seed, not on ``num_threads`` and ``batch_size``. ``progress`` is called with
+    the numbers of demonstrations recorded and wanted. Numbers in ``done`` are left out. ``disturbance`` is the share of
+    demonstrations with a disturbed operator, by default the task's.
 
     Raises:
         ValueError: if the task is unknown or has no expert, or a number is out of range.
-        RecordingError: if an episode fails again and again; it names the expert and the last failure.
+        RecordingError: if an episode fails in every attempt; it names the expert and the last failure.
     """
     task = get_task(task)
     disturbance = _share(task, disturbance)
@@ -179,7 +179,7 @@ def _play_batches(
     size, shown = min(batch_size, len(left)), 0
     env = make_env(task, size, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
 
-    def show(found: int, over: int) -> None:  # attempts that turn out bad are played again: the bar waits for them
+    def show(found: int, over: int) -> None:  # the bar waits while discarded attempts are repeated
         nonlocal shown
         shown = max(shown, found + over)
         if progress is not None:
@@ -187,7 +187,7 @@ def _play_batches(
 
     @functools.cache
     def contexts_of(attempt: int) -> np.ndarray | None:
-        """Drawn for all episodes, so that none depends on how many are played at once."""
+        """Draws contexts of all episodes, so that none depends on the batch size."""
         if not task.bodies:
             return None
         return draw_contexts(task, len(modes), np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
@@ -203,7 +203,7 @@ def _play_batches(
                 seeds = [(seed, row, attempt) for row in rows]
                 hand = Disturbances(task, seeds, disturbed[rows]) if disturbed[rows].any() else None
                 drawn = np.random.SeedSequence(seeds[0]).generate_state(1)
-                env.set_seed(int(drawn[0]))  # for all that the environment draws itself
+                env.set_seed(int(drawn[0]))  # for the environment's own random numbers
                 results = play(
                     env,
                     task,
@@ -238,7 +238,7 @@ def _play_batches(
 
 
 def _within(spells: Sequence[tuple[int, int, str]], found: Attempt) -> tuple[tuple[int, int, str], ...]:
-    """Disturbances in steps of the data: in D3IL's log the first row is the state after the first control step."""
+    """Returns disturbances in steps of the data; D3IL's log begins with the state after the first control step."""
     last = len(found.actions)
     shift = found.steps - last
     moved = [(max(begin - shift, 0), min(end - shift, last), kind) for begin, end, kind in spells]
@@ -255,16 +255,16 @@ def record_to_folder(
     disturbance: float | None = None,
     **options: Any,
 ) -> RecordingReport:
-    """Records demonstrations into a folder; called again with the same arguments, it goes on where it was interrupted.
+    """Records demonstrations into a folder; a call with the same arguments continues an interrupted recording.
 
-    Arguments are those of :func:`iterate_takes`. A folder that holds
-    demonstrations already, or other unfinished ones, or that another process records into, is refused.
+    Arguments are those of :func:`iterate_takes`. Raises an error if the folder holds demonstrations or an interrupted
+    recording with other arguments, or if another process records into it.
     """
     start, disturbance = time.perf_counter(), _share(task, disturbance)
     task = get_task(task.source)
     request = {"task": task.name, "episodes": episodes, "seed": seed, "disturbance": disturbance}
     iterating = functools.partial(iterate_takes, task, episodes, seed, disturbance=disturbance, **options)
-    iterating()  # looks at the arguments before anything is written
+    iterating()  # checks the arguments before anything is written
     ted, unfinished = Path(folder) / "ted", Path(folder) / "unfinished"
     begun, files = unfinished / "request.json", [unfinished / f"{number:05d}.npz" for number in range(episodes)]
     check_new(folder)
@@ -272,8 +272,8 @@ def record_to_folder(
     other = [f"{key} {there.get(key)!r}, not {value!r}" for key, value in request.items() if there.get(key) != value]
     if other:
         raise FileExistsError(
-            f"{unfinished} holds an interrupted recording with {', '.join(other)}: ask for the same to go on, or remove"
-            " it"
+            f"{unfinished} holds an interrupted recording with {', '.join(other)}: continue with the same arguments, or"
+            " remove it"
         )
     with one_at_a_time(unfinished / ".lock", busy=f"another process records into {folder}"):
         with replacing_file(begun) as aside:
@@ -297,5 +297,5 @@ def record_to_folder(
 
 
 def _share(task: Task, asked: float | None) -> float:
-    """The share of the demonstrations in which the operator is disturbed: the task's if none is asked for."""
+    """Returns the share of demonstrations with a disturbed operator, by default the task's."""
     return task.defaults.disturbance if asked is None else asked

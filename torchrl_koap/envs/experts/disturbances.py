@@ -1,14 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Disturbances while a scripted operator plays, so that demonstrations show how mistakes are corrected.
+"""Disturbs scripted operators, so that demonstrations show how mistakes are corrected.
 
 After Laskey et al., "DART: Noise Injection for Robust Imitation Learning", 2017. A disturbed step changes the command
-that is executed, and that command is what the recording holds::
+that is executed and recorded. Kinds of disturbances, for several control steps each::
 
-    impulse      for a few control steps the command is pushed in a direction of its own
-    slip         for a while the command runs off to the side of the way that the operator wants
-    late_turn    for a while the operator goes on as it did before
-    drift        for a while the height of a tool that is pushed about sinks or rises unnoticed, where an action
-                 commands it
+    impulse      the command is pushed in a random direction
+    slip         the command turns to one side of the operator's direction
+    late_turn    the operator repeats its previous action
+    drift        a tool on the table slowly sinks or rises, if an action commands its height
 """
 
 from __future__ import annotations
@@ -21,28 +20,28 @@ from torchrl_koap.tasks import Task
 
 KINDS = ("impulse", "slip", "late_turn", "drift")
 _SIDEWAYS = KINDS[:3]
-_STREAM, _CHOICE_STREAM, _HEIGHT_STREAM = 2, 3, 4  # keep these draws apart from those of players and contexts
-_QUIET, _MEAN_GAP = 12, 45  # control steps from one disturbance to the next: at least, and on average beyond that
-# control steps that one lasts, low and high end
+_STREAM, _CHOICE_STREAM, _HEIGHT_STREAM = 2, 3, 4  # random streams, separate from those of experts and contexts
+_QUIET, _MEAN_GAP = 12, 45  # control steps to the next disturbance: minimum, and mean of what is added
+# duration in control steps, low and high end
 _STEPS = {"impulse": (2, 6), "slip": (4, 11), "late_turn": (4, 11), "drift": (4, 11)}
-_SLIP = (0.6, 1.4)  # rad
-_DRIFT = (0.1, 0.35)  # of the size of the operator's own steps
-_MEMORY = 0.98  # of the size of the operator's own steps
+_SLIP = (0.6, 1.4)  # angle (rad)
+_DRIFT = (0.1, 0.35)  # speed, as a share of the operator's step size
+_MEMORY = 0.98  # decay of the operator's step size per control step
 
 
 def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
-    """Draws which episodes of a recording are disturbed, bool ``[episodes]``; none depends on how many there are."""
+    """Draws which episodes are disturbed, bool ``[episodes]``; a draw does not depend on their number."""
     if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 <= share <= 1:
-        raise ValueError(f"disturbance must be the share of the episodes that are disturbed, 0 to 1, got {share!r}")
+        raise ValueError(f"disturbance must be the share of disturbed episodes, 0 to 1, got {share!r}")
     return np.random.default_rng((seed, _CHOICE_STREAM)).random(episodes) < share
 
 
 class Disturbances:
-    """Disturbs the actions of a batch of operators, by amounts that follow from the operator's own steps so far.
+    """Disturbs the actions of a batch of operators, in proportion to the operator's own steps so far.
 
-    Entries that are no change of a command (the gripper) are left alone. The height of a tool that is pushed about only
-    drifts: where demonstrations never lift it, nothing tells a controller how that is done. Every episode has a seed, a
-    tuple of integers, and is ``disturbed`` or left as it is.
+    Actions that are no change of a command (the gripper) stay the same. The height of a tool on the table only drifts;
+    from demonstrations that never lift the tool, a controller could not learn to lift it. Every episode has a seed, a
+    tuple of integers, and a flag in ``disturbed``.
     """
 
     def __init__(self, task: Task, seeds: Sequence, disturbed: Sequence[bool]):
@@ -52,18 +51,18 @@ class Disturbances:
         ]
 
     def disturb(self, action: np.ndarray) -> np.ndarray:
-        """Returns the actions ``[n, act]`` that are executed where the operators want ``action`` ``[n, act]``."""
+        """Returns the actions ``[n, act]`` that are executed in place of the operators' ``action`` ``[n, act]``."""
         rows = zip(self._hands, action, strict=True)
         return np.stack([wanted if hand is None else hand.disturb(wanted) for hand, wanted in rows])
 
     @property
     def spells(self) -> list[list[tuple[int, int, str]]]:
-        """Of every episode so far the disturbances: first control step, the one after the last, kind."""
+        """Disturbances of every episode so far: first control step, the one after the last, kind."""
         return [[] if hand is None else sorted(hand.spells) for hand in self._hands]
 
 
 def disturbed_columns(task: Task) -> np.ndarray:
-    """Returns the action columns that are disturbed: changes of a command, of a tool on the table only sideways."""
+    """Returns the disturbed action columns: changes of a command, for a tool on the table only sideways ones."""
     changes = task.delta_actions
     if not changes:
         raise ValueError(f"task {task.name!r} has no action that is a change of a command: nothing can be disturbed")
@@ -72,20 +71,20 @@ def disturbed_columns(task: Task) -> np.ndarray:
 
 
 def height_column(task: Task) -> int | None:
-    """Returns the action column that changes the height of a tool on the table, None where none does."""
+    """Returns the action column that changes the height of a tool on the table; None if there is none."""
     lengths = [index for index, unit in enumerate(task.action_units) if unit == "m"]
     return lengths[2] if len(lengths) == 3 and list(disturbed_columns(task)) == lengths[:2] else None
 
 
 def _spell(now: int, draw: np.random.Generator, kinds: Sequence[str]) -> tuple[int, int, str]:
-    """The next disturbance: first control step, the one after the last, kind."""
+    """Draws the next disturbance: first control step, the one after the last, kind."""
     start = now + _QUIET + int(draw.exponential(_MEAN_GAP))
     kind = kinds[draw.integers(len(kinds))]
     return start, start + int(draw.integers(*_STEPS[kind])), kind
 
 
 class _Hand:
-    """One episode: what is disturbed sideways, and how the height drifts besides."""
+    """Disturbances of one episode: sideways ones, and drifts of the height."""
 
     def __init__(self, seed: tuple[int, ...], columns: np.ndarray, height: int | None):
         self._columns, self._height, self._width = columns, height, len(columns)
@@ -132,7 +131,7 @@ class _Hand:
         return done
 
     def _slip(self, wanted: np.ndarray) -> np.ndarray:
-        if self._width != 2:  # no one side to run off to: a push that grows with the speed
+        if self._width != 2:  # no unique sideways direction: a push in proportion to the speed
             return wanted + 0.5 * np.linalg.norm(wanted) * self._share
         c, s = np.cos(self._turn), np.sin(self._turn)
         return np.array([c * wanted[0] - s * wanted[1], s * wanted[0] + c * wanted[1]])

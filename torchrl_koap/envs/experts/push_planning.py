@@ -14,8 +14,8 @@ A *contact* is a row of eight numbers: ``x, y`` of the touched point, direction 
 friction cone, half width of the cone (rad), ``x, y`` of the rod's axis, ``a``, ``delta``; lengths in m, all in the
 tray's frame. A *plan* ``[4]`` for a contact holds the slant of the force against the middle of its cone at the
 beginning, in the middle and at the end of the way (as ``atanh`` of its share of the half width), and the logarithm of
-the length of the rod's way (m). ``pose`` and ``target`` are where the tray lies now and shall come to lie, ``[3]``:
-x, y (m), yaw (rad).
+the length of the rod's way (m). ``pose`` and ``target`` are the present and the wanted pose of the tray, ``[3]``: x, y
+(m), yaw (rad).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LENGTH = KNOTS  # column of a plan
 PLAN_SIZE = KNOTS + 1
 _PIECES = 16
 _POSITION_UNIT, _ANGLE_UNIT = 0.004, math.radians(3.0)  # errors at the end of a plan that cost 1
-_SLANT_COST = np.array([0.75, 1.0, 1.9])  # late slants cost more: they leave nothing to correct with
+_SLANT_COST = np.array([0.75, 1.0, 1.9])  # late slants cost more: they leave no room for corrections
 _BEND_COST, _LENGTH_COST = 0.25, 16.0
 _RESIDUALS = 3 + KNOTS + (KNOTS - 1) + 1
 _STEEPEST = 2.5
@@ -90,9 +90,9 @@ def _residuals(pose, target, contact, plan, out):
 
 @njit(cache=True)
 def improve(pose, target, contact, plan, iterations):
-    """Betters a plan in place by so many damped Gauss-Newton steps, and returns its cost.
+    """Improves a plan in place by damped Gauss-Newton steps, and returns its cost.
 
-    That is squared errors at its end (4 mm and 3 deg cost 1 each), slants, bends and length.
+    The cost adds squared errors at its end (4 mm and 3 deg cost 1 each), slants, bends and length.
     """
     base, other = np.empty(_RESIDUALS), np.empty(_RESIDUALS)
     jacobian = np.empty((_RESIDUALS, PLAN_SIZE))
@@ -157,7 +157,7 @@ def two_pushes(pose, target, contacts, bounds, aim):
     """Looks for a first push after which a second one, from another contact, leads straight to the target.
 
     The pose between the pushes, within ``bounds`` [4] (least and greatest x, y; m), is written into ``aim`` [3].
-    Returned are the least cost of both pushes, and the index of the first of ``contacts`` [C, 8].
+    Returns the least cost of both pushes, and the index of the first of ``contacts`` [C, 8].
     """
     least, best = 1e300, 0
     plan = np.empty(PLAN_SIZE)

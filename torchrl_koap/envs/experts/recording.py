@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""One attempt of a scripted expert at a batch of episodes, and what is kept of it.
+"""Plays one attempt of a scripted expert at a batch of episodes, and records it.
 
-An environment of D3IL's is recorded as D3IL's recorder does it: after the first substep of a control step, so that
-positions are 1 ms newer than those that were observed. Any other one is recorded as what it observed and what was done.
+D3IL's environments are recorded as by D3IL's recorder: after the first substep of a control step, so that positions are
+1 ms newer than the observed ones. Of other environments, observations and actions are recorded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task, get_task
 
-FAULTS = {  # why an attempt is discarded; of several the first one is told
+FAULTS = {  # reasons to discard an attempt; the first that applies is reported
     "collision": "something forbidden was touched",
     "unfinished": "no success within the step limit",
     "mode": "success in another mode than asked for",
@@ -31,34 +31,34 @@ FAULTS = {  # why an attempt is discarded; of several the first one is told
 
 
 class Attempt(NamedTuple):
-    """What is kept of one attempt."""
+    """The recorded data of one attempt."""
 
     frames: np.ndarray  # [T, obs]
     actions: np.ndarray  # [T - 1, act]
-    steps: int  # played; one more than actions in D3IL's log, whose first row is the state after the first of them
+    steps: int  # control steps; one more than actions in D3IL's log, which begins with the state after the first one
     fault: str = ""  # what went wrong, one of FAULTS; empty if nothing did
 
 
 class Expert(abc.ABC):
-    """Plays a batch of ``n`` episodes of a task; a subclass is named by ``Task.expert``.
+    """Plays a batch of ``n`` episodes of a task; ``Task.expert`` names the subclass.
 
     Each episode has a mode and a seed, an integer or a sequence of integers as for ``numpy.random.default_rng``; in a
-    task with bodies also a context ``[bodies, 3]``: x, y (m), yaw (rad). All that is random about it comes from its
-    seed, so it does not depend on the others of the batch.
+    task with bodies also a context ``[bodies, 3]``: x, y (m), yaw (rad). Its random numbers come from its seed only,
+    so it does not depend on the rest of the batch.
 
     Raises:
         ValueError: if a mode does not exist, or the numbers of modes, seeds and contexts differ.
     """
 
     TASK: str  # name of the task
-    embodiments: tuple[str, ...] = ()  # of demonstrations before a camera
-    # which recordings are discarded besides those without success or in another mode than asked for
-    most_rows: int | None = None  # those of more control steps
-    least_clearance = 0.0  # those that come nearer to what must not be touched (m)
+    embodiments: tuple[str, ...] = ()  # of demonstrations in view of a camera
+    # recordings beyond these limits are discarded, like those without success or in another mode than asked for
+    most_rows: int | None = None  # largest number of control steps
+    least_clearance = 0.0  # smallest distance from forbidden bodies (m)
 
     def __init__(self, modes: Sequence[int], contexts: np.ndarray | None, seeds: Sequence):
         self.task, shape = get_task(self.TASK), np.shape(contexts)
-        self.finished = np.zeros(len(modes), dtype=bool)  # which episodes are over for the expert
+        self.finished = np.zeros(len(modes), dtype=bool)  # episodes that the expert has ended
         wanted = (len(modes), len(self.task.objects), 3) if self.task.objects else ()
         if not len(modes) or len(modes) != len(seeds) or shape != wanted:
             raise ValueError(
@@ -71,19 +71,19 @@ class Expert(abc.ABC):
 
     @abc.abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step."""
+        """Returns actions ``[n, act]`` for observations, float64 ``[n, obs]``; called once per control step."""
 
     def touching(self, env: Any) -> np.ndarray:
-        """Where something forbidden is touched in an environment, bool ``[n]``."""
+        """Returns which episodes touch a forbidden body, bool ``[n]``."""
         return np.zeros(env.batch_size[0], dtype=bool)
 
     @staticmethod
     def clearance(frames: np.ndarray) -> float:
-        """Least distance of a recording ``[T, obs]`` to what must not be touched (m)."""
+        """Returns the least distance of a recording ``[T, obs]`` from forbidden bodies (m)."""
         return np.inf
 
     def _checked(self, observation: np.ndarray) -> np.ndarray:
-        """The observations in float64; refused if they are not ``[n, obs]``."""
+        """Returns observations in float64; raises a ValueError if they are not ``[n, obs]``."""
         observation = np.asarray(observation, dtype=np.float64)
         wanted = (len(self.finished), self.task.observation_dim)
         if observation.shape != wanted:
@@ -94,9 +94,9 @@ class Expert(abc.ABC):
 def ar1_noise(
     generator: np.random.Generator, memory: float, deviation: float, size: int | tuple[int, ...]
 ) -> np.ndarray:
-    """Draws a drifting hand: noise ``[*size]``, steps first, of an autoregressive process of order one.
+    """Draws the drift of a hand: noise ``[*size]``, steps first, from an autoregressive process of order one.
 
-    Its standard deviation is ``deviation`` from the first step on; after ``memory`` steps a share 1/e remains.
+    Its standard deviation is ``deviation`` from the first step on; after ``memory`` steps the autocorrelation is 1/e.
     """
     keep = np.exp(-1 / memory)
     values = generator.normal(0, deviation, size)
@@ -140,7 +140,7 @@ def play(
         action = np.zeros((count, task.action_dim))
         wanted = expert.act(frames[-1][:playing])
         action[:playing] = wanted if disturbances is None else disturbances.disturb(wanted)
-        # an environment may leave alone those that are over; what it does with them is not looked at
+        # environments may skip finished episodes; what they return for them is not used
         step = data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
         data = env.step(step)["next"].clone()
         frames.append(data[keys.OBSERVATION].numpy().copy())
@@ -178,7 +178,7 @@ def play(
 def _converted(
     converter: Converter, logs: Sequence[tuple[dict, np.ndarray]], row: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames and actions of an episode from what D3IL's recorder logs, as its files are converted."""
+    """Converts the log of D3IL's recorder to frames and actions of an episode, as its files are converted."""
     robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in converter.robot}
     poses = np.stack([poses[row] for _, poses in logs], axis=1)  # [objects, T, 7]
     each = zip(converter.objects, poses, strict=True)

@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scripted expert of Sorting: pushes the boxes into their bins in any order of colours.
 
-It looks at the boxes anew at every control step and keeps hardly anything in mind, so similar situations give similar
-motions. In one control step it
+It decides anew at every control step and has little memory, so similar situations give similar motions. In one
+control step it
 
-    1. chooses a box    of the colour that is next, and stays with it until it has arrived
-    2. chooses a way    to push: the direction that brings the box best on its way to the bin, past the other boxes,
-                        against the rod's own way to the place behind the box
+    1. chooses a box    of the next colour, and keeps it until it has arrived
+    2. chooses a way    to push: the direction that is best for the way of the box to the bin, past the other boxes, and
+                        for the way of the rod to the place behind the box
     3. moves the rod    around all boxes to that place, or, once behind the box, forwards; while pushing it steers
                         twice as far to the side as the box lies off, which brings the box back in front of it
 
@@ -26,20 +26,20 @@ from torchrl_koap.envs.experts.sorting_decision import best_push, decide
 from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X, arrival_orders, box_colours, sorting_task
 
 ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
-_HORIZON = 700  # control steps for which the hand's noise is drawn
+_HORIZON = 700  # control steps for which hand noise is drawn
 _LINGER = 4  # control steps after success
-_STICK = 0.0118  # m per control step and axis, the most that humans used
-# The arm is soft: its rod swings around the command with a period of 26 control steps, by centimetres. These gains
-# damp it: on the difference of wanted and seen speed, and on the stretch between command and rod.
+_STICK = 0.0118  # m per control step and axis, the largest of humans
+# The arm is compliant: the rod oscillates around the command by centimetres, with a period of 26 control steps. These
+# gains on the speed error and on the distance of rod and command damp it.
 _DAMPING = np.array([0.3, 0.5])
 _LEAK = 0.18
-_LATENCY = 2.0  # control steps from what is seen to when an action begins to show
+_LATENCY = 2.0  # control steps between an observation and the first effect of the action
 
 
 class SortingExpert(Expert):
     """Scripted expert of Sorting; modes are orders of colours (``arrival_orders``).
 
-    It has finished when it has had nothing left to do for a few control steps.
+    It has finished when it has had nothing to do for a few control steps.
     """
 
     most_rows = 699
@@ -60,12 +60,12 @@ class SortingExpert(Expert):
         self._pushing = np.zeros(count, dtype=bool)
         self._direction = np.full(count, np.nan)  # of pushing (rad)
         self._rest = np.zeros(count, dtype=np.int64)  # control steps without anything to do
-        self._wish = np.zeros((count, 2))  # speed the rod shall have (m per control step)
-        self._speed = np.zeros((count, 2))  # that it has
+        self._wish = np.zeros((count, 2))  # wanted speed of the rod (m per control step)
+        self._speed = np.zeros((count, 2))  # its measured speed
         self._seen = None
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides changes of the commanded xy [n, 2] (m) under observations [n, 4 + 3 num_boxes], which hold no NaN."""
+        """Returns changes of the commanded xy [n, 2] (m) for observations [n, 4 + 3 num_boxes] without NaN."""
         observation = self._checked(observation)
         if np.isnan(observation).any():
             raise ValueError(f"observation must not hold NaN, row {int(np.isnan(observation).any(1).argmax())} does")
@@ -84,7 +84,7 @@ class SortingExpert(Expert):
         return np.clip(self._wish + _DAMPING * (self._wish - self._speed) + _LEAK * stretch, -_STICK, _STICK)
 
     def _look(self, places: np.ndarray) -> None:
-        """Notes which boxes have arrived in their bins, and which fell beside."""
+        """Notes which boxes have arrived in their bins, and which fell beside them."""
         off = np.abs(places[..., 0] - np.take(BIN_X, self._colours))
         over = places[..., 1] > ARRIVED_Y
         self._arrived |= over & (off < BIN_HALF)
@@ -122,7 +122,7 @@ class SortingExpert(Expert):
 
 
 def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, Any]:
-    """What is random about an episode: ``taste`` for boxes (m of way), ``aim`` within the bin (m), pause, tempo."""
+    """Draws the habits of an episode: ``taste`` for boxes (m of way), ``aim`` within the bin (m), pause, tempo."""
     return {
         "taste": generator.normal(0, 0.03, num_boxes),
         "aim": generator.uniform(-0.015, 0.015, num_boxes),

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What Sorting's scripted expert decides in a control step: from where to push a box, and the way of the rod there.
+"""Decisions of Sorting's scripted expert in a control step: where to push a box from, and the way of the rod there.
 
 Ways are paths of least cost, for the box with the others as obstacles, for the rod with all boxes as obstacles. The
 cost ``T(p)`` of the cheapest path from ``p`` to a source obeys the eikonal equation ``|grad T| = s``. The slowness
@@ -19,11 +19,11 @@ ORIGIN = (0.14, -0.4)  # x, y of the first one (m)
 SHAPE = (91, 90)  # points along x and y
 FAR = 1e3  # cost of a place that is not reached
 ROD_RADIUS = 0.01
-_LANE_HALF = 0.058  # m; a box is led to within this of the middle of its bin
+_LANE_HALF = 0.058  # m; largest distance of a box's way from the middle of its bin
 _PUSH, _FREE = 0.0130, 0.0145  # m per control step
 _REACH = 0.30  # m from the base; nearer, the arm may flip over
 _DIRECTIONS = 32
-_HOLD = 0.006  # a direction is given up for a very different one if that is better by this much (m of way)
+_HOLD = 0.006  # a very different direction must be better by this much (m of way)
 
 
 @njit(cache=True)
@@ -82,7 +82,7 @@ def value_at(field, x, y):
 def descent(field, x, y):
     """Finds the direction, a unit vector [2], in which a field [X, Y] is least 16 mm from a point.
 
-    Values within about 0.002 of the least one count too, which smooths the direction; a mere gradient would shiver
+    Values within about 0.002 of the least one count too, which smooths the direction; a gradient would oscillate
     between the walls of narrow passages.
     """
     reach, softness = 0.016, 0.002
@@ -112,7 +112,7 @@ def _squares(boxes, yaws):
 
 @njit(cache=True)
 def _box_field(boxes, yaws, obstacle, lane):
-    """Cost of the rest of a box's way into its bin, everywhere [X, Y]; ``lane`` is the middle of the bin (x)."""
+    """Returns the cost of a box's remaining way into its bin [X, Y]; ``lane`` is the middle of the bin (x)."""
     slowness, cost, squares = np.ones(SHAPE), np.full(SHAPE, FAR), _squares(boxes, yaws)
     for i in range(SHAPE[0]):
         x = ORIGIN[0] + i * STEP
@@ -155,7 +155,7 @@ def _rod_slowness(boxes, yaws, solid, target):
 
 @njit(cache=True)
 def _cost_from(slowness, x, y):
-    """Cost of the rod's way from a place to everywhere [X, Y]."""
+    """Returns the cost of the rod's way from a place to everywhere [X, Y]."""
     cost = np.full(SHAPE, FAR)
     i = int(min(max((x - ORIGIN[0]) / STEP, 0.0), SHAPE[0] - 2.0))
     j = int(min(max((y - ORIGIN[1]) / STEP, 0.0), SHAPE[1] - 2.0))
@@ -167,7 +167,7 @@ def _cost_from(slowness, x, y):
 
 @njit(cache=True)
 def _behind(box, yaw, angle, clearance):
-    """Place of the rod from which it pushes a box along ``angle``."""
+    """Returns the place of the rod from which it pushes a box along ``angle``."""
     turned = angle - yaw
     support = BOX_HALF * (abs(np.cos(turned)) + abs(np.sin(turned)))
     # the middle of a face is nearer than the corners that the support counts
@@ -177,7 +177,7 @@ def _behind(box, yaw, angle, clearance):
 
 @njit(cache=True)
 def _carried(box, yaw, rod, ahead):
-    """Where a box will be once the rod has come from where it is to the place ``ahead``."""
+    """Returns where a box will be when the rod has moved from ``rod`` to ``ahead``."""
     box = box.copy()
     square = np.array([0.0, 0.0, np.cos(yaw), np.sin(yaw)])
     for k in range(1, 5):
@@ -193,7 +193,7 @@ def _carried(box, yaw, rod, ahead):
 
 @njit(cache=True)
 def _direction_cost(box, yaw, angle, to_go, way, slowness):
-    """What is left to go after pushing along ``angle``, plus the rod's way to the place behind the box."""
+    """Returns the cost of the box's way after a push along ``angle``, plus that of the rod's way behind the box."""
     cos, sin = np.cos(angle), np.sin(angle)
     left = 0.5 * (
         value_at(to_go, box[0] + 0.02 * cos, box[1] + 0.02 * sin)
@@ -207,7 +207,7 @@ def _direction_cost(box, yaw, angle, to_go, way, slowness):
 def best_push(boxes, yaws, present, target, lane, rod):
     """Chooses how to push a box to its bin; arguments are those of :func:`decide`.
 
-    Returned are the costs of the rest of the box's way and of the rod's [X, Y], its slowness [X, Y], the angle along
+    Returns the costs of the rest of the box's way and of the rod's [X, Y], its slowness [X, Y], the angle along
     which to push (rad), and the cost of that (m of way), the rod's own way included.
     """
     others = present.copy()
@@ -233,9 +233,9 @@ def _wrapped(angle):
 def decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     """Decides on the step of the rod in x and y (m), whether it pushes, and the direction (rad) in which.
 
-    ``boxes`` [B, 2] are positions (m), ``yaws`` [B] theirs (rad); ``present`` [B] are on the platform, and ``target``
-    is led to its bin, whose middle lies at x = ``lane`` (m). The rod is at ``rod`` [2] (m), and ``ahead`` when an
-    action begins to show; whether it was ``pushing``, and the direction ``held`` (rad) or NaN, are the last step's.
+    ``boxes`` [B, 2] are positions (m), ``yaws`` [B] theirs (rad); ``present`` [B] are on the platform. ``target`` is
+    the box to push into its bin, whose middle is at x = ``lane`` (m). The rod is at ``rod`` [2] (m), and at ``ahead``
+    when the action takes effect. ``pushing`` and the direction ``held`` (rad, or NaN) are those of the last step.
     """
     boxes = boxes.copy()
     boxes[target] = _carried(boxes[target], yaws[target], rod, ahead)

@@ -1,15 +1,15 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scripted expert of Stacking: a simulated person at the gripper who stacks the three boxes in a wanted order.
+"""Scripted expert of Stacking: a simulated operator of the gripper who stacks the three boxes in a given order.
 
-What it does next follows from what it sees now, so similar situations give similar motions. For every box::
+Its actions follow from the present observation, so similar situations give similar motions. For every box::
 
-    reach     fingers open, over the box at a safe height, turned as the box is turned, down once above it
+    reach     fingers open, over the box at a safe height, at the yaw of the box, down once above it
     grasp     fingers close until they stop
     carry     up, over to the stack, turned back, down once above it
     release   fingers open; then up and on to the next box
 
-A box that slipped or fell is fetched again. Poses of the tool centre point (TCP) are decided here; joint commands come
-from the controller's inverse kinematics.
+A box that slipped or fell is fetched again. The expert decides poses of the tool centre point (TCP); the controller's
+inverse kinematics give the joint commands.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torchrl_koap.envs.mujoco.kinematics import follow_pose, tcp_pose
 from torchrl_koap.tasks.action_rules import OPEN
 from torchrl_koap.tasks.stacking import BOXES, ORDERS, TARGET
 
-GRIPPER_CLOSED = 0.06  # gripper command: the distance of the fingers that will result (m)
+GRIPPER_CLOSED = 0.06  # gripper command: resulting distance of the fingers (m)
 HALF_SIZES = np.array([size[:2] for _, size in BOXES])
 BOX_HEIGHT = 0.06
 ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
@@ -33,18 +33,18 @@ ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
 _SPEED, _PUSH = 0.0125, 0.0012  # sideways: m per control step, and its change per control step
 _SINK, _RISE, _LIFT = 0.0075, 0.01, 0.001  # down, up: m per control step, and their change
 _TURN, _TURN_PUSH = 0.028, 0.004  # rad per control step, and its change
-_EAGERNESS = np.array([0.15, 0.15, 0.12])  # share of the remaining way that is wanted in the next control step
-_HOLD = 0.004  # the TCP grasps that much above the centre of a box (m)
+_EAGERNESS = np.array([0.15, 0.15, 0.12])  # share of the remaining way per control step
+_HOLD = 0.004  # height of the TCP above the centre of a grasped box (m)
 _FINGER_AT, _FINGER_HALF = 0.051, (0.015, 0.011)  # an open finger: distance from the TCP, half sizes (m)
 _CLEAR = 0.003  # room that a finger needs beside it (m)
-_PUSHED = 0.012  # m between the command and what this person commanded, more than inverse kinematics leave
-_HORIZON = 1500  # control steps for which the wobble of the hand is drawn
+_PUSHED = 0.012  # m; a command this far from the expert's was moved by others: larger than errors of inverse kinematics
+_HORIZON = 1500  # control steps for which hand noise is drawn
 
 
 class StackingExpert(Expert):
     """Scripted expert of Stacking; modes are orders of the boxes, ``ORDERS``.
 
-    It has finished when it has let go of the third box and drawn back.
+    It has finished when it has released the third box and moved away.
     """
 
     TASK, most_rows = "stacking", 999
@@ -56,7 +56,7 @@ class StackingExpert(Expert):
         ]
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides changes of the commanded joints (rad) and gripper commands (m) [n, 8] under observations [n, 31]."""
+        """Returns changes of the commanded joints (rad) and gripper commands (m) [n, 8] for observations [n, 31]."""
         observation = self._checked(observation)
         seen = {name: observation[:, columns] for name, columns in self.task.observation.items()}
         commanded = seen["desired_joints_and_gripper"][:, :7]
@@ -71,7 +71,7 @@ class StackingExpert(Expert):
             tcp, width = seen["tcp_position"][i], seen["gripper_width"][i, 0]
             if person.position is None:
                 person.position, person.yaw = start[i].copy(), yaw
-            elif np.linalg.norm(start[i] - person.position) > _PUSHED:  # somebody moved the command: go on from there
+            elif np.linalg.norm(start[i] - person.position) > _PUSHED:  # a disturbance moved the command: go on there
                 person.position, person.yaw = start[i].copy(), math.remainder(yaw, 2 * math.pi)
             gripper[i] = person.decide(tcp, math.remainder(yaw, 2 * math.pi), width, boxes[i])
             half = person.yaw / 2
@@ -98,7 +98,7 @@ class _Person:
         self._enter(self._reach)
 
     def decide(self, tcp: np.ndarray, yaw: float, width: float, boxes: np.ndarray) -> float:
-        """Moves the command by one control step, given what is seen; returns the gripper command."""
+        """Moves the command by one control step, given an observation; returns the gripper command."""
         self._time += 1
         self._since += 1
         self._speed, self._seen = np.linalg.norm(tcp - self._seen), tcp.copy()
@@ -119,7 +119,7 @@ class _Person:
         low, off = box[2] + _HOLD, error + 0.08 * max(tilt - 0.03, 0.0)
         if off < 0.008:
             self._down = True
-        elif off > 0.012 and tcp[2] > box[2] + 0.025:  # the fingers would come down on the box
+        elif off > 0.012 and tcp[2] > box[2] + 0.025:  # the fingers would hit the box
             self._down = False
         height = low if self._down else box[2] + 0.05 + _funnel(off, 0.0, 0.02, 0.009, 0.03)
         self._move(goal, max(height, self._above_stack(tcp)), turn, tcp)
@@ -144,7 +144,7 @@ class _Person:
         index = self.order[self._placed]
         box = boxes[index]
         offset = tcp - box[:3]
-        if np.linalg.norm(offset) > 0.05 or width < 0.05:  # lost
+        if np.linalg.norm(offset) > 0.05 or width < 0.05:  # the box is lost
             self._grasp = None
             self._enter(self._reach)
             return OPEN
@@ -174,14 +174,14 @@ class _Person:
         return OPEN
 
     def _place(self, boxes: np.ndarray) -> tuple[np.ndarray, float]:
-        """Where the centre of the box in hand shall come to rest: xy and height."""
+        """Returns the goal of the centre of the held box: xy and height."""
         if not self._placed:
             return self._centre, ON_TABLE
         below = boxes[self.order[self._placed - 1]]
         return below[:2], below[2] + BOX_HEIGHT
 
     def _recount(self, tcp: np.ndarray, boxes: np.ndarray) -> None:
-        """Boxes that no longer lie where they were put have to be fetched again."""
+        """Counts the stack again; boxes that have moved must be fetched again."""
         if np.linalg.norm(tcp[:2] - self._centre) < 0.12:
             return
         for place in range(self._placed):
@@ -191,14 +191,14 @@ class _Person:
                 return
 
     def _above_stack(self, tcp: np.ndarray) -> float:
-        """Height that open fingers need where they are to pass the stack."""
+        """Returns the height that open fingers need at their place to pass the stack."""
         if not self._placed:
             return 0.0
         top = ON_TABLE + (self._placed - 0.5) * BOX_HEIGHT
         return _funnel(0.17 - np.linalg.norm(tcp[:2] - self._centre), 0.0, top + 0.035, 0.0, 0.08)
 
     def _move(self, goal: np.ndarray, height: float, turn: float, tcp: np.ndarray) -> None:
-        """Speeds up, slows down and steers towards a place; sideways only as far up as the height there asks for."""
+        """Accelerates, brakes and steers towards a goal; moves sideways only near or above the height of the goal."""
         freedom = np.clip((0.02 - (height - tcp[2])) / 0.015, 0.0, 1.0)
         wobble = self._wobble[self._time % _HORIZON]
         far = np.linalg.norm(goal - tcp[:2]) > 0.03
@@ -215,9 +215,9 @@ class _Person:
 
 
 def _choose_grasp(index: int, boxes: np.ndarray) -> tuple[float, float]:
-    """How to grasp a box: yaw of the gripper and shift along its width (rad, m).
+    """Chooses a grasp of a box: yaw of the gripper and shift along its width (rad, m).
 
-    Of the equivalent yaws the one nearest to the neutral seventh joint is taken, unless another box is in the way.
+    Of equivalent yaws, takes the one nearest to the neutral seventh joint, unless another box is in the way.
     """
     box, others = boxes[index], [other for other in range(3) if other != index]
     long = HALF_SIZES[index, 1] > 0.04
@@ -237,7 +237,7 @@ def _choose_grasp(index: int, boxes: np.ndarray) -> tuple[float, float]:
 
 
 def _room(place: np.ndarray, turn: float, shift: float, other: np.ndarray, half: np.ndarray) -> float:
-    """Least distance (m; negative inside) of the open fingers from another box, measured along its sides."""
+    """Returns the least distance (m; negative inside) of the open fingers from another box, along its sides."""
     across, along = np.array([math.sin(turn), -math.cos(turn)]), np.array([math.cos(turn), math.sin(turn)])
     grid = np.array(list(itertools.product((-1, 0, 1), (-1, 0, 1))))
     room = math.inf
@@ -251,10 +251,10 @@ def _room(place: np.ndarray, turn: float, shift: float, other: np.ndarray, half:
 
 
 def _funnel(error: float, low: float, high: float, tight: float, wide: float) -> float:
-    """``low`` for errors below ``tight``, ``high`` above ``wide``, in between in proportion."""
+    """Returns ``low`` for errors below ``tight``, ``high`` above ``wide``, interpolated in between."""
     return low + (high - low) * min(max((error - tight) / (wide - tight), 0.0), 1.0)
 
 
 def _limited(vector: np.ndarray, length: float) -> np.ndarray:
-    """The vector, shortened to ``length`` if it is longer."""
+    """Returns the vector, shortened to ``length`` if it is longer."""
     return vector * min(1.0, length / max(np.linalg.norm(vector), 1e-12))
