@@ -125,9 +125,12 @@ def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: CommandLimits([0], lead=0.1, **COLUMNS), "2, 2 and 1 columns"),
+        (lambda: CommandLimits([0], lead=0.1, **COLUMNS), "2, 2 and 1$"),
         (lambda: CommandLimits([0], lead=0.1), "lead 0.1 was given, but the observation repeats no command"),
-        (lambda: CommandLimits(ranges=[None])(torch.zeros(1, 1), torch.zeros(2)), "1 action columns .* have 2"),
+        (
+            lambda: CommandLimits(ranges=[None])(torch.zeros(1, 1), torch.zeros(2)),
+            "ranges has 1 columns, but actions have 2",
+        ),
         (lambda: policy_for("scooping", lead=0.1), "lead 0.1 were given, but no action is a change of a command"),
         (lambda: policy_for("scooping", gain=1.1), "gain 1.1 and .* but no action is a change of a command"),
     ],

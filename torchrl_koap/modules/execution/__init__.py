@@ -1,2 +1,2 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Policies that act in an environment: plan then control, action chunks, replay."""
+"""Policies that act in an environment: they follow plans or execute action chunks."""

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A policy in a robot's control loop: observation in, action out, everything else kept inside."""
+"""Runs a policy in a robot's control loop: it takes observations, returns actions and stores all other state."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from torchrl_koap.modules.execution.policy import IS_INIT, PlanningPolicy
 from torchrl_koap.modules.execution.policy_env import NoiseStreams
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
-KEPT = 10_000  # latencies of the last steps
+KEPT = 10_000  # steps whose latencies are stored
 
 
 class FarStateWarning(UserWarning):
-    """A state column lies far outside of its demonstrated range."""
+    """A state column lies far outside its demonstrated range."""
 
 
 def percentiles(seconds: Sequence[float]) -> dict[str, float]:
-    """Returns ``p50``, ``p99`` and ``max`` of times of single ``steps`` in ms, and their number."""
+    """Returns ``p50``, ``p99`` and ``max`` of step times (given in seconds) in ms, and the number of ``steps``."""
     p50, p99, longest = (1e3 * np.percentile(seconds, (50, 99, 100))).tolist()
     return {"p50": p50, "p99": p99, "max": longest, "steps": len(seconds)}
 
@@ -35,24 +35,24 @@ def percentiles(seconds: Sequence[float]) -> dict[str, float]:
 class Agent:
     """Runs a policy in a control loop, for one robot or several at a time, without gradients.
 
-    Frames observed so far, the current plans and start noise live inside. With the same seed the actions are bit for
-    bit those of a :class:`~torchrl_koap.modules.PolicyEnv`. Its first episode is that of this seed in ``koap eval``;
-    the next ones go on in the same stream.
+    The agent stores the observed frames, the current plans and the start noise. With the same seed its actions equal
+    those of a :class:`~torchrl_koap.modules.PolicyEnv` bit for bit. Its first episode equals that of this seed in
+    ``koap eval``; later episodes continue the same random stream.
 
     Args:
-        policy (PlanningPolicy): of :func:`~torchrl_koap.modules.make_policy` or :func:`~torchrl_koap.load_policy`.
+        policy (PlanningPolicy): from :func:`~torchrl_koap.modules.make_policy` or :func:`~torchrl_koap.load_policy`.
 
     Keyword Args:
-        seed (int): seed of the plans' start noise; robot ``i`` of a batch draws with ``seed + i``.
+        seed (int): seed of the plans' start noise; robot ``i`` of a batch uses ``seed + i``.
 
     Warns:
-        FarStateWarning: if a state column goes far outside of its demonstrated range, once per column and episode.
+        FarStateWarning: once per column and episode, if a state exceeds its demonstrated range by that range's width.
 
     Raises:
-        RuntimeError: if it is asked to act before :meth:`reset`.
-        TypeError: for anything else than a policy, such as the name of its file.
-        ValueError: for a seed that is no whole number >= 0; for observations of another width, batch or number of axes
-            than before, that are not finite, or from which no finite action follows.
+        RuntimeError: if :meth:`act` is called before :meth:`reset`.
+        TypeError: if ``policy`` is not a policy, for example a file name.
+        ValueError: if the seed is not an integer >= 0, if an observation is not finite or differs from earlier ones in
+            width, batch size or number of axes, or if the resulting action is not finite.
 
     Examples:
         >>> import numpy as np
@@ -82,7 +82,7 @@ class Agent:
         self._forget()
 
     def reset(self) -> None:
-        """Begins an episode with the next observation; random numbers continue."""
+        """Begins an episode with the next observation; the stream of random numbers continues."""
         self._forget()
         self._ready = True
         self._episode += 1
@@ -91,9 +91,9 @@ class Agent:
     def act(self, observation: np.ndarray | Tensor | Sequence[float] | Mapping[str, Any]) -> np.ndarray | Tensor:
         """Returns the action ``[act]`` for an observation ``[obs]`` in raw units, or ``[n, act]`` for several robots.
 
-        It is a tensor where the observation is one, else an array. A policy that was trained with cameras takes
-        ``{"state": x, "top": frame}``: numbers ``[d]`` and a frame of every camera by its name, uint8 ``[H, W, 3]``.
-        It is float64 where the task has an origin.
+        The action is a tensor if the observation is a tensor, else an array; it is float64 if the task has an origin.
+        A policy that was trained with cameras takes ``{"state": x, "top": frame}``: numbers ``[d]``, and one frame,
+        uint8 ``[H, W, 3]``, under the name of each camera.
         """
         began = time.perf_counter()
         newest = self._checked(observation).unsqueeze(-2)
@@ -103,48 +103,48 @@ class Agent:
             self._frames = torch.cat([self._frames[:, 1:], newest], -2)
         action = self.policy.to_robot(self._decide())
         if not action.isfinite().all():
-            self._forget()  # frames and plan hold this observation
-            raise ValueError("this observation is so far from the demonstrations that no finite action follows from it")
+            self._forget()  # the stored frames and plan depend on this observation
+            raise ValueError("the action is not finite: this observation is too far from the demonstrations")
         action = action[0] if len(self._shape) == 1 else action
         result = action if isinstance(observation, Tensor) else action.cpu().numpy()
         self.latencies.append(time.perf_counter() - began)
         return result
 
     def latency(self) -> dict[str, float]:
-        """Time per action of the last 10,000 steps in ms: ``p50``, ``p99``, ``max``, and the number of ``steps``."""
+        """Returns the time per action in ms over the last 10,000 steps (:func:`percentiles`)."""
         if not self.latencies:
-            raise RuntimeError("the agent has not acted yet: there is no latency to tell")
+            raise RuntimeError("no latency has been measured: call act() first")
         return percentiles(self.latencies)
 
     def _forget(self) -> None:
-        self._carried: TensorDict | None = None  # what the policy wrote in the last step
+        self._carried: TensorDict | None = None  # tensordict that the policy wrote in the last step
         self._frames = None
-        self._shape: tuple[int, ...] | None = None  # of the observations
-        self._far: set[int] = set()  # columns that were warned of
+        self._shape: tuple[int, ...] | None = None  # shape of the observations
+        self._far: set[int] = set()  # columns that a warning has named
 
     def _decide(self) -> Tensor:
-        """The action for the frames observed by now ``[n, act]``."""
+        """Returns the action ``[n, act]`` for the frames observed so far."""
         robots = len(self._frames)
         td = TensorDict(batch_size=[robots], device=self.device) if self._carried is None else self._carried
         td.set(self.policy.in_keys[0], self._frames)
         td.set(IS_INIT, torch.full((robots, 1), self._carried is None, device=self.device))
-        if self.policy.planner.noise_key is not None:  # else the planner draws by itself
+        if self.policy.planner.noise_key is not None:  # with None the planner draws its own noise
             td.set(self.policy.planner.noise_key, self._noise(robots))
         td = self.policy(td)
         self._carried = td
         return td.get(self.policy.out_keys[0]).clone()
 
     def _noise(self, robots: int) -> Tensor:
-        """Start noise of a plan ``[n, *noise_shape]``, from a stream per robot."""
+        """Draws the start noise ``[n, *noise_shape]`` of a plan, from one stream per robot."""
         if self._streams is None or len(self._streams) != robots:
             seeds = range(self.seed, self.seed + robots)
             self._streams = NoiseStreams(seeds, self.policy.noise_shape, block=self.policy.max_steps)
         return self._streams.draw().to(self.device, self.dtype)
 
     def _checked(self, observation: Any) -> Tensor:
-        """The observation as ``[n, obs]`` of the policy's type."""
+        """Checks an observation and returns it as ``[n, obs]`` in the policy's dtype."""
         if not self._ready:
-            raise RuntimeError("reset() the agent before the first act(): it has to know where an episode begins")
+            raise RuntimeError("reset() the agent before the first act(): reset() begins an episode")
         if isinstance(observation, Mapping):
             if self.policy.observe is None:
                 given = ", ".join(observation)
@@ -158,7 +158,7 @@ class Agent:
             raise ValueError(f"an observation must be [obs] or [n, obs], got {list(shape)}")
         if self._shape is not None and shape != self._shape:
             raise ValueError(
-                f"the observation is {list(shape)}, those before were {list(self._shape)}; reset() the agent for"
+                f"the observation has shape {list(shape)}, earlier ones had {list(self._shape)}; reset() the agent for"
                 " another robot or batch"
             )
         read = self.policy.from_robot(observed).to(self.device, self.dtype).reshape(-1, shape[-1])
@@ -166,14 +166,14 @@ class Agent:
         if bad.any():
             columns = bad.any(0).nonzero().flatten().tolist()
             raise ValueError(f"columns {columns} of the observation are NaN or infinite as {self.dtype}")
-        state = self.policy.state_of(read)  # refuses another width before anything is kept
+        state = self.policy.state_of(read)  # raises for a wrong width, before the agent stores anything
         planner = self.policy.planner
         far = set()
         if isinstance(planner, ConditionalSampler):
             far = {*planner.far(state).any(0).nonzero().flatten().tolist()} - self._far
         if far:
             self._far |= far
-            warnings.warn(  # with the episode's number, as Python shows a repeated text once only
+            warnings.warn(  # the episode number makes the texts differ: Python shows a repeated text only once
                 f"in episode {self._episode} columns {sorted(far)} of the state lie beyond the demonstrated range by"
                 " more than that range: another unit or robot, a faulty sensor, or a quaternion of the other sign?",
                 FarStateWarning,

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Asynchronous planning: a thread makes the next plan while the present one is executed."""
+"""Asynchronous planning: a thread makes the next plan while the current one is executed."""
 
 from __future__ import annotations
 
@@ -18,36 +18,37 @@ from torchrl_koap.modules.execution.policy import PlanningPolicy
 
 
 class AsynchronousAgent(Agent):
-    """Agent that follows a plan while a thread makes the next one.
+    """Follows a plan while a thread makes the next one.
 
     ::
 
         step                 0     1     2     3     4     5     6     7
         current plan         P     P     P     P     P     P     P'    P'
         in the thread                                P'---------        P''---
-        first states of P'                           P_4 = P'_1, P_5 = P'_2: executed before P' is there
+        first states of P'                           P_4 = P'_1, P_5 = P'_2: executed before P' is ready
 
-    Real-time chunking (arXiv 2506.07339) with the hard constraint: at every solver step the states that will have been
-    executed when the plan is ready take the place of the planner's own, as many as the time of the last plan says.
-    Actions are decoded at every step from the history observed by then, as in ``"feedback"``.
+    This is real-time chunking (arXiv 2506.07339) with the hard constraint. Some states of the current plan will be
+    executed before the next plan is ready; at every solver step they replace the first states of the next plan. Their
+    number follows from the time that the last plan took. Actions are decoded at every step from the history observed
+    so far, as in ``"feedback"``.
 
-    The first plan of an episode has no predecessor: hand the first observation to :meth:`reset`, which makes it before
-    the clock runs.
+    The first plan of an episode has no predecessor. Pass the first observation to :meth:`reset`, which makes this plan
+    before control begins.
 
     Args:
-        policy (PlanningPolicy): one that follows plans with strategy ``"feedback"``.
+        policy (PlanningPolicy): follows plans with strategy ``"feedback"``.
 
     Keyword Args:
-        control_hz (float): control steps per second, by which a plan's time becomes a number of steps. One that differs
-            from that of the policy by more than a fifth is warned of.
+        control_hz (float): control steps per second; converts planning time to steps.
         seed (int): as for :class:`Agent`.
 
     Warns:
-        UserWarning: as :class:`Agent`, and if a plan ends before the next one is there, once per episode.
+        UserWarning: as :class:`Agent`; if ``control_hz`` is outside 0.8 to 1.25 times the policy's rate; and if a plan
+            ends before the next one is ready, once per episode.
 
     Raises:
-        RuntimeError: if it is asked to act or :meth:`reset` after :meth:`close`.
-        TypeError: for anything else than a policy, such as the name of its file.
+        RuntimeError: if :meth:`act` or :meth:`reset` is called after :meth:`close`.
+        TypeError: if ``policy`` is not a policy, for example a file name.
         ValueError: for another strategy, or a rate that is not positive.
 
     Examples:
@@ -69,9 +70,7 @@ class AsynchronousAgent(Agent):
     def __init__(self, policy: PlanningPolicy, *, control_hz: float, seed: int = 0):
         super().__init__(policy, seed=seed)
         if policy.execution.strategy != "feedback":
-            raise ValueError(
-                f"plans are made asynchronously with strategy 'feedback', not {policy.execution.strategy!r}"
-            )
+            raise ValueError(f"asynchronous planning needs strategy 'feedback', got {policy.execution.strategy!r}")
         policy.check_rate(control_hz)
         self.control_hz = control_hz
         self._delay = 1  # steps that a plan takes
@@ -84,15 +83,15 @@ class AsynchronousAgent(Agent):
         self.close()
 
     def close(self) -> None:
-        """Waits for the plan in progress, and ends the thread: the agent acts no more."""
+        """Waits for the plan in progress and ends the thread; the agent cannot act afterwards."""
         self._closed = True
         self._thread.shutdown(wait=True)
 
     def reset(self, observation: object = None) -> None:
         """Begins an episode with the next observation.
 
-        From the first observation, ``[obs]`` or ``[n, obs]``, the first plan is made now; without one it is made in the
-        first :meth:`act`, which waits for it.
+        If the first observation, ``[obs]`` or ``[n, obs]``, is given, the first plan is made here. Otherwise the first
+        :meth:`act` makes it and waits for it.
         """
         self._refuse_closed()
         super().reset()
@@ -110,12 +109,12 @@ class AsynchronousAgent(Agent):
     def _forget(self) -> None:
         super()._forget()
         if self._pending is not None:
-            wait([self._pending])  # of another episode, as is an error in it
+            wait([self._pending])  # this plan, or its error, belongs to an earlier episode
         self._pending = None
         self._plan = None
-        self._told = False  # that a plan ended
-        self._age = 0  # steps since the plan was begun
-        self._begun = 0  # steps since the pending one was begun
+        self._warned = False  # whether this episode has a warning that a plan ended
+        self._age = 0  # steps since planning of the current plan began
+        self._pending_age = 0  # steps since planning of the pending one began
 
     @torch.no_grad()
     def _decide(self) -> Tensor:
@@ -125,23 +124,23 @@ class AsynchronousAgent(Agent):
         if self._pending is not None and self._pending.done():
             made, self._pending = self._pending, None
             self._plan, took = made.result()
-            self._delay, self._age = self._steps(took), self._begun
+            self._delay, self._age = self._steps(took), self._pending_age
         if self._pending is None and self._age >= policy.execution.replan_interval:
             bound = remaining_plan(self._plan, self._age)[..., : min(self._delay, policy.planner.horizon - 1), :]
             self._pending = self._thread.submit(self._make, frames, self._noise(len(frames)), bound)
-            self._begun = 0
-        if self._age >= policy.planner.horizon and not self._told:
-            self._told = True
+            self._pending_age = 0
+        if self._age >= policy.planner.horizon and not self._warned:
+            self._warned = True
             seconds = (policy.planner.horizon - policy.execution.replan_interval) / self.control_hz
             warnings.warn(
-                f"in episode {self._episode} a plan ended before the next one was there: until then its last state is"
-                f" followed. At {self.control_hz:g} Hz a plan may take {1e3 * seconds:.0f} ms; torch.set_num_threads(1)"
-                " may help. In a process forked after the agent was made no plan ever comes",
+                f"in episode {self._episode} a plan ended before the next one was ready; the agent follows its last"
+                f" state until then. At {self.control_hz:g} Hz planning may take at most {1e3 * seconds:.0f} ms;"
+                " torch.set_num_threads(1) may help. Make the agent after forking a process, or its thread is missing",
                 stacklevel=5,
             )
         action = policy.act(frames, self._plan, self._age)
         self._age += 1
-        self._begun += 1
+        self._pending_age += 1
         return action
 
     def _make_first(self, frames: Tensor) -> None:

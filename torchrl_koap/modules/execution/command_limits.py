@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Limits, gain and lead of commands (:class:`Execution`)."""
+"""Applies limits, gain and lead to commands (:class:`Execution`)."""
 
 from __future__ import annotations
 
@@ -9,40 +9,39 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-Ranges = Sequence[Sequence[float] | None]  # least and greatest number of every column
+Ranges = Sequence[Sequence[float] | None]  # minimum and maximum of every column; None: unlimited
 
 
 def ends_of(ranges: Ranges) -> Tensor:
-    """Least and greatest number of every column ``[act, 2]``, infinite where there is no range."""
+    """Returns the minimum and maximum of every column, ``[act, 2]``; infinite if a column has no range."""
     return torch.tensor([(-math.inf, math.inf) if r is None else r for r in ranges])
 
 
 class CommandLimits(nn.Module):
     r"""Limits actions to a range, scales changes of a command, and limits the distance of the command from the robot.
 
-    An action is clipped to its range first; what a planner or controller says far from its data has no bound of its
-    own. Changes of a command follow:
+    First, actions are clipped to their range: far from their data, outputs of planner and controller are unbounded.
+    Then gain and lead apply to the actions that change a command:
 
     .. math::
         a' = \operatorname{clip}(c + g a - x,\; -l,\; l) - (c - x)
 
     with the last command ``c``, the measured position ``x``, an action ``a`` that changes the command, the gain ``g``
-    and the lead ``l``, 0 for none, in the units of the actions. Where a robot is blocked, every plan that leads on adds
-    to the command (integrator windup); with a lead it answers as soon as plans turn back.
+    and the lead ``l`` in the units of the actions (0: no limit). While a robot is blocked, plans that lead further
+    increase the command (integrator windup). With a lead, the robot responds as soon as a plan turns back.
 
     Args:
         actions (sequence of int): action columns that change the command; needed for a gain or lead.
 
     Keyword Args:
-        ranges (sequence, optional): least and greatest number of every action column, None for one without limit.
+        ranges (sequence, optional): minimum and maximum of every action column; None: unlimited.
         gain, lead (float): ``g`` and ``l``.
         commands (sequence of int): observation columns that repeat the last command; needed for a lead.
-        positions (sequence of int): state columns of what each of them moves; likewise.
-        state_of (callable, optional): from observations ``[*B, obs]`` to states ``[*B, d]``. Default: they are the
-            same.
+        positions (sequence of int): state columns that these commands move; needed for a lead.
+        state_of (callable, optional): maps observations ``[*B, obs]`` to states ``[*B, d]``. Default: identity.
 
     Raises:
-        ValueError: for a gain or lead where no action is a change of a command, or columns that differ in number.
+        ValueError: for a gain or lead if no action changes a command, or if the numbers of columns differ.
     """
 
     def __init__(
@@ -63,8 +62,8 @@ class CommandLimits(nn.Module):
             raise ValueError(f"lead {lead:g} was given, but the observation repeats no command that actions change")
         if lead and not len(commands) == len(positions) == len(actions):
             raise ValueError(
-                "as many commands, positions and actions are needed, got"
-                f" {len(commands)}, {len(positions)} and {len(actions)} columns"
+                "commands, positions and actions must have the same number of columns, got"
+                f" {len(commands)}, {len(positions)} and {len(actions)}"
             )
         self.gain, self.lead, self.state_of = gain, lead, state_of
         self.register_buffer("ends", None if ranges is None else ends_of(ranges), persistent=False)
@@ -74,8 +73,8 @@ class CommandLimits(nn.Module):
     def forward(self, observations: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Limits actions ``[*B, act]``, given observations ``[*B, history, obs]``, the present one last.
 
-        What is within the limits stays the same bit for bit: a rounding error changes episodes with contacts. The
-        second tensor says whether a column left its range, bool ``[*B]``.
+        Actions within the limits stay the same bit for bit, since a rounding error changes episodes with contacts. The
+        second result, bool ``[*B]``, says whether any column of an action was outside its range.
         """
         held = self._in_range(action)
         return self._paced(observations, held), (held != action).any(-1)
@@ -84,12 +83,12 @@ class CommandLimits(nn.Module):
         if self.ends is None:
             return action
         if action.shape[-1] != len(self.ends):
-            raise ValueError(f"ranges of {len(self.ends)} action columns were given, actions have {action.shape[-1]}")
+            raise ValueError(f"ranges has {len(self.ends)} columns, but actions have {action.shape[-1]}")
         low, high = self.ends.to(action.dtype).unbind(-1)
         return action.clamp(low, high)
 
     def _paced(self, observations: Tensor, action: Tensor) -> Tensor:
-        """Actions ``[*B, act]`` with gain and lead."""
+        """Applies gain and lead to actions ``[*B, act]``."""
         if self.gain != 1:
             factors = torch.ones(action.shape[-1], dtype=action.dtype, device=action.device)
             action = action * factors.index_fill(0, self.actions, self.gain)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How plans become actions: the options that are saved with a run."""
+"""Options of how plans become actions; they are saved with a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STRATEGIES = ("feedback", "open_loop", "oracle")
 
 @dataclass(frozen=True)
 class Execution:
-    """How plans become actions.
+    """Holds the options of how plans become actions.
 
     ::
 
@@ -23,7 +23,7 @@ class Execution:
         feedback        a(x_0,P)   a(x_1,P)   a(x_2,P)   a(x_3,P)   a(x_4,P')
         open_loop       a_0(x_0,P) a_1(x_0,P) a_2(x_0,P) a_3(x_0,P) a_0(x_4,P')
 
-    ``"open_loop"`` is the paper's strategy. Gain and lead come after the limits.
+    ``"open_loop"`` is the paper's strategy. Gain and lead are applied after the limits.
 
     Args:
         strategy, ..., limits: the attributes of :class:`ExecutionConfig`, each with a default.
@@ -61,7 +61,7 @@ class Execution:
             raise ValueError(f"limits must be a number >= 0, or infinity, got {self.limits}")
 
     def replaced(self, **asked: Any) -> Execution:
-        """Returns a copy with some fields replaced; ``None`` leaves a field as it is, and an unknown one is refused."""
+        """Returns a copy with some fields replaced; ``None`` keeps a field. Raises a ValueError for unknown fields."""
         for name in asked:
             lookup(asdict(self), name, "option of an execution")
         return replace(self, **{name: value for name, value in asked.items() if value is not None})
@@ -69,20 +69,20 @@ class Execution:
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """Options of an :class:`Execution`; None is the default of the method, the task or the library.
+    """Options of an :class:`Execution`; None selects the default of the method, the task or the library.
 
     Attributes:
         strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (inverse dynamics of
-            the simulator, which follow plans closely within the arm's reach; what still fails is mostly the planner's).
-        replan_interval: control steps per plan (default with feedback: those of 0.1 s, 4 to 10, or 7 where actions are
-            targets).
+            the simulator, which follow plans closely within the arm's reach; remaining failures are mostly the
+            planner's).
+        replan_interval: control steps per plan (default with feedback: the steps in 0.1 s, at least 4 and at most 10,
+            or 7 if actions are targets).
         blend: share of the distance between robot and plan that remains after each step; 0: plans are not shifted.
         lead: largest distance of the command from the robot along each axis, in the units of the actions; 0: no limit.
-        gain: factor of actions that are changes of a command: above 1 the robot is faster than planned.
+        gain: factor of actions that are changes of a command; above 1 the robot moves faster than planned.
         temperature: factor of the noise that plans are sampled from, 0 to 1. Below 1 plans are more precise and vary
             less.
-        limits: commands stay in the range of the demonstrated ones, widened on both sides by this share of it; inf: no
-            limit.
+        limits: commands stay in the demonstrated range, widened on each side by this share of it; inf: no limit.
 
     Raises:
         ValueError: as :class:`Execution`.
@@ -105,5 +105,5 @@ class ExecutionConfig:
         self.on(Execution())
 
     def on(self, default: Execution) -> Execution:
-        """Returns a default with the given options in place."""
+        """Returns ``default`` with the options that are given (not None) replaced."""
         return default.replaced(**asdict(self))

@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Policies as files that run without this library: ``torch.export``, ONNX, AOTInductor.
+"""Exports policies to files that run without this library: ``torch.export``, ONNX, AOTInductor.
 
-What is exported is :meth:`~torchrl_koap.modules.PlanningPolicy.decode_ahead`: observations and start noise in, the next
-actions out, gain and command limit included, the solver's loop unrolled inside. Whoever calls it keeps the last
-observations and counts steps. Every file says what goes in and comes out (:attr:`Exportable.facts`).
+A file holds :meth:`~torchrl_koap.modules.PlanningPolicy.decode_ahead`, which maps observations and start noise to the
+next actions. Gain and command limits are included; the solver's loop is unrolled. The caller stores the last
+observations and counts steps. Every file describes its inputs and outputs (:attr:`Exportable.facts`).
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.policy import PlanningPolicy
 
 SUFFIXES = {"torch": ".pt2", "onnx": ".onnx", "aoti": ".aoti.pt2"}
-FACTS = "facts.json"  # inside of a file of torch.export
-_BATCHES = (1, 3)  # that what is read back is tried with
+FACTS = "facts.json"  # name inside a file of torch.export
+_BATCHES = (1, 3)  # batch sizes that a written file is tested with
 _OUTPUTS = ("actions", "limited")
 _MEANINGS = {
     "observations": "raw units, oldest frame first, the present one last; at the start the first one is repeated",
     "noise": "standard normal numbers, drawn anew for every call",
     "actions": "raw units, the next control step first",
-    "limited": "which of these actions had left their range and were held at its end",
+    "limited": "which of these actions were outside their range and were clipped to it",
 }
 _OPEN_LOOP = (
-    "Exported chunks are open loop between plans: all actions of a call are decided by its observations. Execute one"
-    " per control step, then call again. Strategy 'feedback' looks at every step; its figures are not those of this"
+    "Exported chunks are open loop between plans: all actions of a call depend only on its observations. Execute one"
+    " per control step, then call again. Strategy 'feedback' observes at every step; its results do not hold for this"
     " file."
 )
 
@@ -42,11 +42,11 @@ Outputs = tuple[Tensor, ...]
 
 
 class ExportError(RuntimeError):
-    """An export that is impossible on this machine, or that differs from the policy."""
+    """An export is impossible on this machine, or differs from the policy."""
 
 
 class _Stateless(nn.Module):
-    """Observations ``[B, history, obs]`` and noise to the next actions ``[B, interval, act]``, and which were held."""
+    """Maps observations ``[B, history, obs]`` and noise to the next actions ``[B, interval, act]`` and ``limited``."""
 
     def __init__(self, policy: PlanningPolicy):
         super().__init__()
@@ -61,9 +61,9 @@ class _Stateless(nn.Module):
 class Exportable:
     """A policy as a plain module on tensors, of any batch size."""
 
-    module: nn.Module  # from the inputs, in their order, to a tuple of tensors
+    module: nn.Module  # maps the inputs, in their order, to a tuple of tensors
     inputs: dict[str, Tensor]  # an example of every input by name, batch 1
-    facts: dict[str, Any]  # what a caller has to know: shapes, columns, order of frames, noise, rate, steps per plan
+    facts: dict[str, Any]  # shapes, columns, order of frames, noise, control rate and steps per plan, for the caller
 
     def batch(self, size: int) -> tuple[Tensor, ...]:
         """Returns example inputs of several robots, all different."""
@@ -73,9 +73,9 @@ class Exportable:
 def exportable(
     policy: PlanningPolicy, *, columns: Mapping[str, Mapping[str, str]], kinds: Sequence[str] = (), note: str = ""
 ) -> Exportable:
-    """Returns a policy as a plain module, with name to unit of every column of ``"observations"`` and ``"actions"``.
+    """Returns a policy as a plain module; its facts also hold the ``kinds`` of the actions and the ``note``.
 
-    ``kinds`` of the actions and a ``note`` join the facts.
+    ``columns`` maps names to units, for the columns of ``"observations"`` and of ``"actions"``.
     """
     planner, generator = policy.planner, torch.Generator().manual_seed(0)
     sizes = (1, policy.history, len(columns["observations"])), (1, *planner.noise_shape)
@@ -111,14 +111,14 @@ def _tensors(tensors: Mapping[str, Tensor], columns: Mapping[str, Mapping[str, s
 def export_policy(
     what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5
 ) -> Callable[..., Outputs]:
-    """Writes a policy of :func:`exportable`, compares the file with the original and returns what it loads as.
+    """Writes a policy of :func:`exportable`, compares the file with the original and returns the loaded program.
 
-    The batch of the file is dynamic: it is tried with one robot and with three. The facts are in the file:
-    ``torch.export.load(file, extra_files={"facts.json": ""})``, the metadata of an ONNX model, entry by entry as JSON,
-    ``get_metadata()`` of an AOTInductor package.
+    The file's batch size is dynamic; it is tested with one robot and with three. The file holds the facts: read them by
+    ``torch.export.load(file, extra_files={"facts.json": ""})``, from the metadata of an ONNX model (JSON per entry), or
+    by ``get_metadata()`` of an AOTInductor package.
 
     Kinds are ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) and ``"aoti"`` (AOTInductor;
-    needs a C++ compiler). The tolerance is relative to the largest number of the original's output. It is an
+    needs a C++ compiler). The tolerance is relative to the largest number of the original's output. Raises an
     ExportError if a package or compiler is missing, or the numbers differ.
     """
     write, read = lookup(_KINDS, kind, "export format")
@@ -133,7 +133,7 @@ def export_policy(
 
 
 def relative_gap(found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
-    """Largest difference of the first outputs, relative to the largest number of what was expected."""
+    """Returns the largest difference of the first outputs, relative to the largest number expected."""
     gap, size = (found[0] - expected[0]).abs().max(), expected[0].abs().max()
     return float(gap / size) if size > 0 else float(gap)
 
@@ -143,7 +143,7 @@ def _program(what: Exportable) -> torch.export.ExportedProgram:
 
 
 def _shapes(what: Exportable, batch: Any) -> tuple[dict[int, Any], ...]:
-    """The name of the first axis of every input."""
+    """Marks the first axis of every input as dynamic."""
     return tuple({0: batch} for _ in what.inputs)
 
 
@@ -168,7 +168,7 @@ def _write_onnx(what: Exportable, file: Path) -> None:
 
 
 def _texts(facts: Mapping[str, Any]) -> dict[str, str]:
-    """Facts for a format that knows texts alone: texts as they are, all else as JSON."""
+    """Converts facts for a format that stores only strings: other values become JSON."""
     return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}
 
 
@@ -191,7 +191,7 @@ def _write_aoti(what: Exportable, file: Path) -> None:
     options = {"aot_inductor.metadata": _texts(what.facts)}
     try:
         torch._inductor.aoti_compile_and_package(_program(what), package_path=str(file), inductor_configs=options)
-    except Exception as error:  # the compiler is asked in many places
+    except Exception as error:  # many places raise for a missing compiler, with different types
         if "compiler" in str(error).lower():
             raise ExportError(f"AOTInductor needs a C++ compiler such as g++: {str(error).splitlines()[0]}") from error
         raise

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The factory of policies."""
+"""Makes policies from a planner, a controller and the facts of a task."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ def make_policy(
     follower: Follower | None = None,
     **options: Any,
 ) -> PlanningPolicy:
-    """Makes a policy of planner and controller: observations in, an action per control step out.
+    """Makes a policy from planner and controller; it maps observations to one action per control step.
 
-    The facts of a task, all but the first two keyword arguments, are handed over by
-    :func:`~torchrl_koap.training.policy_facts.policy_facts`.
+    All keyword arguments but the first two are facts of a task;
+    :func:`~torchrl_koap.training.policy_facts.policy_facts` returns them.
 
     Args:
-        planner (StatePlanner or DiffusionPolicy): samples plans; or actions, which no controller decodes.
+        planner (StatePlanner or DiffusionPolicy): samples plans, or actions that need no controller.
         controller (nn.Module, optional): an :class:`~torchrl_koap.modules.InverseDynamics` or a
-            :class:`~torchrl_koap.modules.ResponseModel` (plans are followed by :class:`~torchrl_koap.modules.MPC`).
+            :class:`~torchrl_koap.modules.ResponseModel` (then :class:`~torchrl_koap.modules.MPC` follows the plans).
 
     Keyword Args:
         state_of (callable, or sequence of int): as for :class:`~torchrl_koap.modules.PlanningPolicy`, like
             ``execution`` and the options.
-        reads (callable, optional): what an inverse dynamics reads of states ``[*B, T, d]``. Default: all.
+        reads (callable, optional): selects what an inverse dynamics reads of states ``[*B, T, d]``. Default: all.
         action_rule (callable, optional): as for ``Follower``.
-        changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
+        changes (sequence of int): action columns that are changes of a command; the gain multiplies them.
         commanded (mapping, optional): for each of these the observation column that repeats the command
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
-        ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
-            may be any; ``execution.limits`` widens them. Default: actions may be any.
+        ranges (sequence, optional): demonstrated minimum and maximum of every action column, None for an unlimited
+            one; ``execution.limits`` widens them. Default: no limits.
         follower (Follower, optional): follows plans in place of the controller.
         **options: ``decoded``, ``max_steps``, ``control_hz``, ``observe``, ``origins`` and the keys.
 
@@ -57,8 +57,8 @@ def make_policy(
         PlanningPolicy: the policy.
 
     Raises:
-        ValueError: as :class:`~torchrl_koap.modules.PlanningPolicy`, or for a gain or lead where no action is a change
-            of a command (that is observed).
+        ValueError: as :class:`~torchrl_koap.modules.PlanningPolicy`; for a gain if no action is a change of a command;
+            for a lead if no such command is observed.
 
     Examples:
         >>> from torchrl_koap.modules import Execution, StatePlanner, TemporalUnet, make_policy
@@ -71,7 +71,7 @@ def make_policy(
     execution = Execution() if execution is None else execution
     followed: dict[str, Any] = {"blend": execution.blend, "action_rule": action_rule}
     if follower is None and isinstance(controller, ResponseModel):
-        look_ahead = planner.horizon - execution.replan_interval + 1  # what every plan tells at its last step
+        look_ahead = planner.horizon - execution.replan_interval + 1  # planned states left at a plan's last step
         follower = MPC(controller, look_ahead=look_ahead, **followed)
     elif follower is None and controller is not None:
         follower = InverseDynamicsFollower(controller, reads=reads, **followed)

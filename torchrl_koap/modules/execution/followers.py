@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Followers turn a plan into actions: the base class, and inverse dynamics as a follower."""
+"""Follower modules, which turn plans into actions: the base class, and inverse dynamics as a follower."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 ActionRule = Callable[[Tensor, Tensor], Tensor]  # (states [*B, T, d], actions [*B, T, act]) -> actions
-# five times the weights of a plan's first states in where it has the robot at present
+# weights, times 5, that extrapolate a plan's first five states to the present
 _AT_PRESENT = (9.0, 0.0, -4.0, -3.0, 3.0)
 
 
@@ -22,15 +22,15 @@ class Follower(nn.Module):
     """Base class of modules that turn a plan into actions; a subclass defines ``forward``.
 
     Args:
-        controller (nn.Module, optional): what it decides by, whose weights are saved.
+        controller (nn.Module, optional): model that decodes actions; its weights are saved.
 
     Keyword Args:
         num_frames (int): observed frames that it reads, the present one included.
         blend (float): share of the distance to the plan that remains after each frame (:func:`blend_plan`).
-        action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` has the
-            last word on the actions of a window, such as a gripper's number; ``task.action_rule``.
+        action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` is applied
+            last to the actions of a window, for example to set a gripper command; ``task.action_rule``.
 
-    One that ``knows_command`` reads the last command: it looks at every step, and its actions take no gain.
+    A follower with ``knows_command`` reads the last command. It decodes at every step, and no gain applies to it.
     """
 
     knows_command = False
@@ -48,25 +48,25 @@ class Follower(nn.Module):
         self.blend, self.action_rule = blend, action_rule
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
-        """The actions of the next steps ``[*B, steps, act]``, raw units.
+        """Returns the actions of the next steps ``[*B, steps, act]``, raw units.
 
-        Of observations ``[*B, history, obs]``, the present one last, states are ``[*B, history, d]``; planned ones
-        ``[*B, H, d]``, the next one first. Actions after the first are as if every planned state was reached.
+        Observations are ``[*B, history, obs]`` and their states ``[*B, history, d]``, the present one last; the plan is
+        ``[*B, H, d]``, the next state first. Actions after the first assume that every planned state is reached.
         """
         raise NotImplementedError
 
     def attach(self, env: EnvBase) -> None:
-        """Receives the batch of environments before their episodes begin, of which only those under way are decoded."""
+        """Receives the batch of environments before their episodes begin; only running episodes are decoded later."""
 
 
 class InverseDynamicsFollower(Follower):
     """Decodes actions from the window of observed and planned states.
 
-    Before anything is decoded the plan is *blended* into the present state (:func:`blend_plan`). An inverse dynamics is
-    fitted to motions that happened, in which no step leaps; a plan that begins beside the robot it follows badly.
+    Before decoding, the plan is *blended* into the present state (:func:`blend_plan`). An inverse dynamics is fitted to
+    recorded motions, which contain no jumps, so it follows a plan badly that begins away from the robot.
 
     The controller is an InverseDynamics, or another module with ``num_past`` that reads a window of states ``[*B, T,
-    d]`` and writes actions ``[*B, T, act]``. What it reads of states ``[*B, T, w]`` is ``reads``, all by default.
+    d]`` and writes actions ``[*B, T, act]``. ``reads`` selects its input from states ``[*B, T, w]``; default: all.
     """
 
     def __init__(self, controller: InverseDynamics, *, reads: Callable[[Tensor], Tensor] | None = None, **options: Any):
@@ -74,7 +74,7 @@ class InverseDynamicsFollower(Follower):
         self.reads = reads
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
-        """The actions of the next steps; arguments as for :class:`Follower`."""
+        """Decodes the actions of the next steps; arguments as for :class:`Follower`."""
         window = torch.cat([states, blend_plan(states, plan, self.blend)], -2)
         window = window if self.reads is None else self.reads(window)
         out = self.controller(TensorDict({self.controller.in_keys[0]: window}, batch_size=window.shape[:-2]))
@@ -86,7 +86,7 @@ class InverseDynamicsFollower(Follower):
 
 
 def command_rest(action_rule: ActionRule | None, states: Tensor, plan: Tensor, width: int, steps: int) -> Tensor:
-    """Actions ``[*B, steps, width]`` that a rule alone tells from observed and planned states; zero where it does not.
+    """Returns actions ``[*B, steps, width]`` of an action rule alone; entries that the rule does not set are zero.
 
     The other arguments are those of :class:`Follower`.
     """
@@ -97,7 +97,7 @@ def command_rest(action_rule: ActionRule | None, states: Tensor, plan: Tensor, w
 
 
 def remaining_plan(plan: Tensor, age: Tensor | int) -> Tensor:
-    """What is left of plans ``[*B, H, w]`` that were made ``age [*B]`` steps ago, their last state repeated."""
+    """Returns the rest of plans ``[*B, H, w]`` made ``age [*B]`` steps ago, padded by repeating the last state."""
     steps, last = torch.arange(plan.shape[-2], device=plan.device), plan.shape[-2] - 1
     if isinstance(age, int):
         return plan[..., (steps + age).clamp_max(last), :]
@@ -106,21 +106,21 @@ def remaining_plan(plan: Tensor, age: Tensor | int) -> Tensor:
 
 
 def blend_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
-    r"""Shifts a plan to begin at the present state; the shift decays along the plan.
+    r"""Shifts a plan so that it begins at the present state; the shift decays along the plan.
 
     .. math::
         x'_{t+k} = x_{t+k} + \rho^k e, \qquad e = x_t - (9 x_{t+1} - 4 x_{t+3} - 3 x_{t+4} + 3 x_{t+5}) / 5
 
-    with the present state ``x_t`` and where the plan has the robot at present: its first five states, continued
-    backwards along their least-squares parabola. A line would take acceleration for a distance to the robot.
+    where ``x_t`` is the present state and the fraction is the plan's present state: a least-squares parabola through
+    its first five states, extrapolated backwards. A line would mistake acceleration for a distance to the robot.
 
     Args:
         history (Tensor): observed states ``[*B, h, d]``, the present one last.
-        plan (Tensor): planned states ``[*B, H, d]``; one shorter than five states is returned as it is.
-        decay (float): ``rho``.
+        plan (Tensor): planned states ``[*B, H, d]``; plans of fewer than five states are returned unchanged.
+        decay (float): ``rho``; 0 returns the plan unchanged.
 
     Returns:
-        Tensor: the bent plan ``[*B, H, d]``.
+        Tensor: the shifted plan ``[*B, H, d]``.
 
     Examples:
         >>> import torch

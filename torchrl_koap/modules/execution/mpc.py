@@ -11,32 +11,32 @@ from torch import Tensor, nn
 
 from torchrl_koap.modules.execution.followers import Follower, blend_plan, command_rest
 
-SMOOTHNESS = 3.0  # weight of a change of the commanded velocity against a distance from the plan
-END_SPEED = 5.0  # weight of the speed at the end of the look-ahead: a short one is unstable without
+SMOOTHNESS = 3.0  # weight of changes of the commanded velocity, relative to distances from the plan
+END_SPEED = 5.0  # weight of the speed at the end of the look-ahead: a short look-ahead is unstable without it
 
 
 class ResponseModel(nn.Module):
     r"""Predicts measured positions from position commands by linear dynamics of delayed coordinates.
 
-    An arm under its tracking law is behind its command, and how far tells where it goes next. The coordinates of the
-    model are the last steps of the measured positions ``x``, the distance from there to the command ``c``, and the last
-    changes of the command ``a``, ``m = 2`` of each:
+    A position-controlled arm lags behind its command, and the lag determines its next motion. The coordinates of the
+    model are the last ``m = 2`` steps of the measured positions ``x``, the distance from the present position to the
+    command ``c``, and the last ``m`` changes ``a`` of the command:
 
     .. math::
         x_{t+1} = x_t + \sum_{k=0}^{m-1} A_k (x_{t-k} - x_{t-k-1}) + C (c_t - x_t) + \sum_{k=1}^{m} B_k a_{t-k},
         \qquad c_{t+1} = c_t + a_t
 
-    which is a Koopman model with control whose lifting is a delay embedding (Korda and Mezić, 2018, Linear predictors
-    for nonlinear dynamical systems, section 3). What is commanded at ``t`` is seen from ``t + 2`` on: a measurement is
-    taken before the command of its control step takes effect.
+    This is a Koopman model with control whose lifting is a delay embedding (Korda and Mezić, 2018, Linear predictors
+    for nonlinear dynamical systems, section 3). A command given at ``t`` affects measurements from ``t + 2`` on: each
+    measurement is taken before the command of its control step takes effect.
 
     Args:
-        states (sequence of int): columns of the state that hold the measured positions ``[J]``.
-        commands (sequence of int): columns of the observation that repeat the last commands ``[J]``.
-        actions (sequence of int): columns of the action that change them, or set them ``[J]``.
+        states (sequence of int): state columns of the measured positions ``[J]``.
+        commands (sequence of int): observation columns that repeat the last commands ``[J]``.
+        actions (sequence of int): action columns that change, or set, these commands ``[J]``.
 
     Keyword Args:
-        action_dim (int, optional): entries of an action. Default: those that move an axis.
+        action_dim (int, optional): entries of an action. Default: ``J``.
         absolute (bool): an action is the command itself instead of its change. Defaults to ``False``.
 
     Raises:
@@ -52,7 +52,7 @@ class ResponseModel(nn.Module):
         [4.0, 6.0, 7.0]
     """
 
-    memory = 2  # past steps, and past changes of the command, that are read
+    memory = 2  # number of past steps, and of past changes of the command, that the model reads
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class ResponseModel(nn.Module):
 
     @property
     def num_axes(self) -> int:
-        """``J``."""
+        """The number ``J`` of axes."""
         return len(self.states)
 
     @property
@@ -85,8 +85,8 @@ class ResponseModel(nn.Module):
     def coordinates(self, positions: Tensor, lead: Tensor, changes: Tensor) -> Tensor:
         """Returns the regressors of the next step, ``[*B, J, 2 memory + 1]``.
 
-        Measured positions are ``[*B, memory + 1, J]``, the present one last; the distance from there to the command
-        ``[*B, J]``; changes of the command ``[*B, memory, J]``, the latest last.
+        Measured positions are ``[*B, memory + 1, J]``, the present one last; ``lead`` is the distance from there to the
+        command, ``[*B, J]``; changes of the command are ``[*B, memory, J]``, the latest last.
         """
         steps = positions.diff(dim=-2).flip(-2).movedim(-2, -1)
         return torch.cat([steps, lead.unsqueeze(-1), changes.flip(-2).movedim(-2, -1)], -1)
@@ -98,11 +98,11 @@ class ResponseModel(nn.Module):
 
         Args:
             positions (Tensor): measured ``[*B, memory + 1, J]``, the present one last.
-            command, changes (Tensor): the last command ``[*B, J]``, and what led to it ``[*B, memory, J]``.
-            future (Tensor): the changes to come ``[*B, N, J]``; the last one is not seen within N steps.
+            command, changes (Tensor): the last command ``[*B, J]``, and its last changes ``[*B, memory, J]``.
+            future (Tensor): future changes ``[*B, N, J]``; the last one has no effect within N steps.
 
         Keyword Args:
-            weight (Tensor, optional): coefficients ``[J, J, 2 memory + 1]`` to predict with. Default: its own.
+            weight (Tensor, optional): coefficients ``[J, J, 2 memory + 1]``. Default: those of the model.
         """
         weight, predicted = (self.weight if weight is None else weight).to(positions.dtype), []
         for change in future.unbind(-2):
@@ -114,9 +114,9 @@ class ResponseModel(nn.Module):
         return torch.stack(predicted, -2)
 
     def impulse_matrix(self, steps: int) -> Tensor:
-        """Effect of future changes of the command on the next ``N = steps`` positions, float64 ``[N, J, N - 1, J]``.
+        """Computes the effect of future changes of the command on the next ``N = steps`` positions.
 
-        The last two are step and axis of the change, the first two those of the position.
+        The result is float64 ``[N, J, N - 1, J]``: step and axis of the position, then step and axis of the change.
         """
         axes = self.num_axes
         pushes = torch.eye(steps * axes, dtype=torch.float64, device=self.weight.device)
@@ -129,11 +129,11 @@ class ResponseModel(nn.Module):
     def fit_ridge(
         self, coordinates: Tensor, steps: Tensor, *, penalty: float = 1e-5, coupled: bool = True
     ) -> ResponseModel:
-        """Fits this model to measured steps by ridge regression, and returns it.
+        """Fits this model to measured steps by ridge regression and returns it.
 
         Coordinates are ``[n, J, 2 memory + 1]`` (:meth:`coordinates`), the steps that followed ``[n, J]``; the penalty
-        is relative to the coordinates' mean squares. Axes that are ``coupled`` may answer the commands of others, else
-        each one is fitted by itself.
+        is relative to the coordinates' mean squares. ``coupled`` axes may respond to each other's commands; otherwise
+        every axis is fitted separately.
         """
         axes, size = self.num_axes, 2 * self.memory + 1
         read, wanted = coordinates.double(), steps.double()
@@ -150,7 +150,7 @@ class ResponseModel(nn.Module):
 
 
 def _ridge(read: Tensor, wanted: Tensor, penalty: float) -> Tensor:
-    """Coefficients ``[f, k]`` of ``read [n, f]`` for ``wanted [n, k]``."""
+    """Returns the coefficients ``[f, k]`` that predict ``wanted [n, k]`` from ``read [n, f]``."""
     square = read.T @ read
     square.diagonal().add_(penalty * len(read))
     return torch.linalg.solve(square, read.T @ wanted)
@@ -159,25 +159,24 @@ def _ridge(read: Tensor, wanted: Tensor, penalty: float) -> Tensor:
 class MPC(Follower):
     r"""Follows plans by model predictive control of the robot's response to its commands.
 
-    An inverse dynamics model reads the target state, not the last command. How far the command is ahead of the robot
-    decides its next motion, and the policy knows the command. The response
-    (:class:`~torchrl_koap.modules.ResponseModel`) is linear, so the next changes ``a`` of the command come in closed
-    form:
+    The distance of the command from the robot determines the robot's next motion. MPC reads the last command; an
+    inverse dynamics model reads only states. The response (:class:`~torchrl_koap.modules.ResponseModel`) is linear, so
+    the next changes ``a`` of the command have a closed form:
 
     .. math::
         \min_a \sum_{k=1}^{N} |y_k - p_k|^2 + \gamma^2 |(y_N - y_{N-1}) - (p_N - p_{N-1})|^2
             + \lambda \sum_{k=0}^{N-2} |a_k - a_{k-1}|^2
 
     with predicted positions ``y``, planned ones ``p``, the last change ``a_{-1}``, ``lambda = 3``, ``gamma = 5``. The
-    first change is executed, and the next step looks again (dynamic matrix control: Cutler and Ramaker, 1980).
+    first change is executed; the next step solves again (dynamic matrix control: Cutler and Ramaker, 1980).
 
     Args:
-        response (ResponseModel): the robot's response, fitted: gains are computed once (:meth:`refresh`).
+        response (ResponseModel): the fitted response of the robot; gains are computed once (:meth:`refresh`).
 
     Keyword Args:
-        look_ahead (int): ``N``, planned states that are looked at.
-        **options: ``blend`` and ``action_rule``, which tells the entries that the response does not know, see
-            ``Follower``.
+        look_ahead (int): number ``N`` of planned states that are read.
+        **options: ``blend`` and ``action_rule`` of ``Follower``; the rule sets the action entries that the response
+            does not model.
 
     Raises:
         ValueError: for a look-ahead below 2.
@@ -204,10 +203,10 @@ class MPC(Follower):
         self.register_load_state_dict_post_hook(type(self).refresh)
 
     def refresh(self, *_: Any) -> None:
-        """Solves the quadratic problem once for all plans, anew for another response; loading weights does so too.
+        """Solves the quadratic problem for all plans; call it after the response changes. Loading weights calls it.
 
-        The gain of the distance from the plan if the command is held is ``[(N - 1) J, N J]``, that of the last change
-        of the command ``[(N - 1) J, J]``; both float64.
+        The gain of the distance from the plan under a constant command is ``[(N - 1) J, N J]``, that of the last change
+        of the command ``[(N - 1) J, J]``; both are float64.
         """
         axes, steps = self.controller.num_axes, self.look_ahead
         effect = self.controller.impulse_matrix(steps).reshape(steps * axes, (steps - 1) * axes)
@@ -222,7 +221,7 @@ class MPC(Follower):
         self.follow_gain, self.keep_gain = inverse @ effect.T @ measured, SMOOTHNESS * inverse[:, :axes]
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
-        """Computes the actions of the next steps by predicted positions; beyond the look-ahead the command stays."""
+        """Computes the actions of the next steps; beyond the look-ahead the command is held."""
         model = self.controller
         tracked = self.track(observations, states, plan)[..., :steps, :]
         if (missing := steps - tracked.shape[-2]) > 0:
@@ -233,9 +232,9 @@ class MPC(Follower):
         return actions
 
     def track(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:
-        """The next actions ``[*B, look_ahead - 1, J]`` of the entries that the response knows.
+        """Computes the next actions ``[*B, look_ahead - 1, J]`` of the entries that the response models.
 
-        They are changes of the command, or commands where actions are absolute; arguments as for :class:`Follower`.
+        They are changes of the command, or commands if actions are absolute; arguments as for :class:`Follower`.
         """
         model = self.controller
         positions, goal = states[..., model.states], plan[..., model.states]

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The policy: it makes a plan every few steps and follows it in between."""
+"""The policy, which makes a plan every few steps and follows it in between."""
 
 from __future__ import annotations
 
@@ -26,46 +26,46 @@ from torchrl_koap.modules.planning.planner import StatePlanner
 OBSERVATION_HISTORY = "observation_history"
 IS_INIT = "is_init"
 PLANNED_STATE = "planned_state"
-UNDER_WAY = "_step"  # of a batch in a rollout of TorchRL, which episodes are not over
+UNDER_WAY = "_step"  # TorchRL's mask of the environments of a batch whose episodes are still running
 
 
 class PlanningPolicy(TensorDictModuleBase):
     """Samples plans of states and follows them, or samples chunks of actions and executes their beginning.
 
-    :func:`~torchrl_koap.modules.make_policy` makes one of the facts of a task. Every environment of a batch re-plans in
-    its own rhythm, counted from its own reset (:class:`torchrl.modules.MultiStepActorWrapper`); batches may have any
-    shape, ``[]`` of a single environment included. The current plan travels in the tensordict; where it is lost on the
-    way (a :class:`torchrl.envs.ParallelEnv` whose workers reset by themselves hands on its own entries alone), the
-    policy remembers what it wrote last.
+    :func:`~torchrl_koap.modules.make_policy` makes one from the facts of a task. Every environment of a batch re-plans
+    at its own times, counted from its own reset (:class:`torchrl.modules.MultiStepActorWrapper`). Batches may have any
+    shape, including ``[]`` for a single environment. The current plan is stored in the tensordict. The policy also
+    remembers the last one that it wrote: a :class:`torchrl.envs.ParallelEnv` whose workers reset by themselves returns
+    only its own entries.
 
-    :func:`torch.compile` leaves a policy as it is, since plans are made where data say so; :meth:`compile` compiles its
+    :func:`torch.compile` does not change a policy, since data decide when plans are made; :meth:`compile` compiles its
     denoiser in place.
 
     Args:
         planner (StatePlanner or DiffusionPolicy): samples plans from the last observed states.
-        follower (Follower, optional): turns plans into actions. Default: what is sampled are actions.
+        follower (Follower, optional): turns plans into actions. Default: none, the planner samples actions.
 
     Keyword Args:
-        state_of (callable, or sequence of int): from observations ``[*B, obs]`` to states ``[*B, d]``, or the columns
-            that make up the state.
+        state_of (callable, or sequence of int): maps observations ``[*B, obs]`` to states ``[*B, d]``, or lists the
+            columns of the state.
         execution (Execution, optional): how plans become actions. Default: ``Execution()``.
-        decoded (mapping, optional): for actions that are decoded as commands and taken as their changes, the columns of
-            the ``"actions"`` and of the observations that repeat the last ``"commands"``.
-        limits (CommandLimits, optional): has the last word on actions. How many of how many left their range is in
-            ``limited``, int64 ``[2]``.
-        max_steps (int): steps of an episode, whose start noise is drawn at once.
-        control_hz (float, optional): frames per second of the data. Default: not known.
-        observe (callable, optional): from what a robot gives, a mapping with camera frames, to observations
-            ``[*B, obs]`` (:class:`~torchrl_koap.vision.Observer`). Default: the robot gives observations.
-        origins (tuple, optional): what the data lack of the numbers that the robot reports ``[obs]`` and takes
-            ``[act]``; an :class:`~torchrl_koap.modules.Agent` and exported files subtract and add it.
+        decoded (mapping, optional): for actions that are decoded as commands but executed as their changes, the columns
+            of the ``"actions"`` and of the observations that repeat the last ``"commands"``.
+        limits (CommandLimits, optional): limits actions last. ``limited``, int64 ``[2]``, counts the actions that left
+            their range, and all.
+        max_steps (int): steps of an episode, for all of which start noise is drawn together.
+        control_hz (float, optional): frames per second of the data. Default: unknown.
+        observe (callable, optional): maps robot data with camera frames to observations ``[*B, obs]``
+            (:class:`~torchrl_koap.vision.Observer`). Default: the robot returns observations.
+        origins (tuple, optional): offsets that were subtracted from observations ``[obs]`` and actions ``[act]`` of the
+            data; an :class:`~torchrl_koap.modules.Agent` and exported files subtract and add them.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
     Raises:
-        ValueError: for an interval longer than the horizon, a follower that cannot be executed so, a StatePlanner
-            without one or a DiffusionPolicy with one. At the first call for a history of another length.
-        KeyError: at the first call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
+        ValueError: for a replan interval longer than the horizon, a follower that does not support the execution, a
+            StatePlanner without follower or a DiffusionPolicy with one. At a call for a history of another length.
+        KeyError: at a call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
 
     Examples:
         >>> import torch
@@ -100,19 +100,19 @@ class PlanningPolicy(TensorDictModuleBase):
         if isinstance(planner, StatePlanner if follower is None else DiffusionPolicy):
             samples = "states: a controller must" if follower is None else "actions: no controller may"
             raise ValueError(f"{type(planner).__name__} samples {samples} decode them")
-        if follower is None:  # what is sampled is executed
+        if follower is None:  # the sampled actions are executed
             execution = execution.replaced(strategy="open_loop")
         knows_command = follower is not None and follower.knows_command
         if knows_command and execution.strategy == "open_loop":
-            raise ValueError(f"{type(follower).__name__} looks at every step: strategy must not be 'open_loop'")
+            raise ValueError(f"{type(follower).__name__} decodes at every step: strategy must not be 'open_loop'")
         if knows_command and execution.gain != 1:
-            raise ValueError(f"{type(follower).__name__} knows how commands are answered: gain must be 1")
+            raise ValueError(f"{type(follower).__name__} models the response to commands: gain must be 1")
         if execution.replan_interval > planner.horizon:
             raise ValueError(
                 f"replan_interval must be in 1..{planner.horizon} (the horizon), got {execution.replan_interval}"
             )
         self.planner, self.follower, self.limits = planner, follower, limits
-        given = {} if decoded is None or knows_command else decoded  # what knows the command gives its changes
+        given = {} if decoded is None or knows_command else decoded  # such a follower already returns changes
         self.decoded = {name: list(columns) for name, columns in given.items()} or None
         self.execution, self.max_steps, self.control_hz = execution, max_steps, control_hz
         self.observe = observe
@@ -120,7 +120,7 @@ class PlanningPolicy(TensorDictModuleBase):
         self.state_of = columns_of(state_of)
         self.origins = None if origins is None else [torch.tensor(part, dtype=torch.float64) for part in origins]
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
-        self._decodes = follower is not None and execution.strategy != "open_loop"  # at every step
+        self._decodes = follower is not None and execution.strategy != "open_loop"  # decodes at every step
         chunk_key = PLAN if self._decodes else ACTION_CHUNK
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self._action_key, self._chunk_key = action_key, chunk_key  # out_keys may be selected
@@ -135,11 +135,11 @@ class PlanningPolicy(TensorDictModuleBase):
 
     @property
     def noise_shape(self) -> tuple[int, ...]:
-        """Shape of everything that is drawn for one environment whenever a plan is due."""
+        """Shape of the start noise of one environment's plan."""
         return self.planner.noise_shape
 
     def check_rate(self, control_hz: float) -> None:
-        """Warns if a control rate (Hz) is outside 0.8 to 1.25 times that of the data; refuses what is not positive."""
+        """Warns if a control rate (Hz) is outside 0.8 to 1.25 times that of the data; raises if it is not positive."""
         number = isinstance(control_hz, (int, float, np.number)) and not isinstance(control_hz, bool)
         if not (number and math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz!r}")
@@ -151,19 +151,19 @@ class PlanningPolicy(TensorDictModuleBase):
             )
 
     def from_robot(self, observations: Tensor) -> Tensor:
-        """Subtracts the origin from what the robot reports ``[*B, obs]``, in float64, where there is one."""
+        """Subtracts the origin, if there is one, from the robot's observations ``[*B, obs]``, in float64."""
         if self.origins is None or observations.shape[-1] != len(self.origins[0]):
             return observations
         return observations.double() - self.origins[0].to(observations.device)
 
     def to_robot(self, actions: Tensor) -> Tensor:
-        """Adds the origin to actions ``[*B, act]``, in float64, where there is one."""
+        """Adds the origin, if there is one, to actions ``[*B, act]``, in float64."""
         return actions if self.origins is None else actions.double() + self.origins[1].to(actions.device)
 
     def plan(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Makes what is executed next: planned states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
+        """Makes the next plan: states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
 
-        Observations are ``[*B, history, obs]`` in raw units, noise ``[*B, *noise_shape]`` is drawn by default.
+        Observations are ``[*B, history, obs]`` in raw units; noise is ``[*B, *noise_shape]``, drawn by default.
         """
         states = self.state_of(observations)
         chunk = self.sample(states, noise)
@@ -174,8 +174,8 @@ class PlanningPolicy(TensorDictModuleBase):
     def sample(self, states: Tensor, noise: Tensor | None = None, **options: Any) -> Tensor:
         """Samples plans ``[*B, H, w]`` at the temperature of the execution.
 
-        The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`; options are of the planner's
-        ``sample``, such as the ``prefix``.
+        The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`; options go to the planner's
+        ``sample``, for example ``prefix``.
         """
         if noise is None:
             shape = (*states.shape[:-2], *self.noise_shape)
@@ -184,9 +184,9 @@ class PlanningPolicy(TensorDictModuleBase):
         return self.planner.sample(seen, self.execution.temperature * noise, **options)
 
     def act(self, observations: Tensor, plan: Tensor, age: Tensor | int) -> Tensor:
-        """The action ``[*B, act]`` of a step, command limits included.
+        """Returns the action ``[*B, act]`` of a step, after command limits.
 
-        Observations are ``[*B, history, obs]`` in raw units, the plan is of :meth:`plan`, ``age [*B]`` steps old.
+        Observations are ``[*B, history, obs]`` in raw units; the plan, from :meth:`plan`, is ``age [*B]`` steps old.
         """
         left = remaining_plan(plan, age)
         if self._decodes:
@@ -201,11 +201,11 @@ class PlanningPolicy(TensorDictModuleBase):
     def decode_ahead(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Plans and decodes the actions of the next steps at once.
 
-        This is what is exported, stateless and without branches on data. Actions are as if the robot moved as it is
-        commanded. Arguments as for :meth:`plan`.
+        Exported files hold this method: it is stateless and has no branches on data. The actions assume that the robot
+        moves as commanded. Arguments as for :meth:`plan`.
 
         Returns:
-            tuple: the actions ``[*B, replan_interval, act]``, and which of them were held in their range, bool
+            tuple: the actions ``[*B, replan_interval, act]``, and which of them were clipped to their range, bool
             ``[*B, replan_interval]``.
         """
         states, steps = self.state_of(observations), self.execution.replan_interval
@@ -218,7 +218,7 @@ class PlanningPolicy(TensorDictModuleBase):
         return self.limits(observations.unsqueeze(-3), actions)
 
     def _taken(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Actions ``[*B, n, act]`` of decoded ones, after observations ``[*B, history, obs]``."""
+        """Turns ``decoded`` commands in actions ``[*B, n, act]``, after observations ``[*B, h, obs]``, into changes."""
         if self.decoded is None:
             return actions
         commands, taken = actions[..., self.decoded["actions"]], actions.clone()
@@ -228,7 +228,7 @@ class PlanningPolicy(TensorDictModuleBase):
         return taken
 
     def attach(self, env: EnvBase) -> None:
-        """Tells the follower the batch of environments whose episodes are about to begin."""
+        """Passes to the follower the batch of environments whose episodes are about to begin."""
         if self.follower is not None:
             self.follower.attach(env)
 
@@ -236,9 +236,9 @@ class PlanningPolicy(TensorDictModuleBase):
         """Compiles the denoiser, which takes most of the time; arguments as for :func:`torch.compile`."""
         self.planner.denoiser.compile(*args, **kwargs)
 
-    @torch.compiler.disable  # a graph would keep the counter of its first call; torch.compile(policy) acts as it is
+    @torch.compiler.disable  # a graph would freeze the step counter of its first call
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action of the current step, and the plan that the next one continues from."""
+        """Writes the action of the current step, and the plan that the next step continues."""
         observed = tensordict.get(self.in_keys[0], None)
         for name, value in ((self.in_keys[0], observed), (IS_INIT, tensordict.get(IS_INIT, None))):
             if value is None:
@@ -252,7 +252,7 @@ class PlanningPolicy(TensorDictModuleBase):
             if not tensordict.get(IS_INIT).all():
                 tensordict.update(self._written)
         noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
-        # the wrapper wants one batch dimension
+        # MultiStepActorWrapper needs exactly one batch dimension
         flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
         flat = flat.reshape(-1) if batch else flat.unsqueeze(0)
         under_way = tensordict.get(UNDER_WAY, None)
@@ -276,7 +276,7 @@ class PlanningPolicy(TensorDictModuleBase):
 
 
 class _Chunk(TensorDictModuleBase):
-    """The part that runs only when a plan is due; a TensorDictModule of a method of the policy cannot be pickled."""
+    """Makes a plan when one is due. A TensorDictModule of a bound method would not be picklable."""
 
     def __init__(self, plan: Callable, history_key: NestedKey, noise_key: NestedKey | None, chunk_key: NestedKey):
         super().__init__()
@@ -289,7 +289,7 @@ class _Chunk(TensorDictModuleBase):
 
 
 def columns_of(state_of: Callable[[Tensor], Tensor] | Sequence[int]) -> Callable[[Tensor], Tensor]:
-    """Returns what makes states of observations; columns become a module that selects them."""
+    """Returns a function from observations to states; a list of columns becomes a module that selects them."""
     return state_of if callable(state_of) else _Columns(state_of)
 
 

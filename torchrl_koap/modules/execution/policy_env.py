@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Environment transforms for policies: the history of observations, and seeded start noise."""
+"""Environment transforms that policies need: the history of observations, and seeded start noise."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ NOISE = "noise"
 
 
 class NoiseStreams:
-    """Draws standard normal noise of episodes, which depends on an episode's seed and step alone.
+    """Draws standard normal noise of episodes that depends only on the seed of the episode and the step.
 
-    There is a seed per episode. Numbers are drawn for a block of steps at once (``policy.max_steps``), since torch
-    fills tensors in groups of 16, so that draws step by step would be others. A draw has the shape
-    ``policy.noise_shape``.
+    Noise of shape ``policy.noise_shape`` is drawn for a block of steps at once (``policy.max_steps``). Step-by-step
+    draws would give other numbers, since torch fills tensors in groups of 16.
     """
 
     def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, block: int):
@@ -37,7 +36,7 @@ class NoiseStreams:
         return len(self._generators)
 
     def draw(self) -> Tensor:
-        """The noise of the next step ``[E, *shape]``."""
+        """Returns the noise of the next step ``[E, *shape]``."""
         if not self._left:
             size = (self.block, *self.shape)
             self._draws = torch.stack([torch.randn(size, generator=g, dtype=torch.float32) for g in self._generators])
@@ -47,20 +46,20 @@ class NoiseStreams:
 
 
 class NoiseTransform(Transform):
-    """Writes start noise at every reset and step of an environment; number ``i`` of a batch draws with ``seed + i``.
+    """Writes start noise at every reset and step of an environment; environment ``i`` of a batch uses ``seed + i``.
 
-    TorchRL hands a seed to the innermost environment alone; :class:`~torchrl_koap.modules.PolicyEnv` hands it to this
-    transform too; before, it has a random one. Arguments are those of :class:`NoiseStreams`, and the entry that is
-    written, ``planner.noise_key``.
+    The seed is random until :meth:`set_seed`. TorchRL seeds only the innermost environment, so
+    :class:`~torchrl_koap.modules.PolicyEnv` also seeds this transform. Arguments are those of :class:`NoiseStreams`,
+    and the entry to write, ``planner.noise_key``.
     """
 
     def __init__(self, shape: Sequence[int], *, block: int, noise_key: NestedKey = NOISE):
         super().__init__(in_keys=[], out_keys=[noise_key])
         self.shape, self.block = tuple(shape), block
-        self.set_seed(secrets.randbits(62))  # torch's own generator is the same in every new process
+        self.set_seed(secrets.randbits(62))  # torch's generator has the same default seed in every new process
 
     def set_seed(self, seed: int) -> None:
-        """Begins all streams anew."""
+        """Restarts all streams with a seed."""
         self.seed = int(seed)
         self._streams = NoiseStreams([], self.shape, block=self.block)
 
@@ -75,7 +74,7 @@ class NoiseTransform(Transform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """The specification with the noise."""
+        """Adds the noise to the specification."""
         shape = (*observation_spec.shape, *self.shape)
         observation_spec[self.out_keys[0]] = Unbounded(shape, device=observation_spec.device, dtype=torch.float32)
         return observation_spec
@@ -84,7 +83,7 @@ class NoiseTransform(Transform):
 def policy_transforms(
     history: int, *, observation_key: NestedKey = OBSERVATION, history_key: NestedKey = OBSERVATION_HISTORY
 ) -> Compose:
-    """Environment transforms that the policies need: ``is_init`` and the last ``history`` observations.
+    """Makes the environment transforms that policies need: ``is_init`` and the last ``history`` observations.
 
     At the start of an episode the first observation is repeated.
 
@@ -109,21 +108,20 @@ def policy_transforms(
 
 
 class PolicyEnv(TransformedEnv):
-    """An environment that also returns what a policy reads: the last observations, and start noise.
+    """An environment that also returns the inputs of a policy: the last observations, and start noise.
 
-    ``set_seed`` fixes the whole rollout; without it the noise is another in every environment. Call it before a
-    collector is made, which begins the first episodes at once. With the same seed an
-    :class:`~torchrl_koap.modules.Agent` gives the same actions in the first episode. It may stand inside of
-    :class:`torchrl.envs.SerialEnv`, :class:`torchrl.envs.ParallelEnv` and collectors, or around a
-    :class:`torchrl.envs.SerialEnv`.
+    ``set_seed`` makes the whole rollout reproducible; without it the noise is random. Call it before making a
+    collector, which begins the first episodes at once. With the same seed an :class:`~torchrl_koap.modules.Agent`
+    returns the same actions in the first episode. It works inside :class:`torchrl.envs.SerialEnv`,
+    :class:`torchrl.envs.ParallelEnv` and collectors, or around a :class:`torchrl.envs.SerialEnv`.
 
     Args:
         env (EnvBase): the environment.
-        policy (PlanningPolicy): the policy that is to act in it.
+        policy (PlanningPolicy): the policy that acts in it.
         observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
 
     Raises:
-        ValueError: if the data of the policy lack an origin, which only an Agent subtracts and adds.
+        ValueError: if the policy has ``origins``: only an Agent subtracts and adds them.
 
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv
@@ -139,8 +137,8 @@ class PolicyEnv(TransformedEnv):
 
     def __init__(self, env: EnvBase, policy: PlanningPolicy, *, observation_key: NestedKey = OBSERVATION):
         if policy.origins is not None:
-            raise ValueError("the data of this policy lack an origin, which an Agent subtracts and adds: act with one")
-        key = policy.planner.noise_key  # None: the planner draws by itself
+            raise ValueError("PolicyEnv does not support policies with origins: use an Agent, which applies them")
+        key = policy.planner.noise_key  # None: the planner draws its own noise
         noise = [] if key is None else [NoiseTransform(policy.noise_shape, block=policy.max_steps, noise_key=key)]
         transforms = policy_transforms(policy.history, observation_key=observation_key, history_key=policy.in_keys[0])
         super().__init__(env, Compose(*(transform.clone() for transform in transforms), *noise))
