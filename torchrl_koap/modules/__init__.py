@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
+"""Networks as TensorDictModules: planners, liftings, latent actions, decoders and policies."""
 
 from torchrl_koap.modules.baselines.latents import QuantizedInverseDynamics, VariationalInverseDynamics
 from torchrl_koap.modules.baselines.networks import NonlinearInverseDynamics, SupervisedInverseDynamics

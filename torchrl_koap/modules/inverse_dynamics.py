@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Base classes of all controllers: inverse dynamics from a window of raw states to the raw action of every frame."""
+"""Base classes of all controllers, which map a window of raw states to the raw action of every frame."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from torch import Tensor, nn
 from torchrl_koap.keys import ACTION, EPISODE, LATENT_ACTION, STATE, check_actions, check_window, frame_mask, read_entry
 from torchrl_koap.modules.windows import WindowReader
 
-BATCH = 4096  # windows that are read at once
+BATCH = 4096  # windows that are processed at once
 
 
 class InverseDynamics(TensorDictModuleBase):
-    """Maps windows of raw states to the raw action of every frame; all that losses, training and policies ask of it.
+    """Maps windows of raw states to the raw action of every frame: the interface to losses, training and policies.
 
-    A subclass writes :meth:`predict`, and of the rest what it needs. Training calls, in this order, :meth:`prepare`,
-    its losses, :meth:`finish`, and :meth:`fit_labels` where the method has a decoder in closed form.
+    A subclass defines :meth:`predict`, and overrides other methods as needed. Training calls, in this order,
+    :meth:`prepare`, the losses, :meth:`finish`, and :meth:`fit_labels` if the method has a decoder in closed form.
 
-    Subclasses take the size ``state_dim`` of a state as it is read, ``action_dim`` of an action, and the keywords
-    below; those that read steps also ``num_past`` frames before the present one, and ``look_ahead``, an offset or
-    several.
+    Subclasses take the sizes ``state_dim`` of a state (as it is read) and ``action_dim`` of an action, and the keywords
+    below. Those that read steps also take ``num_past``, the number of frames before the present one, and
+    ``look_ahead``, one offset or several.
 
     Args:
-        reader (WindowReader, optional): reads what a frame is predicted from. A subclass without one has ``num_past``,
-            ``num_window_frames`` and :meth:`valid_frames` of its own.
+        reader (WindowReader, optional): reads the input of every frame. A subclass without one defines ``num_past``,
+            ``num_window_frames`` and :meth:`valid_frames` itself.
 
     Keyword Args:
         state_normalizer (nn.Module, optional): maps states to the networks' units.
         action_normalizer (nn.Module, optional): its ``inverse`` maps predicted actions to raw units.
 
     It reads the window of raw states ``[*B, T, d]`` from ``"state"`` and writes raw actions ``[*B, T, act]`` to
-    ``"action"``, the last out-key, unless :meth:`set_keys` says otherwise; frame ``t`` holds the action from ``x_t`` to
+    ``"action"``, its last out-key; :meth:`set_keys` renames both. Frame ``t`` holds the action from ``x_t`` to
     ``x_{t+1}``.
 
     Examples:
@@ -65,8 +65,8 @@ class InverseDynamics(TensorDictModuleBase):
     ):
         super().__init__()
         self.in_keys, self.out_keys = [STATE], [ACTION]
-        self._out_key: NestedKey = ACTION  # out_keys may be selected
-        self.register_module("reader", reader)  # where a part holds it, a property of the subclass finds it there
+        self._out_key: NestedKey = ACTION  # select_out_keys() may remove it from out_keys
+        self.register_module("reader", reader)  # a subclass whose part holds the reader overrides this by a property
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
 
     @property
@@ -80,7 +80,7 @@ class InverseDynamics(TensorDictModuleBase):
         return self._out_key
 
     def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
-        """Renames :attr:`in_key` and :attr:`out_key`, those that are given."""
+        """Renames :attr:`in_key`, :attr:`out_key` or both."""
         if state is not None:
             self.in_keys = [state]
         if action is not None:
@@ -94,7 +94,7 @@ class InverseDynamics(TensorDictModuleBase):
 
     @property
     def num_window_frames(self) -> int:
-        """Frames of the shortest window in which a frame has all it reads, and its successor."""
+        """Length of the shortest window that holds a frame, its successor and all frames read for it."""
         return self.reader.num_window_frames
 
     def valid_frames(self, num_frames: int) -> range:
@@ -114,23 +114,22 @@ class InverseDynamics(TensorDictModuleBase):
         return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
 
     def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
-        """Sets before training what is known of raw states ``[*B, T, d]`` without labels: the spread of every step.
+        """Fits, before training, what raw states ``[*B, T, d]`` determine without labels: the spread of every step.
 
-        A subclass may train a network for some updates, and calls ``progress`` with those done, and all.
+        A subclass may train a network for ``updates`` steps; it calls ``progress(updates done, all updates)``.
         """
         if self.reader is not None:
             self.reader.fit(self.normalize_state(windows))
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Predicts actions ``[*B, len(frames), act]`` in normalised units; a subclass says how.
+        """Predicts actions ``[*B, len(frames), act]`` in normalised units; subclasses define it.
 
-        The window of raw states is ``[*B, T, d]``, frames are all ``T`` by default; offsets beyond the window are
-        clamped.
+        The window of raw states is ``[*B, T, d]``; ``frames`` defaults to all ``T``. Offsets are clamped to the window.
         """
         raise NotImplementedError
 
     def finish(self, windows: Tensor) -> None:
-        """Fits after training, to raw states ``[*B, T, d]`` without labels, what is fitted then: here nothing."""
+        """Fits parts after training, to raw states ``[*B, T, d]`` without labels. The base class has none."""
 
     def fit_labels(
         self,
@@ -141,19 +140,19 @@ class InverseDynamics(TensorDictModuleBase):
         guessed: bool = False,
         alike: bool = True,
     ) -> dict[str, Any]:
-        """Fits a decoder in closed form on the labelled frames of windows; a subclass that has one says how.
+        """Fits a decoder in closed form on the labelled frames of windows; subclasses with such a decoder define it.
 
         Args:
-            windows (TensorDictBase): raw states ``[*B, T, d]`` and actions ``[*B, T, act]``. Frames of one trajectory,
-                ``episode`` int64 ``[*B]`` or ``[*B, T]``, are left out together; without this entry every frame is left
-                out alone, and windows that overlap hide that a decoder overfits.
-            mask (Tensor): labelled frames to use, bool ``[*B, T]`` or ``[*B, T, 1]``; no action outside of it is read.
-                Frames that do not count in the losses (:meth:`valid_frames`) are left out.
+            windows (TensorDictBase): raw states ``[*B, T, d]`` and actions ``[*B, T, act]``. For held-out errors, all
+                frames of a trajectory (``episode``, int64 ``[*B]`` or ``[*B, T]``) are left out together. Without this
+                entry frames are left out one by one, and overlapping windows then hide overfitting.
+            mask (Tensor): labelled frames to use, bool ``[*B, T]`` or ``[*B, T, 1]``; no other action is read. Frames
+                that do not count in the losses (:meth:`valid_frames`) are ignored.
 
         Keyword Args:
-            axes (sequence of int): the state column, of those read, that each action entry moves.
-            guessed (bool): the axes are only likely.
-            alike (bool): the action entries are of one kind: one penalty serves all of them.
+            axes (sequence of int): for each action entry, the state column (of those read) that it moves.
+            guessed (bool): the axes are likely, but not certain.
+            alike (bool): the action entries are of one kind and share one penalty.
 
         Returns:
             dict: numbers for the summary (:meth:`~torchrl_koap.modules.ridge.RidgeFit.summary`).
@@ -166,11 +165,10 @@ class InverseDynamics(TensorDictModuleBase):
     def labelled_frames(
         self, read: Callable[[Tensor, range], Tensor], windows: TensorDictBase, mask: Tensor
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Selects what :meth:`fit_labels`, whose other arguments these are, fits a decoder to.
+        """Selects the data that :meth:`fit_labels` fits a decoder to; ``windows`` and ``mask`` are its arguments.
 
-        ``read`` maps raw states ``[N, T, d]`` and a range of frames to what the decoder reads of them, ``[N, frames,
-        m]``. Returned are inputs ``[n, m]``, normalised actions ``[n, act]``, and trajectories ``[n]`` if they are
-        known.
+        ``read`` maps raw states ``[N, T, d]`` and a range of frames to the decoder's input ``[N, frames, m]``. Returns
+        inputs ``[n, m]``, normalised actions ``[n, act]``, and trajectory numbers ``[n]``, None if unknown.
         """
         states = read_entry(self, windows, self.in_key, "set_keys(state=...)")
         check_window(windows, self.in_key, states)
@@ -198,9 +196,9 @@ class InverseDynamics(TensorDictModuleBase):
 
 
 class LatentInverseDynamics(InverseDynamics):
-    """Base class of the controllers with a latent: states to latents to actions.
+    """Base class of controllers that map states to latents, and latents to actions.
 
-    A subclass says how a latent is inferred (:meth:`infer`). ``forward`` writes the latent under ``"latent_action"``
+    A subclass defines how latents are inferred (:meth:`infer`). ``forward`` writes the latent under ``"latent_action"``
     and then the raw action of every frame. The decoder maps latents to actions in normalised units; the other arguments
     are those of :class:`InverseDynamics`.
     """
@@ -214,11 +212,11 @@ class LatentInverseDynamics(InverseDynamics):
         self.action_decoder = action_decoder
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Infers the latents ``[*B, len(frames), m]`` of raw states ``[*B, T, d]``; a subclass says how."""
+        """Infers the latents ``[*B, len(frames), m]`` of raw states ``[*B, T, d]``; subclasses define it."""
         raise NotImplementedError
 
     def sample(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Samples latents where they have a distribution; otherwise it is :meth:`infer`."""
+        """Samples latents if they have a distribution; otherwise returns those of :meth:`infer`."""
         return self.infer(state, frames)
 
     def decode(self, latent: Tensor) -> Tensor:

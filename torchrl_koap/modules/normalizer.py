@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Normalisation as a module: statistics are buffers, so they travel with the weights."""
+"""Normalisation as a module, whose statistics are buffers and so part of the state dict."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def _moving(values: Tensor) -> tuple[Tensor, Tensor]:
     return rest, (apart.square() * moving).sum(0).div(moving.sum(0).clamp(min=1)).sqrt()
 
 
-_COLUMNS = 32  # at a time
-# offset and scale of each column; those of "shared" take the largest scale together
+_COLUMNS = 32  # columns whose statistics are computed at once
+# functions that return offset and scale of each column; with "shared" all columns then use the largest scale
 MODES = {
     "minmax": _minmax,
     "standard": _standard,
@@ -39,7 +39,7 @@ MODES = {
 class Normalizer(nn.Module):
     r"""Shifts and scales each column: :math:`y = (x - \text{offset}) / \text{scale}`.
 
-    Changes nothing until it is given statistics: by :meth:`fit`, by the keywords, or by a state dict.
+    It is the identity until it has statistics: from :meth:`fit`, the keywords, or a state dict.
 
     Args:
         width (int): number of columns ``d``.
@@ -49,7 +49,7 @@ class Normalizer(nn.Module):
         scale (Tensor, optional): ``[d]``, positive. Defaults to 1.
 
     Shape:
-        every method takes and gives ``[*B, d]``, in the floating type of its argument.
+        every method maps ``[*B, d]`` to ``[*B, d]`` in the dtype of its argument.
 
     Raises:
         ValueError: if offset and scale are not ``[d]``, not finite, or a scale is not positive.
@@ -80,21 +80,21 @@ class Normalizer(nn.Module):
 
     @classmethod
     def fit(cls, values: Tensor, *, mode: str = "minmax", mask: Tensor | None = None) -> Normalizer:
-        """Takes the statistics of a data set.
+        """Makes a normaliser with the statistics of a data set.
 
         Args:
             values (Tensor): ``[*N, d]``.
-            mode (str): ``"minmax"`` maps the range of each column to [-1, 1], ``"standard"`` its mean and standard
-                deviation to 0 and 1, ``"shared"`` likewise with the largest standard deviation for all columns,
-                ``"rms"`` its root mean square to 1 and 0 to 0. ``"moving"`` maps the median to 0, and the root mean
-                square distance from it, of rows with over 1 % of the largest distance, to 1: a column that rarely
-                moves is scaled by how far it moves then. A column whose scale would be zero, up to rounding, keeps
-                the scale 1.
+            mode (str): ``"minmax"`` maps the range of each column to [-1, 1]. ``"standard"`` maps its mean to 0 and its
+                standard deviation to 1. ``"shared"`` does the same with the largest standard deviation of all columns.
+                ``"rms"`` maps its root mean square to 1 and keeps 0. ``"moving"`` maps its median to 0, and to 1 the
+                root mean square distance from the median, over rows with more than 1 % of the largest distance: a
+                column that rarely moves is scaled by the size of its motions. A scale that is zero, up to rounding,
+                becomes 1.
             mask (Tensor, optional): ``[*N]`` or ``[*N, 1]`` bool, rows to use; the others may hold NaN. For actions
                 this is ``has_action``.
 
         Returns:
-            Normalizer: with buffers of the floating type of ``values``.
+            Normalizer: with buffers of the dtype of ``values``.
 
         Raises:
             ValueError: if the mode is unknown, the mask does not fit or selects nothing, or a used row is not finite.
@@ -110,21 +110,21 @@ class Normalizer(nn.Module):
                 raise ValueError(f"mask must be {wanted}, got {mask.dtype} {list(mask.shape)}")
             rows = rows[mask.flatten()]
         if not len(rows):
-            raise ValueError("there are no rows to take statistics of")
+            raise ValueError("values has no rows to compute statistics from")
         bad = ~rows.isfinite()
         if bad.any():
             columns = bad.any(0).nonzero().flatten().tolist()
             count = int(bad.any(-1).sum())
             raise ValueError(f"{count} of {len(rows)} rows are NaN or infinite, in columns {columns}")
 
-        # in double precision, of some columns at a time: of all of them it may take gigabytes
+        # float64, for some columns at a time: all columns together may take gigabytes
         parts = [(*statistics(part), part.abs().amax(0)) for part in map(Tensor.double, rows.split(_COLUMNS, -1))]
         offset, scale, largest = map(torch.cat, zip(*parts, strict=True))
         if mode == "shared":
             scale = scale.amax().expand_as(scale)
         rounding = 4 * torch.finfo(values.dtype).eps * largest
         scale = torch.where(scale <= rounding, 1.0, scale)
-        scale = torch.where(scale.to(values.dtype) > 0, scale, 1.0)  # too small for the type of the values
+        scale = torch.where(scale.to(values.dtype) > 0, scale, 1.0)  # the dtype may round small scales to 0
         return cls(rows.shape[-1], offset=offset.to(values.dtype), scale=scale.to(values.dtype))
 
     def forward(self, values: Tensor) -> Tensor:
@@ -133,7 +133,7 @@ class Normalizer(nn.Module):
         return (values - offset) / scale
 
     def inverse(self, values: Tensor) -> Tensor:
-        """Turns normalised values ``[*B, d]`` back."""
+        """Maps normalised values ``[*B, d]`` to the original units."""
         offset, scale = self._statistics(values)
         return values * scale + offset
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Ridge regression in closed form, its penalty chosen by exact errors on what is left out."""
+"""Ridge regression in closed form; exact leave-one-out or leave-group-out errors choose the penalty."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# columns above which the products of the rows are decomposed, if there are few enough of these
+# with more columns than this, and far more columns than rows, the Gram matrix of the rows is decomposed
 WIDE = 2048
-ROWS = 8192  # that are in float64 at once, at least: all of them may take more memory than there is
+ROWS = 8192  # least number of rows converted to float64 at once: all rows together may exceed the memory
 PENALTIES = tuple(10.0 ** (p / 2) for p in range(-12, 3))
-# one or two labelled trajectories cannot be left out to choose the penalty
+# used with one or two labelled trajectories, too few to choose the penalty by leaving one out
 DEFAULT_PENALTY = 0.15
-# variance of the errors of plans that recorded steps do not show, in units of the mean square norm of the inputs: where
-# thousands of steps are labelled, a penalty chosen by them alone was followed by fewer successes in closed loop
+# variance of the errors of plans, which recorded steps do not contain, in units of the mean square norm of the inputs.
+# With thousands of labelled steps, penalties chosen by recorded steps alone gave fewer successes in closed loop.
 INPUT_NOISE = 1e-8
-SHARED_PENALTY = 0.02  # assumed ratio of noise to signal variance where all axes share one filter
+SHARED_PENALTY = 0.02  # assumed ratio of noise to signal variance for a filter that all axes share
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class RidgeFit:
     Args:
         weight (Tensor): ``[act, m]``, float64.
         bias (Tensor): ``[act]``, float64.
-        penalty (float): the best ridge for all targets, in units of the mean square norm of the inputs.
-        errors (dict): root of the mean squared held-out error of every candidate, in the units of the targets.
-        error (float): the same with what was chosen, for all targets or for each; infinite where a single row leaves
-            nothing to fit the mean to.
-        num_labels (int): rows used.
+        penalty (float): the best penalty for all targets, in units of the mean square norm of the inputs.
+        errors (dict): root mean squared held-out error of every candidate penalty, in the units of the targets.
+        error (float): that of the chosen penalty, or of the penalties chosen for each target; infinite for a single
+            row, since no other row is left to fit the mean.
+        num_labels (int): number of rows used.
     """
 
     weight: Tensor
@@ -44,12 +44,12 @@ class RidgeFit:
     num_labels: int
 
     def predict(self, inputs: Tensor) -> Tensor:
-        """Predicts targets ``[*B, act]`` of inputs ``[*B, m]``, in their floating type."""
+        """Predicts targets ``[*B, act]`` of inputs ``[*B, m]``, in the dtype of the inputs."""
         return torch.nn.functional.linear(inputs, self.weight.to(inputs), self.bias.to(inputs))
 
     def summary(self) -> dict[str, Any]:
-        """Returns what a run's summary holds: ``penalty``, ``labels_used`` and ``held_out_error``."""
-        # LAPACK's last digits depend on where memory lies: keep those that two equal runs share
+        """Returns the entries of a run's summary: ``penalty``, ``labels_used`` and ``held_out_error``."""
+        # LAPACK's last digits depend on memory addresses: keep only the digits that repeated runs reproduce
         return {
             "penalty": self.penalty,
             "labels_used": self.num_labels,
@@ -72,10 +72,10 @@ def ridge(
 ) -> RidgeFit:
     r"""Fits ``targets ~ D inputs + b``, in float64.
 
-    The penalty is chosen by leaving out one row at a time, :math:`e_i = (a_i - \hat a_i) / (1 - h_i)` with the leverage
-    ``h_i``; with ``groups`` all rows of a group at once, since steps of one trajectory resemble each other. Both are
-    exact. Noise of variance :math:`s^2` on every entry of inputs to come acts as a penalty of :math:`n s^2` (Bishop
-    1995, "Training with noise is equivalent to Tikhonov regularization"), so no smaller one is chosen.
+    The penalty is chosen by leave-one-out errors, :math:`e_i = (a_i - \hat a_i) / (1 - h_i)` with the leverage ``h_i``.
+    With ``groups`` all rows of a group are left out together, since steps of one trajectory resemble each other. Both
+    are exact. Noise of variance :math:`s^2` on every entry of future inputs acts as a penalty of :math:`n s^2` (Bishop
+    1995, "Training with noise is equivalent to Tikhonov regularization"), so no smaller penalty is chosen.
 
     Args:
         inputs (Tensor): ``[n, m]``.
@@ -84,10 +84,10 @@ def ridge(
     Keyword Args:
         groups (Tensor, optional): group of every row, int64 ``[n]``.
         penalties (sequence of float): candidates, in units of the mean square norm of the inputs.
-        default_penalty (float, optional): used instead of the choice where there are fewer than three groups.
+        default_penalty (float, optional): used without any choice if there are fewer than three groups.
         input_noise (float): :math:`s^2`, in units of the mean square norm of the inputs. Defaults to 0.
         bias (bool): fit ``b``; otherwise it is 0. Defaults to ``True``.
-        prior (Tensor, optional): ``[act, m]``, what ``D`` is shrunk towards. Defaults to 0.
+        prior (Tensor, optional): the penalty shrinks ``D`` towards it, ``[act, m]``. Defaults to 0.
         alike (bool): all targets share one penalty; otherwise each has its own. Defaults to ``True``.
 
     Returns:
@@ -118,21 +118,21 @@ def ridge(
         if not value.isfinite().all():
             raise ValueError(f"a labelled {name} is not finite")
     prior = y.new_zeros(y.shape[-1], x.shape[-1]) if prior is None else prior.to(y)
-    # a ridge around the prior is a ridge around 0 on what the prior leaves over
+    # shrinking towards the prior is shrinking towards 0 on the residuals of the prior
     y = y - torch.cat([part.double() @ prior.mT for part in x.split(ROWS)])
     rows = torch.arange(len(x), device=x.device)
     groups = rows if groups is None else groups.unique(return_inverse=True)[1]
     num_groups = int(groups.max()) + 1
     if default_penalty is not None and num_groups < 3:
         penalties = (default_penalty,)
-    if num_groups == 1:  # its rows are all there is to leave out
+    if num_groups == 1:  # leaving out the only group would leave no rows: leave out single rows
         groups = rows
 
     mean_x, mean_y = (part.mean(0, dtype=torch.float64) * bias for part in (x, y))
     target = y - mean_y
     left, singular, right = thin_svd(x, mean_x)
     unit = singular.square().sum() / len(x)
-    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant inputs: any scale will do
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # for constant inputs any positive unit works
 
     smallest = input_noise * len(x)
     tried = sorted({max(float(penalty), smallest) for penalty in penalties})
@@ -149,13 +149,13 @@ def ridge(
 
 
 def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
-    r"""Fits one filter ``w [S]`` that all axes share: the prior mean of a decoder that has few labels.
+    r"""Fits one filter ``w [S]`` that all axes share, the prior mean of a decoder with few labels.
 
     .. math::
         a_{t,i} \approx \sum_s w_s v_{t,s,i} \qquad \text{for every axis } i
 
-    with steps ``v [N, S, act]`` of each axis' own coordinate and actions ``[N, act]``, both in raw units. A trajectory
-    that hardly moves along one axis says little about that axis; together they determine the few numbers ``w`` well.
+    with steps ``v [N, S, act]`` along each axis and actions ``[N, act]``, both in raw units. A trajectory that hardly
+    moves along an axis contains little information about it; all axes together determine the few numbers ``w`` well.
     """
     rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
     unit = rows.square().sum(-1).mean()
@@ -164,12 +164,12 @@ def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
 
 
 def thin_svd(inputs: Tensor, mean: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor, Tensor]:
-    """Decomposes inputs ``[N, m]`` without their mean ``[m]``, in float64.
+    """Computes the thin singular value decomposition of inputs ``[N, m]`` minus their mean ``[m]``, in float64.
 
-    Returned are a function that gives the left vectors ``[n, r]`` of rows int64 ``[n]``, singular values ``[r]``,
-    descending, and right vectors ``[r, m]``. Of many rows, some at a time become a triangle. Where there are far more
-    columns, the products of the rows are decomposed. Directions that are lost in rounding are left out: below a
-    millionth of the largest singular value by products of rows, below a billionth where there are many rows.
+    Returns a function from rows, int64 ``[n]``, to their left vectors ``[n, r]``; singular values ``[r]``, descending;
+    and right vectors ``[r, m]``. With many rows, a QR decomposition reduces them in parts. With far more columns than
+    rows, the Gram matrix of the rows is decomposed. Directions below rounding are left out: singular values under 1e-6
+    of the largest with the Gram matrix, under 1e-9 with many rows.
     """
     rows, columns = inputs.shape
     if rows > 4 * columns:
@@ -201,28 +201,27 @@ def held_out_errors(
     *,
     centred: bool,
 ) -> Tensor:
-    r"""Computes mean squared errors ``[P, act]`` of ridge regressions on every group of rows, predicted without it.
+    r"""Computes mean squared held-out errors ``[P, act]`` of ``P`` ridge regressions, leaving out one group at a time.
 
-    With the left singular vectors ``U`` ``[N, r]``, which ``left`` gives by rows, the target's parts along them
-    (``projected [r, act]``) and the shrinkages ``s`` of the directions, a row for every regression ``[P, r]``, a ridge
-    predicts :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` left out have the errors :math:`(I -
-    H_{GG})^{-1} (Y - \hat Y)_G`, exactly. For a group of more rows than there are directions the smaller system is
+    ``U`` ``[N, r]`` are the left singular vectors (``left`` returns some rows), ``projected [r, act]`` the target's
+    parts along them, and ``s`` the shrinkages of the directions, a row per regression ``[P, r]``. A ridge predicts
+    :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` that are left out have exactly the errors
+    :math:`(I - H_{GG})^{-1} (Y - \hat Y)_G`. If a group has more rows than there are directions, the smaller system is
     solved (Woodbury's identity, with :math:`V = U_G \mathrm{diag}(s)^{1/2}`):
 
     .. math::
         (I - V V^T)^{-1} E = E + V (I - V^T V)^{-1} V^T E
 
-    Where the mean is fitted too (``centred``) it counts as one more direction that is not shrunk; the target ``[N,
-    act]`` is then without it. ``groups`` are int64 ``[N]``. Errors are infinite where nothing is left to take a mean
-    of.
+    If the mean is fitted too (``centred``), it is one more direction, without shrinkage, and already subtracted from
+    the target ``[N, act]``. ``groups`` are int64 ``[N]``. With a single row and a mean, errors are infinite.
     """
     coefficients = shrinks.unsqueeze(-1) * projected  # [P, r, act]
     if centred and len(target) == 1:
         return target.new_full((len(shrinks), target.shape[1]), torch.inf)
-    constant = len(target) ** -0.5 if centred else 0.0  # the mean's direction, in every row
+    constant = len(target) ** -0.5 if centred else 0.0  # entry, in every row, of the mean's unit vector
     total = target.new_zeros(len(shrinks), target.shape[1])
     sizes = groups.bincount()
-    if int(sizes.max()) == 1:  # single rows: the leverages are all that is needed
+    if int(sizes.max()) == 1:  # for single rows the leverages suffice
         for rows in torch.arange(len(target), device=target.device).split(ROWS):
             part = left(rows)
             leverage = part.square() @ shrinks.mT + constant**2
@@ -247,7 +246,7 @@ def held_out_errors(
 
 
 def _solve(hat: Tensor, right: Tensor) -> Tensor:
-    """Solves ``I - hat``, symmetric and positive but for rounding."""
+    """Solves ``(I - hat) x = right``; ``I - hat`` is symmetric and, up to rounding, positive definite."""
     keep = -hat
     keep.diagonal(dim1=-2, dim2=-1).add_(1)
     factor, info = torch.linalg.cholesky_ex(keep)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which frames of a window a controller reads for each frame, and which of them count in a loss.
+"""Defines which frames of a window a controller reads for each frame, and which frames count in a loss.
 
 With ``num_past = 1`` frame before the present one, look-ahead ``k = 8`` and a window of ``T = 16`` frames::
 
@@ -9,8 +9,8 @@ With ``num_past = 1`` frame before the present one, look-ahead ``k = 8`` and a w
     full look-ahead    yes       yes           yes       no             no        no          no
     transition known   yes       yes           yes       yes            yes       no (leak)   no (no x_{t+1})
 
-At ``t = T - 2`` the clamped look-ahead *is* ``x_{t+1}``, the answer: such a frame never counts. An inverse model that
-is *given* the successor (``min_offset=1``) may count it.
+At ``t = T - 2`` the clamped look-ahead *is* ``x_{t+1}``, the prediction target, so this frame never counts. With an
+inverse model that reads the successor (``min_offset=1``) it may count.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from torch import Tensor, nn
 
 
 class StateReader(nn.Module):
-    """Reads some columns of states ``[*B, T, d]``, and beside them features ``[*B, T, num_features]`` of every state.
+    """Reads some columns of states ``[*B, T, d]`` and appends features ``[*B, T, num_features]`` of every state.
 
-    The module ``features`` computes them from ``[*B, T, 1, d]``, such as relative positions. Default: none.
+    The module ``features`` computes them from ``[*B, T, 1, d]``, for example relative positions. Default: none.
     """
 
     def __init__(self, columns: Sequence[int], features: nn.Module | None = None):
@@ -33,17 +33,17 @@ class StateReader(nn.Module):
 
     @property
     def width(self) -> int:
-        """Number of columns that are written."""
+        """Number of output columns."""
         return len(self.columns) + (0 if self.features is None else self.features.num_features)
 
     def forward(self, states: Tensor) -> Tensor:
-        """What is read of states, ``[*B, T, width]``."""
+        """Returns the columns and features of states, ``[*B, T, width]``."""
         read = states[..., self.columns]
         return read if self.features is None else torch.cat([read, self.features(states.unsqueeze(-2))], -1)
 
 
 class WindowReader(nn.Module):
-    r"""Reads for every frame of a window the present state and the steps between the frames around it.
+    r"""Reads the present state and the steps between the frames around it, for every frame of a window.
 
     With ``num_past = 1`` and ``look_ahead = (2, 5)``, frame ``t = 3`` of a window reads::
 
@@ -60,15 +60,14 @@ class WindowReader(nn.Module):
     Keyword Args:
         num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
         look_ahead (int or sequence of int): offset ``k``, or several. Defaults to ``(2, 3, 4, 5)``.
-        min_offset (int): smallest offset allowed. ``2`` (default) where the successor ``x_{t+1}`` is to be predicted
-            and so never an input; ``1`` for inverse models that are given it.
-        relative (bool): read steps, as drawn. ``False``: the frames themselves. Defaults to ``True``.
-        clamped (bool): a frame whose look-ahead is cut at the window's end counts too, except where it would be
+        min_offset (int): smallest offset allowed. ``2`` (default) if the successor ``x_{t+1}`` is predicted and must
+            not be an input; ``1`` for inverse models that read it.
+        relative (bool): read steps, as drawn. ``False``: read the frames themselves. Defaults to ``True``.
+        clamped (bool): a frame whose look-ahead is clamped to the window's end counts too, except if it would be
             ``x_{t+1}`` (with ``min_offset=2``) or ``x_t``. Defaults to ``False``.
 
     Raises:
-        ValueError: for a negative ``num_past`` or an offset below ``min_offset``; at the call for states of another
-            size.
+        ValueError: for a negative ``num_past`` or an offset below ``min_offset``; at a call for states of another size.
 
     Examples:
         >>> import torch
@@ -106,16 +105,16 @@ class WindowReader(nn.Module):
 
     @property
     def num_features(self) -> int:
-        """Size ``F * d`` of what is read for one frame."""
+        """Size ``F * d`` of the input of one frame."""
         return self.num_frames * self.state_dim
 
     @property
     def num_window_frames(self) -> int:
-        """Frames of the shortest window in which a frame has all it reads, and its successor."""
+        """Length of the shortest window that holds a frame, its successor and all frames read for it."""
         return self.num_past + 1 + self.look_ahead[-1]
 
     def valid_frames(self, num_frames: int) -> range:
-        """Returns the frames that count in the losses: past, successor and look-ahead lie in the window."""
+        """Returns the frames that count in the losses: their past, successor and look-ahead lie in the window."""
         ahead = self.min_offset if self.clamped else self.look_ahead[-1]
         frames = range(self.num_past, num_frames - ahead)
         if not frames:
@@ -126,7 +125,7 @@ class WindowReader(nn.Module):
         return frames
 
     def index(self, num_frames: int, frames: range | None = None, device: torch.device | None = None) -> Tensor:
-        """Returns which frames are read for each, clamped to the window: int64 ``[len(frames), F]``."""
+        """Returns the frames read for each frame, clamped to the window: int64 ``[len(frames), F]``."""
         frames = range(num_frames) if frames is None else frames
         offsets = torch.tensor([*range(-self.num_past, 1), *self.look_ahead], device=device)
         return (torch.arange(frames.start, frames.stop, device=device)[:, None] + offsets).clamp(0, num_frames - 1)
@@ -134,7 +133,7 @@ class WindowReader(nn.Module):
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Reads a window of states ``[*B, T, d]`` for all or some of its frames: ``[*B, len(frames), F, d]``.
 
-        Offsets beyond the window are clamped to it. States of another number of columns are refused.
+        Offsets are clamped to the window. Raises a ValueError for another number of columns.
         """
         if state.shape[-1] != self.state_dim:
             raise ValueError(f"expected states with {self.state_dim} columns, got shape {list(state.shape)}")
@@ -142,12 +141,12 @@ class WindowReader(nn.Module):
         return read if self.scales is None else self.steps(read) / self.scales
 
     def steps(self, read: Tensor) -> Tensor:
-        """Turns frames ``[*B, F, d]`` into the steps to and from the present one, which stays, without scales."""
+        """Converts all frames of ``[*B, F, d]`` but the present one to steps between neighbours, not scaled."""
         n, steps = self.num_past, read.diff(dim=-2)
         return torch.cat([steps[..., :n, :], read[..., n : n + 1, :], steps[..., n:, :]], -2)
 
     def forward(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Reads as :meth:`gather` does, in one row ``[*B, len(frames), num_features]`` per frame."""
+        """Reads as :meth:`gather` does, flattened to one row per frame: ``[*B, len(frames), num_features]``."""
         return self.gather(state, frames).flatten(-2)
 
     @torch.no_grad()
@@ -159,6 +158,6 @@ class WindowReader(nn.Module):
         self.set_spread(read.square().mean(0).sqrt() * self.scales)
 
     def set_spread(self, spread: Tensor) -> None:
-        """Divides steps by a spread ``[F, d]`` from now on, but for those without one."""
+        """Sets the spread ``[F, d]`` that steps are divided by; 1 for steps without spread."""
         spread[self.num_past] = 1.0  # the present frame stays in the normaliser's units
         self.scales.copy_(torch.where(spread > 1e-9, spread, 1.0))

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Controllers with latents trained on unlabelled windows: codes (LAPO), and a variational auto-encoder of windows."""
+"""Controllers with latents trained on unlabelled windows: discrete codes (LAPO), and a variational auto-encoder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_koap.modules.windows import WindowReader
 
 LATENT_DIM = 16
 LEVELS = (8, 5, 5, 5) * 2  # two codebooks of 1000 codes side by side
-WINDOW = 16  # frames that the auto-encoder reads as a whole
+WINDOW = 16  # frames of the windows that the auto-encoder reads
 
 
 class FiniteScalarQuantizer(nn.Module):
@@ -26,9 +26,9 @@ class FiniteScalarQuantizer(nn.Module):
             \operatorname{round}(\tfrac{L_i - 1}{2} \tanh(z_i + s_i) - o_i),
         \qquad o_i = \tfrac12 [L_i \text{ even}], \quad \tfrac{L_i - 1}{2} \tanh(s_i) = o_i
 
-    after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle one: they lie half a level
-    lower, and the shift ``s`` keeps 0 at the code 0. A linear map takes the ``features`` ``[*B, m]`` to the entries of
-    a code, and a second one takes codes back.
+    after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle level: they lie half a level
+    lower, and the shift ``s`` maps 0 to the code 0. One linear map converts ``features`` ``[*B, m]`` to the entries of
+    a code; a second one converts codes back.
     """
 
     def __init__(self, features: int):
@@ -37,7 +37,7 @@ class FiniteScalarQuantizer(nn.Module):
         self.project_out = nn.Linear(len(LEVELS), features)
 
     def bound(self, values: Tensor) -> Tensor:
-        """Squashes values ``[*B, 8]`` to the range of the levels, which are the whole numbers in it."""
+        """Squashes values ``[*B, 8]`` to the range of the levels; the integers in it are the levels."""
         levels = torch.tensor(LEVELS, dtype=values.dtype, device=values.device)
         half_range, offset = (levels - 1) / 2, (levels % 2 == 0).to(values.dtype) / 2
         return half_range * (values + (offset / half_range).atanh()).tanh() - offset
@@ -49,12 +49,12 @@ class FiniteScalarQuantizer(nn.Module):
         return (bounded + (bounded.round() - bounded).detach()) / half
 
     def forward(self, features: Tensor) -> Tensor:
-        """Maps features ``[*B, m]`` to ``[*B, m]`` by way of their code."""
+        """Quantises features ``[*B, m]`` to codes and maps these back to ``[*B, m]``."""
         return self.project_out(self.quantize(self.project_in(features)))
 
 
 class QuantizedInverseDynamics(LatentInverseDynamics):
-    r"""Encodes the steps around a frame as a discrete code, from which a forward model predicts the next state.
+    r"""Encodes the steps around a frame as a discrete code; a forward model predicts the next state from it.
 
     .. math::
         u_t = \mathrm{FSQ}(f_\theta(s_t, x_t)), \qquad
@@ -63,10 +63,10 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
     with ``s_t`` the steps between the frames ``x_{t-n}, ..., x_{t+k}`` (:class:`~torchrl_koap.modules.WindowReader`).
     Trained in two stages: :class:`~torchrl_koap.objectives.QuantizedDynamicsLoss` on all windows, then
     :class:`~torchrl_koap.objectives.ActionLoss` with ``freeze_latents`` on the labelled frames. Actions are decoded
-    from the code alone. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, and:
+    only from the code. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, and:
 
     Keyword Args:
-        look_ahead (int or sequence of int): offsets ``k``; 1 must be one of them, the transition that is encoded.
+        look_ahead (int or sequence of int): offsets ``k``; they must contain 1, the transition that is encoded.
 
     Raises:
         ValueError: for a look-ahead without 1.
@@ -105,7 +105,7 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
     def predict_step(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor]:
         """Predicts the next step of raw states ``[*B, T, d]`` from the past and the code of the transition.
 
-        Returned are the prediction and the step ``x_{t+1} - x_t`` itself, ``[*B, len(frames), d]``, over its spread.
+        Returns the prediction and the true step ``x_{t+1} - x_t``, ``[*B, len(frames), d]``, divided by its spread.
         """
         read, size = self.reader(self.normalize_state(state), frames), self.reader.state_dim
         past, step, _ = read.tensor_split(((self.num_past + 1) * size, (self.num_past + 2) * size), -1)
@@ -113,16 +113,16 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
 
 
 class VariationalInverseDynamics(LatentInverseDynamics):
-    r"""Encodes a whole window into a Gaussian latent per frame; samples of it are decoded into what the frame read.
+    r"""Encodes a window into one Gaussian latent per frame; a decoder reconstructs the frame's input from samples.
 
     .. math::
         q(u_t \mid x_{0:T}) = N(\mu_\theta(h_t), \sigma^2_\theta(h_t)), \quad h = \mathrm{LSTM}_\theta(s_{0:T}), \qquad
         \hat s_t = g_\psi(u_t), \qquad a_t = d_\phi(u_t), \quad u_t \sim q
 
     with ``s_t`` the present state and the steps to and from it (:class:`~torchrl_koap.modules.WindowReader`), and an
-    LSTM that runs over the window in both directions. Trained in two stages, as the paper says:
+    LSTM that runs over the window in both directions. Trained in two stages, as in the paper:
     :class:`~torchrl_koap.objectives.VariationalLoss` on all windows, then :class:`~torchrl_koap.objectives.ActionLoss`
-    with ``freeze_latents`` and ``sample`` on the labelled frames. Where it acts it reads the mean. Args as for
+    with ``freeze_latents`` and ``sample`` on the labelled frames. In a policy it decodes the mean. Args as for
     :class:`~torchrl_koap.modules.InverseDynamics`, without ``num_past`` and ``look_ahead``.
 
     Examples:
@@ -146,7 +146,7 @@ class VariationalInverseDynamics(LatentInverseDynamics):
     def posterior(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Infers the distribution of the latents of a window of raw states ``[*B, T, d]``.
 
-        Returned are what every frame read ``[*B, len(frames), 3 d]``, at unit scale, and mean and log-variance of the
+        Returns the input of every frame ``[*B, len(frames), 3 d]``, at unit scale, and mean and log-variance of the
         latents ``[*B, len(frames), m]``.
         """
         read = self.reader(self.normalize_state(state))  # [*B, T, F]
@@ -155,7 +155,7 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         if frames is not None:
             read, context = (part[..., frames.start : frames.stop, :] for part in (read, context))
         mean, log_variance = self.encoder(context).chunk(2, -1)
-        return read, mean, log_variance.clamp(-10.0, 10.0)  # one odd window must not overflow the exponential
+        return read, mean, log_variance.clamp(-10.0, 10.0)  # outliers must not overflow the exponential
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Infers the means ``[*B, len(frames), m]`` of the latents of a window of raw states ``[*B, T, d]``."""

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Inverse dynamics networks without linear maps: a supervised one, and KOAP with perceptrons throughout."""
+"""Inverse dynamics networks without linear maps: a supervised one, and KOAP with perceptrons for all maps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_koap.modules.koopman.latent_action import LatentActionMLP
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.windows import WindowReader
 
-LATENT_DIM = 32  # of a lifted state and of a latent action, as in KOAP's default
+LATENT_DIM = 32  # size of a lifted state and of a latent action, as in KOAP's default
 LAYERS: dict[str, Any] = {"num_cells": (128, 128), "activation_class": nn.ReLU}
 
 
@@ -26,9 +26,9 @@ class SupervisedInverseDynamics(InverseDynamics):
     .. math::
         a_t = f(x_{t-n}, \dots, x_t, x_{t+k_1}, x_{t+k_2}, \dots)
 
-    With ``look_ahead=1`` this is the inverse dynamics of Decision Diffuser, which is told the next state and nothing
-    further ahead. Trained by :class:`~torchrl_koap.objectives.ActionLoss`. Args as for
-    :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 1``.
+    With ``look_ahead=1`` this is the inverse dynamics of Decision Diffuser, which reads no state beyond the next one.
+    Trained by :class:`~torchrl_koap.objectives.ActionLoss`. Args as for :class:`~torchrl_koap.modules.InverseDynamics`,
+    offsets ``k >= 1``.
 
     Examples:
         >>> import torch
@@ -46,7 +46,7 @@ class SupervisedInverseDynamics(InverseDynamics):
         self.network = MLP(self.reader.num_features, action_dim, **LAYERS)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Applies the perceptron to what every frame reads."""
+        """Applies the perceptron to the input of every frame."""
         return self.network(self.reader(self.normalize_state(state), frames))
 
 
@@ -57,9 +57,9 @@ class NonlinearInverseDynamics(LiftedInverseDynamics):
         z_t = g_\theta(x_t), \qquad u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad
         \hat z_{t+1} = h_\theta(z_t, u_t), \qquad \hat a_t = d_\phi(u_t)
 
-    All parts are perceptrons and trained together by :class:`~torchrl_koap.objectives.KOAPLoss`. As in KOAP,
-    ``f`` reads steps at unit scale and never ``x_{t+1}``, which the dynamics have to predict. Sizes are those of KOAP's
-    default. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``.
+    All parts are perceptrons, trained together by :class:`~torchrl_koap.objectives.KOAPLoss`. As in KOAP, ``f`` reads
+    steps at unit scale and never ``x_{t+1}``, which the dynamics predict. Sizes are those of KOAP's default. Args as
+    for :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``.
 
     Examples:
         >>> import torch

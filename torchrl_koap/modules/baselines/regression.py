@@ -17,13 +17,13 @@ from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, ridge
 from torchrl_koap.modules.windows import WindowReader
 
 COUNTS = (2, 4, 8, 16, 32, 64)
-MOST_WINDOWS = 4096  # of which components are computed, evenly spaced among all
+MOST_WINDOWS = 4096  # components are computed from fewer than twice as many windows, evenly spaced
 
 
 class LinearInverseDynamics(InverseDynamics):
     """Predicts the action by ridge regression on the raw frames ``x_{t-n}, ..., x_t, x_{t+k}``, without a latent.
 
-    It reads labelled frames only; there is nothing to train. Args as for
+    It is fitted to labelled frames only and needs no training. Args as for
     :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2`` as for KOAP.
 
     Examples:
@@ -49,7 +49,7 @@ class LinearInverseDynamics(InverseDynamics):
         return self.reader(self.normalize_state(state), frames)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Applies the regression to the frames read, at unit spread."""
+        """Applies the regression to the frames that are read, standardised."""
         return self.decoder.linear(self.inputs(self._read(state, frames)))
 
     @torch.no_grad()
@@ -67,9 +67,9 @@ class LinearInverseDynamics(InverseDynamics):
 class PrincipalInverseDynamics(LatentInverseDynamics):
     """Decodes the leading principal components of a window by ridge regression.
 
-    A window is the present frame and the scaled steps around it, those that ``semi_supervised`` reads. The components
-    come from all windows, labelled or not (:meth:`finish`); their number, 2, 4, 8, 16, 32 or 64, from the held-out
-    labelled error. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``.
+    A window holds the present frame and the scaled steps around it, as for the preset ``semi_supervised``. Components
+    are computed from all windows, labelled or not (:meth:`finish`). Held-out errors on labels choose their number: 2,
+    4, 8, 16, 32 or 64. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``.
 
     Examples:
         >>> import torch
@@ -113,7 +113,7 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
 
     @torch.no_grad()
     def finish(self, windows: Tensor) -> None:
-        """Sets the components to those of windows of raw states ``[N, T, d]``; no label is read."""
+        """Computes the components of windows of raw states ``[N, T, d]``, without labels."""
         windows = windows[:: max(1, len(windows) // MOST_WINDOWS)]
         now = self.reader.num_past
         rows = self.reader(self.normalize_state(windows), range(now, now + 1)).flatten(0, -2).double()

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A lifting of high-dimensional, noisy states to few coordinates, trained in units of the measurement noise."""
+"""Lifts high-dimensional, noisy states to few coordinates, trained in units of the measurement noise."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from torch import Tensor, nn
 from torchrl_koap.keys import LIFTED_STATE, STATE, read_entry
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 
-MOST_WINDOWS = 2000  # for the covariance of the noise; neighbouring windows hold nearly the same frames
-MIN_NOISE = 0.5  # no sum of columns is believed to have less than so much of the noise that independent columns give it
-MIN_RATIO = 2.0  # a component with less variance than so many times the noise's is left out
-AVERAGED, MEANS = 5, 2000  # frames of each mean, and means, that Isomap finds coordinates of
-NEIGHBOURS, LANDMARKS = 12, 200  # points that each is joined to at first, and points from which ways are measured
-COMPONENTS = 64  # at most
-PRETRAINING_UPDATES, PRETRAINING_RATE = 1000, 3e-3  # with which the networks learn these coordinates
+MOST_WINDOWS = 2000  # most windows for the covariance of the noise; neighbouring windows share nearly all frames
+MIN_NOISE = 0.5  # least eigenvalue of the correlation matrix of the noise; smaller estimates are raised to it
+MIN_RATIO = 2.0  # components with less variance than this multiple of the noise's are left out
+AVERAGED, MEANS = 5, 2000  # frames per mean, and number of means, that Isomap computes coordinates of
+NEIGHBOURS, LANDMARKS = 12, 200  # initial neighbours of each point, and points from which paths are measured
+COMPONENTS = 64  # largest number of components
+PRETRAINING_UPDATES, PRETRAINING_RATE = 1000, 3e-3  # of the training to Isomap coordinates
 BATCH = 2048  # windows that are lifted at once
-GAIN = 0.7  # twice the coordinates are read if they leave less than this share of the reconstruction error
+GAIN = 0.7  # twice the coordinates are kept if their reconstruction error is below this share of the other's
 
 
 def noise_covariance(windows: Tensor) -> Tensor:
     r"""Computes the covariance of white measurement noise from the autocovariances of steps at lags 1, 2 and 3.
 
-    With steps :math:`v_t = x_{t+1} - x_t` of a smooth motion plus noise of covariance ``R``, noise adds ``2 R`` at lag
-    0 and ``-R`` at lag 1. A parabola in the lag through lags 2 and 3 says what the motion alone has at lag 1. Windows
-    are ``[N, T, d]`` with ``T >= 5``; the result ``[d, d]`` is symmetric and positive semidefinite, float64.
+    For steps :math:`v_t = x_{t+1} - x_t` of a smooth motion plus noise of covariance ``R``, the noise adds ``2 R`` at
+    lag 0 and ``-R`` at lag 1. A parabola in the lag through lags 2 and 3 extrapolates the motion's own autocovariance
+    to lag 1. Windows are ``[N, T, d]``, ``T >= 5``; the result ``[d, d]``, float64, is positive semidefinite.
     """
     if windows.ndim != 3 or windows.shape[-2] < 5:
         raise ValueError(f"noise_covariance needs windows [N, T >= 5, d], got {list(windows.shape)}")
@@ -42,21 +42,21 @@ def noise_covariance(windows: Tensor) -> Tensor:
         early, late = steps[:, :-lag].flatten(0, 1), steps[:, lag:].flatten(0, 1)
         product = early.mT @ late / len(early)
         lagged.append((product + product.mT) / 2)
-    curve = (lagged[1] - lagged[2]) / 5  # of a - b l^2
+    curve = (lagged[1] - lagged[2]) / 5  # b of the parabola a - b lag^2
     noise = lagged[1] + 3 * curve - lagged[0]
     values, vectors = torch.linalg.eigh(noise)
     return vectors * values.clamp_min(0) @ vectors.mT
 
 
 class NoiseAdjustedComponents(nn.Module):
-    r"""Computes linear components of the state, ordered by how far they stand out of the measurement noise.
+    r"""Computes linear components of the state, ordered by their ratio of total variance to noise variance.
 
     .. math::
         y = \Lambda^{-1/2} U^T W^T x, \qquad W^T R W = I, \quad W^T C W = U \Lambda U^T
 
     with the covariance ``C`` of the states and ``R`` of the white noise in them (:func:`noise_covariance`): the minimum
-    noise fraction transform (Green et al. 1988), at unit spread. No column counts as measured to more than 1 % of its
-    spread, and components that stand out by less than a factor of two are 0, but for the first.
+    noise fraction transform (Green et al. 1988), at unit spread. The noise of a column is taken as at least 1 % of its
+    spread. Components whose variance is less than twice the noise's are 0, except the first.
     """
 
     analysis: Tensor
@@ -74,7 +74,7 @@ class NoiseAdjustedComponents(nn.Module):
         return state @ self.analysis.mT
 
     def invert(self, components: Tensor) -> Tensor:
-        """Maps components ``[*B, k]`` back to states ``[*B, d]``; what they leave out is 0."""
+        """Maps components ``[*B, k]`` back to states ``[*B, d]``; directions without a component are 0."""
         return components @ self.synthesis.mT
 
     @torch.no_grad()
@@ -85,7 +85,7 @@ class NoiseAdjustedComponents(nn.Module):
         states = windows.flatten(0, -2).double()
         states = states - states.mean(0)
         total = states.mT @ states / len(states)
-        # nothing is measured to more than 1 % of its spread
+        # noise of at least 1 % of a column's spread (1e-4 of its variance)
         values, vectors = torch.linalg.eigh(noise.to(total) + torch.diag(1e-4 * total.diagonal() + 1e-12))
         spread = values.sqrt()
         whiten, colour = vectors / spread, vectors * spread  # inverse transposes of each other
@@ -93,7 +93,7 @@ class NoiseAdjustedComponents(nn.Module):
         count = len(self.weights)
         ratio, turn = ratio[-count:].flip(-1), turn[:, -count:].flip(-1)
         analysis, synthesis = (whiten @ turn).mT, colour @ turn
-        sign = torch.where(analysis.sum(-1) < 0, -1.0, 1.0)  # the solver's whim
+        sign = torch.where(analysis.sum(-1) < 0, -1.0, 1.0)  # the sign of an eigenvector is arbitrary
         kept = ratio > MIN_RATIO
         kept[0] = True
         size = torch.where(ratio > 1e-9, ratio.clamp_min(1e-9).sqrt(), torch.ones_like(ratio))
@@ -103,9 +103,9 @@ class NoiseAdjustedComponents(nn.Module):
 
 
 def _credible(noise: Tensor) -> Tensor:
-    """The covariance ``[d, d]`` of noise without directions that are free of it by the chance of few windows.
+    """Raises small eigenvalues of an estimated noise covariance ``[d, d]``, which few windows make too small by chance.
 
-    An estimate of many columns nearly always has such directions, and they would come first among the components.
+    With many columns this nearly always occurs, and such directions would become the first components.
     """
     spread = noise.diagonal().clamp_min(1e-12).sqrt()
     values, vectors = torch.linalg.eigh(noise / spread / spread[:, None])
@@ -114,17 +114,18 @@ def _credible(noise: Tensor) -> Tensor:
 
 @torch.no_grad()
 def isomap(points: Tensor, dims: int) -> Tensor:
-    r"""Computes Isomap coordinates: their straight distances approximate those along the surface of the data.
+    r"""Computes Isomap coordinates, whose Euclidean distances approximate distances along the surface of the data.
 
     .. math::
         z_i = -\tfrac12\, \Lambda^{-1/2} V^T (D^2_{i} - \overline{D^2})
 
-    with the shortest ways ``D`` from the point to the landmarks over a graph of nearest neighbours, and the leading
+    with the shortest paths ``D`` from the point to the landmarks over a graph of nearest neighbours, and the leading
     eigenvalues and -vectors of the landmarks' doubly centred squared distances: Isomap (Tenenbaum et al. 2000) with
-    landmarks (de Silva and Tenenbaum 2003). Where the graph falls apart it gets more neighbours until it does not.
+    landmarks (de Silva and Tenenbaum 2003). The number of neighbours is doubled until the graph is connected.
 
-    Of points ``[N, d]`` the first 200 are the landmarks, so they should be in no order; less than two are an error.
-    Coordinates ``[N, dims]`` stand at unit spread, that of widest spread first; those that landmarks do not span are 0.
+    The first 200 of the points ``[N, d]`` are the landmarks, so points should be in random order. Fewer than two raise
+    a ValueError. Coordinates ``[N, dims]`` have unit spread, those with the widest spread before scaling come first;
+    those that landmarks do not span are 0.
     """
     if len(points) < 2:
         raise ValueError(f"coordinates along a surface need at least two points, got {len(points)}")
@@ -136,7 +137,7 @@ def isomap(points: Tensor, dims: int) -> Tensor:
     count = min(dims, chosen)
     values, vectors = values[-count:][::-1], vectors[:, -count:][:, ::-1]
     spanned = values > 1e-9 * values[0]
-    vectors = vectors * np.where(vectors.sum(0) < 0, -1.0, 1.0) * spanned  # their sign is the solver's whim
+    vectors = vectors * np.where(vectors.sum(0) < 0, -1.0, 1.0) * spanned  # their sign is arbitrary
     factor = np.sqrt(np.where(spanned, values, 1.0))
     coordinates = -((ways - own.mean(1, keepdims=True)).T @ vectors) / (2 * factor)
     spread = coordinates.std(0)
@@ -145,12 +146,12 @@ def isomap(points: Tensor, dims: int) -> Tensor:
 
 
 def _shortest_ways(points: Tensor, landmarks: int) -> np.ndarray:
-    """Lengths ``[landmarks, N]`` of the shortest ways over the graph, from the first points to all."""
+    """Computes the lengths ``[landmarks, N]`` of the shortest paths in the graph from the first points to all."""
     distances, count, neighbours = torch.cdist(points, points), len(points), NEIGHBOURS
     while True:
         near, index = distances.topk(min(neighbours + 1, count), largest=False)
         row = torch.arange(count)[:, None].expand_as(index)
-        near = near.clamp_min(1e-12)  # points that coincide are neighbours too
+        near = near.clamp_min(1e-12)  # equal points stay neighbours, at a positive distance
         graph = csr_matrix((near.flatten().cpu(), (row.flatten(), index.flatten().cpu())), shape=(count, count))
         if connected_components(graph, directed=False)[0] == 1:
             return dijkstra(graph, directed=False, indices=np.arange(landmarks))
@@ -158,7 +159,7 @@ def _shortest_ways(points: Tensor, landmarks: int) -> np.ndarray:
 
 
 class CompactLifting(TensorDictModuleBase):
-    r"""Lifts high-dimensional states to few coordinates, and chooses without labels whether twice as many are needed.
+    r"""Lifts high-dimensional states to few coordinates; decides without labels whether twice as many are needed.
 
     .. math::
         y = P x, \quad z = (g_1(y), g_2(y)), \quad
@@ -166,14 +167,14 @@ class CompactLifting(TensorDictModuleBase):
 
     ``P`` are the :class:`NoiseAdjustedComponents` and ``w`` their variances in units of the noise. ``g_1`` has ``m``
     ``coordinates`` and ``g_2`` twice as many; both are trained. :meth:`finish` keeps the smaller one unless the larger
-    one leaves less than 70 % of its reconstruction error, as it does where something moves by itself beside the robot.
-    The coordinates of the other are 0.
+    one has less than 70 % of its reconstruction error, for example because objects move independently of the robot.
+    Coordinates of the network that is not kept are 0.
 
     States are ``[*B, T, d]``, lifted ones ``[*B, T, 3 m]``; ``hidden_dims`` are the widths of all networks.
     """
 
     kept: Tensor
-    keeps_state = False  # the state is no part of the lifted state
+    keeps_state = False  # the lifted state does not contain the state
 
     def __init__(
         self,
@@ -211,14 +212,14 @@ class CompactLifting(TensorDictModuleBase):
         return self.components.invert(share[0] * small + share[1] * large)
 
     def reconstruction_error(self, lifted: Tensor, state: Tensor) -> Tensor:
-        """Computes the squared error ``[*B, T]`` in components, weighted by their variance in units of the noise."""
+        """Computes the squared error ``[*B, T]`` of components, weighted by their variance in units of the noise."""
         target = self.components(state)
         errors = [((made - target).square() * self.components.weights).mean(-1) for made in self._decoded(lifted)]
         return (errors[0] + errors[1]) / 2
 
     @torch.no_grad()
     def prepare(self, windows: Tensor) -> None:
-        """Fits the components to windows ``[*B, T, d]``, and sets the linear part of both networks to the first."""
+        """Fits the components to windows ``[*B, T, d]``; initialises the linear part of both networks with the first."""
         self.kept.fill_(1.0)
         self.components.fit(windows)
         components, size = self.components(windows), self.components.weights.sqrt()
@@ -229,11 +230,10 @@ class CompactLifting(TensorDictModuleBase):
 
     @torch.enable_grad()
     def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
-        """Trains both networks to Isomap coordinates and back, before any loss does.
+        """Trains both networks, before any loss, to map components to Isomap coordinates and back.
 
-        No gradient of the losses unfolds a folded surface. The coordinates are :func:`isomap` of means of a few
-        successive frames, which have less noise. Windows have 5 frames or more; of each network at most 1000 updates
-        are made.
+        Gradients of the losses do not unfold a folded surface. :func:`isomap` is computed on means of a few successive
+        frames, which are less noisy. Windows have 5 frames or more; each network takes at most 1000 updates.
         """
         updates = min(updates, PRETRAINING_UPDATES)
         weights, components = self.components.weights, self.components(windows.flatten(0, -3)).detach()
@@ -259,7 +259,7 @@ class CompactLifting(TensorDictModuleBase):
 
     @torch.no_grad()
     def finish(self, windows: Tensor) -> None:
-        """Keeps the coordinates of one network, by what both leave of windows ``[*B, T, d]``; after training."""
+        """Chooses, after training, one network by the reconstruction errors of both on windows ``[*B, T, d]``."""
         self.kept.fill_(1.0)
         sums = torch.zeros(2, dtype=torch.float64)
         for part in windows.flatten(0, -3).split(BATCH):
