@@ -219,7 +219,7 @@ class CompactLifting(TensorDictModuleBase):
 
     @torch.no_grad()
     def prepare(self, windows: Tensor) -> None:
-        """Fits the components to windows ``[*B, T, d]``; initialises the linear part of both networks with the first."""
+        """Fits the components to windows ``[*B, T, d]``; the first initialise the linear part of both networks."""
         self.kept.fill_(1.0)
         self.components.fit(windows)
         components, size = self.components(windows), self.components.weights.sqrt()

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Koopman inverse dynamics model: state windows in, latent actions and robot actions out."""
+"""The Koopman inverse dynamics model, which maps windows of states to latent actions and robot actions."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, RidgeFit, ridge, shared_filter
 from torchrl_koap.modules.windows import WindowReader
 
-# the raw window of a smoothed latent action is read if its held-out error is below this share of the lifted one's:
-# few labels left out say little, and unlabelled windows made the lifted one for the purpose
+# A smoothed latent action reads the raw window if its held-out error is below this share of the lifted window's. The
+# share is below 1: few held-out labels say little, and the lifted window was fitted to unlabelled windows.
 RAW_SHARE = 0.85
 
 
 class LiftedInverseDynamics(LatentInverseDynamics):
-    """Base class of models of lifted states ``z = g(x)`` that latent actions move on: what ``KOAPLoss`` trains.
+    """Base class of the models that ``KOAPLoss`` trains: lifted states ``z = g(x)``, with latent actions as input.
 
-    A subclass says how (:meth:`predict_next`). Arguments as for :class:`KoopmanInverseDynamics`.
+    A subclass defines their dynamics (:meth:`predict_next`). Arguments as for :class:`KoopmanInverseDynamics`.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
     r"""Infers latent actions from a window of states and decodes them linearly to robot actions.
 
     Normalises, infers :math:`u_t = f_\theta(\cdot)`, decodes :math:`a_t = D u_t + b` and de-normalises. Lifting and
-    operator take no part in that; they shape the latent actions in training through :math:`z_{t+1} = K z_t + u_t`.
+    operator are used only in training, where :math:`z_{t+1} = K z_t + u_t` shapes the latent actions.
 
-    The parts are TensorDictModules of their own, each under its name here and once in the state dict; in a tensordict
-    they read and write the entries that they were made with, in the networks' units.
+    The parts are TensorDictModules themselves, and each occurs once in the state dict. They read and write the entries
+    that they were made with, in the networks' units.
 
     Args:
         latent_action (LatentActionModule): the network ``f``.
@@ -74,11 +74,11 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
     Keyword Args:
         lifting (KoopmanLifting or CompactLifting): the networks ``g``.
         operator (KoopmanOperator): the matrix ``K``.
-        penalty (float): ridge of the decoder where fewer than three trajectories have labels. Defaults to ``0.15``.
+        penalty (float): ridge penalty of the decoder if fewer than three trajectories have labels. Default: ``0.15``.
         **kwargs: normalisers, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
-        ValueError: if the sizes of the parts do not fit together, or the decoder does not read what the network writes.
+        ValueError: if sizes of the parts differ, or the decoder does not read the entry that the network writes.
 
     Examples:
         >>> import torch
@@ -135,9 +135,9 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         return self.operator.step(lifted, latent_action)
 
     def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
-        """Sets what is known of the inputs before training, and trains a lifting that starts from Isomap coordinates.
+        """Fits statistics of the inputs before training, and trains a :class:`CompactLifting` to Isomap coordinates.
 
-        Without updates a lifting starts at linear components.
+        With ``updates=0`` this lifting starts at linear components.
         """
         windows = self.normalize_state(windows)
         with torch.no_grad():
@@ -148,7 +148,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
 
     @torch.no_grad()
     def finish(self, windows: Tensor) -> None:
-        """Fits the parts that are fitted to raw states ``[*B, T, d]`` after training."""
+        """Fits lifting and latent action after training, to raw states ``[*B, T, d]``."""
         windows = self.normalize_state(windows)
         self.lifting.finish(windows)
         self.latent_action.finish(windows)
@@ -163,11 +163,11 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         guessed: bool = False,
         alike: bool = True,
     ) -> dict[str, Any]:
-        """Fits the decoder in closed form, and chooses the block that a latent action with several reads.
+        """Fits the decoder in closed form; of a latent action with several blocks it chooses one.
 
-        With ``axes``, where a latent action holds the steps along them, the decoder is shrunk towards one filter of the
-        steps that all axes share, instead of towards 0. Guessed axes are used only if labels left out are then
-        predicted better. The summary names the ``block`` if there were several.
+        With ``axes``, and a latent action that contains the steps along them, the decoder is shrunk towards one filter
+        of the steps that all axes share, instead of towards 0. Guessed axes are used only if they lower the held-out
+        error. The summary names the ``block`` if there were several.
         """
         normalizer = self.action_normalizer
         options = {
@@ -193,7 +193,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
     def _fit_decoder(
         self, latent: Tensor, action: Tensor, axes: Sequence[int], guessed: bool, **options: Any
     ) -> RidgeFit:
-        """Fits around the shared filter of known axes; around that of guessed ones, or around 0, by held-out error."""
+        """Fits with the shared filter of the axes as prior; for guessed axes only if that lowers the held-out error."""
         features = self.latent_action.axis_features(axes) if axes else None
         if features is None:
             return ridge(latent, action, **options)
@@ -208,7 +208,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
     def _shared_filter_prior(
         self, latent: Tensor, action: Tensor, axes: Sequence[int], entries: Tensor, factors: Tensor
     ) -> Tensor:
-        """The decoder ``[act, m]`` that applies one and the same filter to the steps ``[S, act]`` of every axis."""
+        """Returns the decoder ``[act, m]`` that applies the same filter to the steps ``[S, act]`` of every axis."""
         size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]
         action_size = _unit(self.action_normalizer, action.shape[-1], factors)
         per_unit = (factors * size).double()
@@ -220,6 +220,6 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
 
 
 def _unit(normalizer: nn.Module | None, width: int, like: Tensor) -> Tensor:
-    """Raw size of one normalised unit of every column ``[width]``."""
+    """Returns the raw size of one normalised unit of every column, ``[width]``."""
     ones = torch.ones(width, dtype=like.dtype, device=like.device)
     return ones if normalizer is None else normalizer.inverse(ones) - normalizer.inverse(torch.zeros_like(ones))

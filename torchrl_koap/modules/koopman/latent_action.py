@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latent actions ("action proxies"): inferred from short state sequences alone, and decoded linearly."""
+"""Networks that infer latent actions ("action proxies") from short sequences of states, and their linear decoder."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from torchrl_koap.modules.windows import WindowReader
 
 
 class LatentActionModule(TensorDictModuleBase):
-    r"""Base class of the latent-action networks: reads the frames around every step and infers ``u`` from them.
+    r"""Base class of the latent-action networks, which read the frames around every step and infer ``u`` from them.
 
     .. math::
         u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad x_{t+1} \text{ is never an input}
 
-    A subclass writes :meth:`infer`; :class:`~torchrl_koap.modules.WindowReader` draws what it is given.
+    A subclass defines :meth:`infer`; :class:`~torchrl_koap.modules.WindowReader` shows its input.
 
     Args:
         state_dim (int): size ``d`` of a state.
         latent_dim (int): size ``m`` of a latent action.
 
     Keyword Args:
-        num_past, look_ahead, relative, clamped: of the reader (:class:`~torchrl_koap.modules.WindowReader`), with the
-            paper's defaults: one frame before, one 8 ahead, frames instead of steps.
+        num_past, look_ahead, relative, clamped: options of the :class:`~torchrl_koap.modules.WindowReader`. Defaults
+            are the paper's: one past frame, one frame 8 steps ahead, frames instead of steps.
         in_key, out_key (NestedKey): window of states ``[*B, T, d]`` in the network's units, and latent actions
             ``[*B, T, m]``.
 
@@ -47,7 +47,7 @@ class LatentActionModule(TensorDictModuleBase):
         [2.0, 2.0, 1.0, 0.0]
     """
 
-    blocks: tuple[str, ...] = ("",)  # parts of a latent action of which labels choose one; most have no such parts
+    blocks: tuple[str, ...] = ("",)  # alternative parts of a latent action, of which labels choose one
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class LatentActionModule(TensorDictModuleBase):
         )
 
     def infer(self, read: Tensor) -> Tensor:
-        """Infers latent actions ``[*B, T, m]`` from what was read, ``[*B, T, F, d]``."""
+        """Infers latent actions ``[*B, T, m]`` from the output ``[*B, T, F, d]`` of :meth:`gather`."""
         raise NotImplementedError
 
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
@@ -77,22 +77,22 @@ class LatentActionModule(TensorDictModuleBase):
         return self.reader.gather(state, frames)
 
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor] | None:
-        """Says where a latent action holds the steps along some state columns; None if it does not hold them.
+        """Returns which entries of a latent action hold the steps along some state columns; None if none do.
 
-        These are entries of the latent action, int64 ``[S, len(axes)]`` with ``S = num_past + len(look_ahead)``, and
-        factors of that shape that turn them into steps in the networks' units.
+        The entries are int64 ``[S, len(axes)]`` with ``S = num_past + len(look_ahead)``. Factors of the same shape
+        convert them to steps in the networks' units.
         """
         return None
 
     def choose(self, block: str) -> None:
-        """Reads one of :attr:`blocks`; the entries of the others are 0."""
+        """Selects one of :attr:`blocks`; the entries of the others become 0."""
 
     def prepare(self, windows: Tensor) -> None:
-        """Sets the spread of the steps from windows ``[*B, T, d]`` without labels, before training."""
+        """Computes, before training, the spread of the steps from windows ``[*B, T, d]`` without labels."""
         self.reader.fit(windows)
 
     def finish(self, windows: Tensor) -> None:
-        """Fits to windows ``[*B, T, d]`` without labels what is fitted after training; most have nothing."""
+        """Fits parts after training, to windows ``[*B, T, d]`` without labels. The base class has none."""
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -119,7 +119,7 @@ class LatentActionLSTM(LatentActionModule):
 
     def __init__(self, state_dim: int, latent_dim: int, *, hidden_dim: int = 128, **kwargs):
         super().__init__(state_dim, latent_dim, **kwargs)
-        self.lstm = LSTM(state_dim, hidden_dim, batch_first=True)  # TorchRL's traces under torch.compile
+        self.lstm = LSTM(state_dim, hidden_dim, batch_first=True)  # unlike torch's, it can be traced by torch.compile
         self.readout = nn.Linear(hidden_dim, latent_dim)
 
     def infer(self, read: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ class LatentActionMLP(LatentActionModule):
 
 
 class LatentActionFourier(LatentActionModule):
-    r"""Computes latent actions that are themselves observables of the window: a linear and a trainable Fourier part.
+    r"""Computes latent actions as observables of the window, with a linear and a trainable Fourier part.
 
     .. math::
         u_t = (v_t / \sqrt{D},\; \sqrt{2 c / p}\, \cos(\Omega [v_t / (\ell_v \sqrt{D}), x_t / \ell_x] + \beta))
@@ -172,10 +172,10 @@ class LatentActionFourier(LatentActionModule):
             part is left.
 
     Keyword Args:
-        curvature (float): prior variance ``c`` of the curved part against the linear one. Defaults to ``0.1``.
-        motion_scale (float): length ``l_v``, in spreads of the steps. Defaults to ``1``.
-        position_scale (float): length ``l_x``, in units of the normalised state. Defaults to ``4``.
-        position_weight (float): prior standard deviation, against the linear part's, of a further linear part in
+        curvature (float): prior variance ``c`` of the Fourier part, relative to the linear one. Defaults to ``0.1``.
+        motion_scale (float): length scale ``l_v``, in spreads of the steps. Defaults to ``1``.
+        position_scale (float): length scale ``l_x``, in units of the normalised state. Defaults to ``4``.
+        position_weight (float): prior standard deviation, relative to the linear part's, of a second linear part in
             ``x_t`` itself, for absolute actions; ``latent_dim`` grows by ``d``. Defaults to ``0``: none.
         trainable (bool): train frequencies and phases; otherwise they stay as drawn. Defaults to ``True``.
 
@@ -232,7 +232,7 @@ class LatentActionFourier(LatentActionModule):
         return torch.cat([motion, curved, *((self.position_weight * present,) if self.position_weight else ())], -1)
 
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Says where a latent action holds the steps along state columns: in its first entries."""
+        """Returns the entries that hold the steps along state columns (:meth:`LatentActionModule.axis_features`)."""
         n, axes = self.reader.num_past, list(axes)
         scales = torch.cat([self.reader.scales[:n], self.reader.scales[n + 1 :]])[:, axes]
         first = torch.arange(len(scales), device=scales.device)[:, None] * self.state_dim
@@ -274,10 +274,10 @@ class LinearActionDecoder(TensorDictModuleBase):
 
     @torch.no_grad()
     def assign(self, fit: RidgeFit) -> None:
-        """Takes over the weights of a ridge regression from latent actions to normalised actions.
+        """Copies the weights of a ridge regression from latent actions to normalised actions.
 
         Raises:
-            ValueError: if it is from or to another number of columns.
+            ValueError: if the regression has another number of input or output columns.
         """
         if fit.weight.shape != self.linear.weight.shape:
             wanted, found = (list(weight.shape) for weight in (self.linear.weight, fit.weight))

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The linear model: observables of states (lifting), and the operator ``K`` that moves them on by one step."""
+"""The linear model: observables of states (lifting), and the operator ``K`` that advances them by one step."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class KoopmanLifting(TensorDictModuleBase):
         hidden_dims (sequence of int): widths of both networks.
         include_state (bool): the first ``d`` observables are the state itself, as in extended dynamic mode
             decomposition; the other ``m - d`` are learned.
-        linear_skip (bool): add to a learned lifting a linear map in both directions, which :meth:`prepare` sets to the
-            principal components, so that a nearly linear lifting costs the networks nothing.
+        linear_skip (bool): add linear maps to a learned lifting, in both directions. :meth:`prepare` sets them to the
+            principal components, so that the networks need only learn the nonlinear part.
         in_key, out_key (NestedKey): states ``[*B, T, d]`` and lifted states ``[*B, T, m]``.
 
     Raises:
-        ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim`` or together with ``linear_skip``.
+        ValueError: for ``include_state`` with ``latent_dim < state_dim`` or together with ``linear_skip``.
 
     Examples:
         >>> import torch
@@ -73,7 +73,7 @@ class KoopmanLifting(TensorDictModuleBase):
 
     @property
     def keeps_state(self) -> bool:
-        """Whether the lifted state is the state itself and nothing else."""
+        """Whether the lifted state equals the state."""
         return self.encoder is None
 
     @torch.no_grad()
@@ -86,15 +86,15 @@ class KoopmanLifting(TensorDictModuleBase):
         values, vectors = torch.linalg.eigh(centred.mT @ centred / len(centred))
         count = min(self.latent_dim, self.state_dim)
         components, spread = vectors[:, -count:].flip(-1), values[-count:].flip(-1).clamp_min(1e-12).sqrt()
-        components = components * torch.where(components.sum(0) < 0, -1.0, 1.0)  # their sign is the solver's whim
+        components = components * torch.where(components.sum(0) < 0, -1.0, 1.0)  # their sign is arbitrary
         self.encoder_skip.weight.zero_()[:count] = (components / spread).mT.to(self.encoder_skip.weight)
         self.decoder_skip.weight.zero_()[:, :count] = (components * spread).to(self.decoder_skip.weight)
 
     def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
-        """Trains before the losses do (:meth:`InverseDynamics.prepare`), on windows ``[*B, T, d]``: here nothing."""
+        """Trains on windows ``[*B, T, d]`` before the losses (:meth:`InverseDynamics.prepare`); does nothing here."""
 
     def finish(self, windows: Tensor) -> None:
-        """Chooses after training, on windows ``[*B, T, d]`` without labels, what is kept: here everything."""
+        """Chooses coordinates after training, on windows ``[*B, T, d]`` without labels; keeps all of them here."""
 
     def encode(self, state: Tensor) -> Tensor:
         """Lifts states ``[*B, T, d]`` to ``[*B, T, m]``."""
@@ -123,7 +123,7 @@ class KoopmanLifting(TensorDictModuleBase):
 
 
 class KoopmanOperator(TensorDictModuleBase):
-    r"""Moves lifted states on by one step, with a dense matrix and a latent action.
+    r"""Advances lifted states by one step, with a dense matrix and a latent action.
 
     .. math::
         z_{t+1} = K z_t + u_t \quad\text{or, with an input matrix,}\quad z_{t+1} = K z_t + B u_t
@@ -133,7 +133,7 @@ class KoopmanOperator(TensorDictModuleBase):
 
     Keyword Args:
         input_dim (int, optional): size ``p`` of a latent action; adds the matrix ``B`` ``[m, p]``, zero at first.
-            Default: no ``B``, as in the paper. With ``B`` a latent action may hold more than the next state shows.
+            Default: no ``B``, as in the paper. With ``B`` a latent action may hold more than the next state reveals.
         in_keys (sequence of NestedKey): lifted state ``[*B, T, m]`` and latent action ``[*B, T, m or p]``.
         out_key (NestedKey): predicted next lifted state ``[*B, T, m]``.
 

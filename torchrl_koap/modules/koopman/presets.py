@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Named variants of KOAP: one entry each, from normalisation to the decoder's penalty."""
+"""Named variants of KOAP, each with all options from normalisation to the decoder's penalty."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 _DEFAULT: dict[str, Any] = {
-    "normalization": {"state": "standard", "action": "rms"},  # modes of Normalizer.fit, for whoever makes them
+    "normalization": {"state": "standard", "action": "rms"},  # modes of Normalizer.fit, for callers
     "network": LatentActionFourier,
     "latent_dim": 32,
     "hidden_dim": 64,
@@ -47,23 +47,21 @@ _PAPER: dict[str, Any] = _DEFAULT | {
     "relative": False,
 }
 
-# everything that a variant is; what only its network takes stands last
+# all options of each variant; those that only its network takes come last
 PRESETS: dict[str, dict[str, Any]] = {
-    # observables of the frames relative to the current one, an input matrix B, no clamped look-ahead, a
-    # decoder in closed form
+    # observables of steps between frames, an input matrix B, no clamped look-ahead, a decoder in closed form
     "default": _DEFAULT | _FOURIER,
-    # robots that respond late: the state 8 steps ahead is read, too, as in the paper
+    # for robots that respond late: also reads the state 8 steps ahead, as in the paper
     "delayed": _DEFAULT | {"look_ahead": (2, 3, 4, 5, 8)} | _FOURIER,
-    # actions, or commands, that say where the robot is to be: what is read off the present frame counts more than the
-    # steps around it
+    # for actions, or commands, that are target positions: the present frame has more weight than the steps around it
     "absolute": _DEFAULT
     | {
-        # such places are far from zero compared with their spread; among principal components size is information
+        # Targets are far from zero compared with their spread. The sizes of principal components carry information.
         "normalization": {"state": "shared", "action": "standard"},
         "penalty": 1e-3,
     }
     | {"num_features": 1024, "curvature": 10.0, "motion_scale": 3.0, "position_scale": 2.0, "position_weight": 1.0},
-    # where observations are noisy or high-dimensional: few coordinates that unlabelled windows determine, smoothed
+    # for noisy or high-dimensional observations: few, smoothed coordinates, fitted to unlabelled windows
     # (docs/results/unlabelled_data.md)
     "semi_supervised": _DEFAULT
     | {
@@ -74,13 +72,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "look_ahead": (2, 3, 4, 5, 6, 7, 8),
     }
     | {"num_features": 512},
-    # commands of joints that are not observed: the paper's networks, wider, and labels shape the latent action, too
+    # for commands of joints that are not observed: wider networks of the paper; labels also train the latent action
     "scene": _PAPER
     | {"normalization": {"state": "standard", "action": "standard"}, "hidden_dim": 256, "clamped": False},
     "paper": _PAPER,
 }
 
-# a smoothed lifting keeps states of at most so many columns as they are
+# a smoothed lifting is the identity for states of at most this many columns
 NARROW = 8
 
 
@@ -103,13 +101,13 @@ def make_koopman_inverse_dynamics(
 
     Keyword Args:
         preset (str): a name in :data:`PRESETS`.
-        **overrides: any entry of ``PRESETS[preset]`` but its network.
+        **overrides: any entry of ``PRESETS[preset]`` except ``network``.
 
     Returns:
-        KoopmanInverseDynamics: with fresh weights, drawn from torch's global generator.
+        KoopmanInverseDynamics: with random weights, drawn from torch's global generator.
 
     Raises:
-        ValueError: for an unknown preset or option; the message suggests the nearest.
+        ValueError: for an unknown preset or option; the message suggests the most similar name.
 
     Examples:
         >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
@@ -125,14 +123,14 @@ def make_koopman_inverse_dynamics(
 
     hidden = (choice["hidden_dim"],) * 2
     latent_dim, include_state = choice["latent_dim"], choice["include_state"]
-    if latent_dim is None:  # the state as it is where it is narrow, else a coordinate per action
+    if latent_dim is None:  # a narrow state is kept unchanged, a wider one lifted to one coordinate per action entry
         include_state = include_state or state_dim <= NARROW
         latent_dim = state_dim if include_state else action_dim
     if "latent_dim" not in overrides and "include_state" not in overrides and latent_dim < state_dim:
-        include_state = False  # a preset's size is too small for a high-dimensional state to be part of the lifting
-    own = set(choice) - set(_DEFAULT)  # what only this network takes
+        include_state = False  # the preset's size cannot contain a high-dimensional state
+    own = set(choice) - set(_DEFAULT)  # options that only this network takes
     settings = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *own)}
-    # networks are built in this order: their first weights are drawn one after the other
+    # the order of construction determines the initial weights of a seed
     latent_action = None
     if network is LatentActionFourier:
         latent_action = LatentActionFourier(state_dim, **settings)

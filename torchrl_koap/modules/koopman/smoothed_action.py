@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latent actions of few, smoothed coordinates that unlabelled windows determine: the preset ``semi_supervised``."""
+"""Latent actions of few, smoothed coordinates, fitted to unlabelled windows (preset ``semi_supervised``)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class WienerSmoother(nn.Module):
     .. math::
         \hat w = S (S + N)^{-1} w, \qquad S = \operatorname{cov}(w) - N, \qquad N = (I - \tfrac{1}{F} 1 1^T) \otimes R
 
-    with the ``F`` frames ``[F, dim]`` of a window, their mean subtracted, in ``w``, and the covariance ``R`` of white
-    measurement noise. Noise that is independent from frame to frame makes neighbouring steps undo each other: where the
-    motion's own autocovariance is smooth in the lag, ``R`` is how far the one of lag 1 lies below the curve through
-    those of lags 2 and 3 (:func:`noise_covariance`). Without noise ``R`` is 0 and the window stays as it is.
+    ``w`` are the ``F`` frames ``[F, dim]`` of a window minus their mean, and ``R`` is the covariance of white
+    measurement noise. Such noise makes neighbouring steps anticorrelated. If the motion's own autocovariance is smooth
+    in the lag, ``R`` is the distance of the autocovariance at lag 1 below the curve through lags 2 and 3
+    (:func:`noise_covariance`). Without noise ``R`` is 0 and the window stays unchanged.
     """
 
     gain: Tensor
@@ -44,9 +44,9 @@ class WienerSmoother(nn.Module):
 
     @torch.no_grad()
     def fit(self, windows: Tensor, consecutive: Tensor) -> None:
-        """Fits the gain to windows ``[N, F, dim]`` of the frames that are smoothed together; no label is read.
+        """Fits the gain to windows ``[N, F, dim]`` of the frames that are smoothed together, without labels.
 
-        The noise is that of ``consecutive`` frames one control step apart, ``[N, T, dim]`` with ``T >= 5``.
+        The noise is estimated from ``consecutive`` frames, one control step apart: ``[N, T, dim]`` with ``T >= 5``.
         """
         centred = (windows - windows.mean(-2, keepdim=True)).flatten(-2).double()
         total = centred.mT @ centred / len(centred)
@@ -61,7 +61,7 @@ class WienerSmoother(nn.Module):
 
 
 class LatentActionSmoothed(LatentActionModule):
-    r"""Infers latent actions from a reduced and smoothed window, or from the raw one if its held-out error is lower.
+    r"""Infers latent actions from a lifted and smoothed window, or from the raw one if its held-out error is lower.
 
     .. math::
         w_t = (g(x_{t-n}), \dots, g(x_t), g(x_{t+2}), \dots, g(x_{t+k})), \quad
@@ -69,11 +69,11 @@ class LatentActionSmoothed(LatentActionModule):
 
     ``g`` is the lifting to a few coordinates, shared with the Koopman model, ``A`` the gain of a
     :class:`WienerSmoother` and ``phi`` the observables of :class:`LatentActionFourier` (steps and ``num_features``
-    random Fourier features). All of it comes from unlabelled windows (:meth:`finish`). One of ``gamma`` is 1 and the
-    other 0: :meth:`choose` is asked with the held-out error of the labelled steps, within the budget.
+    random Fourier features). All are fitted to unlabelled windows (:meth:`finish`). One ``gamma`` is 1 and the other 0
+    (:meth:`choose`); the held-out error on the labelled steps of the budget decides.
 
-    With a lifting that keeps the state (``include_state``, all columns) the first block is the smoothed state itself.
-    The raw block may not read frames that the lifted one does not. Keywords as for :class:`LatentActionModule`.
+    If the lifting equals the state, the first block holds the smoothed state. The raw block must not read frames beyond
+    those of the lifted block. Keywords as for :class:`LatentActionModule`.
     """
 
     gates: Tensor
@@ -97,33 +97,33 @@ class LatentActionSmoothed(LatentActionModule):
         dim = lifting.latent_dim
         frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead}
         raw_frames: dict[str, Any] = {"num_past": RAW_PAST, "look_ahead": RAW_LOOK_AHEAD}
-        # random features as they are: training them was measured to change nothing
+        # random features are not trained: training them had no measurable effect
         lifted = LatentActionFourier(dim, num_features, trainable=False, **frames)
         raw = LatentActionFourier(lifting.state_dim, num_features, trainable=False, **raw_frames)
         super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **frames, **kwargs)
-        self.reader = WindowReader(dim, relative=False, **frames)  # of lifted frames, which are smoothed together
+        self.reader = WindowReader(dim, relative=False, **frames)  # reads the lifted frames that are smoothed together
         self.keeps_state = lifting.keeps_state
         self.lifted, self.raw = lifted, raw
-        self._lifting = (lifting,)  # in a tuple: the Koopman model holds its weights
+        self._lifting = (lifting,)  # the tuple prevents registration: the Koopman model owns its weights
         self.smoother = WienerSmoother(self.reader.num_frames, dim)
         self.register_buffer("spread", torch.ones(dim))
         self.register_buffer("gates", torch.tensor([1.0, 0.0]))
 
     @torch.no_grad()
     def choose(self, block: str) -> None:
-        """Reads one block; the other is 0."""
+        """Selects one block; the entries of the other become 0."""
         self.gates.copy_(torch.tensor([float(block == LIFTED), float(block == RAW)]))
 
     @property
     def chosen(self) -> str:
-        """The block that is read."""
+        """Name of the selected block."""
         return RAW if self.gates[1] else LIFTED
 
     def _lift(self, state: Tensor) -> Tensor:
         return self._lifting[0].encode(state) / self.spread
 
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Reads for both blocks: smoothed steps and present frame, then raw ones, flat: ``[*B, T, 1, F m + 9 d]``."""
+        """Reads smoothed steps and present frame, then the raw ones, flattened: ``[*B, T, 1, F m + 9 d]``."""
         smoothed = self.smoother(self.reader.gather(self._lift(state), frames))
         lifted = self.reader.steps(smoothed) / self.lifted.reader.scales
         return torch.cat([lifted.flatten(-2), self.raw.gather(state, frames).flatten(-2)], -1).unsqueeze(-2)
@@ -135,12 +135,12 @@ class LatentActionSmoothed(LatentActionModule):
         return torch.cat([gate * part for gate, part in zip(self.gates, parts, strict=True)], -1)
 
     def prepare(self, windows: Tensor) -> None:
-        """Fits as :meth:`finish` does, to the lifting as it is before training."""
+        """Fits as :meth:`finish` does, with the lifting before training."""
         self.finish(windows)
 
     @torch.no_grad()
     def finish(self, windows: Tensor) -> None:
-        """Fits to windows ``[*B, T, d]`` what depends on the lifting: spread, smoother, spread of the steps."""
+        """Fits to windows ``[*B, T, d]`` all that depends on the lifting: spread, smoother and spread of the steps."""
         windows = windows.flatten(0, -3)
         now = self.reader.valid_frames(windows.shape[-2])[:1]
         self.spread.fill_(1.0)
@@ -152,13 +152,13 @@ class LatentActionSmoothed(LatentActionModule):
         self.smoother.fit(read, lifted)
         steps = self.reader.steps(self.smoother(read)).square().mean(0).sqrt()
         moving = spread > 1e-9
-        # a lifting may leave coordinates at 0: those that are left count as if there were no others
+        # a lifting may set coordinates to 0: the rescaling gives the others the weight that they would have alone
         steps = steps * (moving.sum() / moving.numel()).clamp_min(1e-9).sqrt()
         self.lifted.reader.set_spread(steps)
         self.raw.reader.fit(windows)
 
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor] | None:
-        """Says where the chosen block holds the steps along state columns; the lifted one if it keeps the state."""
+        """Returns the steps' entries in the chosen block; None if that is lifted and does not keep the state."""
         if self.chosen == RAW:
             entries, factors = self.raw.axis_features(axes)
             return entries + self.lifted.latent_dim, factors

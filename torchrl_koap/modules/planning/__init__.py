@@ -1,2 +1,2 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Diffusion models over sequences: schedules, solvers, denoisers, planner, policy."""
+"""Diffusion models of sequences: noise schedule, solvers, denoisers, planner and Diffusion Policy."""

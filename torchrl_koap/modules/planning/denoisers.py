@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Networks that predict the clean sequence from a noisy one, and features of their condition."""
+"""Networks that predict clean sequences from noisy ones, and features of their condition."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-EMBEDDING_DIM = 32  # of a step
-NEAR = (0.05, 0.015)  # m; distances that the magnified copies resolve
+EMBEDDING_DIM = 32  # width of the embedding of a step
+NEAR = (0.05, 0.015)  # length scales in m of the magnified copies of positions
 
 
 class StepEmbedding(nn.Module):
-    """Embeds times as sines and cosines of geometrically spaced frequencies, then a two-layer network.
+    """Embeds times by sines and cosines of geometrically spaced frequencies and a two-layer network.
 
     The width ``embedding_dim`` is even and at least 4.
     """
@@ -28,17 +28,17 @@ class StepEmbedding(nn.Module):
         )
 
     def forward(self, time: Tensor) -> Tensor:
-        """Time ``[B]`` to embedding ``[B, embedding_dim]``."""
+        """Maps times ``[B]`` to embeddings ``[B, embedding_dim]``."""
         angles = time[:, None] * self.frequencies
         return self.network(torch.cat([angles.sin(), angles.cos()], -1))
 
 
 class ConditionEncoder(nn.Module):
-    """Embeds a condition with entries of order one: Fourier features (Tancik et al. 2020), then a two-layer network.
+    """Embeds a condition with entries of order one by Fourier features (Tancik et al. 2020) and a two-layer network.
 
-    Where to pass an obstacle changes within centimetres; sines of up to ``2^(frequencies - 1)`` half turns per unit let
-    a small network learn such edges in fewer steps. Of each of the ``condition_dim`` columns there are so many octaves
-    of sines and cosines, beside the plain column; ``width`` is that of the embedding.
+    The side on which to pass an obstacle changes within centimetres. Sines of up to ``2^(frequencies - 1)`` half turns
+    per unit let a small network learn such edges in fewer steps. Every one of the ``condition_dim`` columns is used
+    unchanged and in ``frequencies`` octaves of sines and cosines; ``width`` is the width of the embedding.
     """
 
     def __init__(self, condition_dim: int, *, frequencies: int, width: int):
@@ -49,13 +49,13 @@ class ConditionEncoder(nn.Module):
         )
 
     def forward(self, condition: Tensor) -> Tensor:
-        """Condition ``[B, c]`` to embedding ``[B, width]``."""
+        """Maps conditions ``[B, c]`` to embeddings ``[B, width]``."""
         angles = (condition[:, :, None] * self.frequencies).flatten(1)
         return self.network(torch.cat([condition, angles.sin(), angles.cos()], -1))
 
 
 class Denoiser(nn.Module):
-    """Base class of denoisers: input checks, one batch dimension, embedded time and condition; a subclass denoises.
+    """Base class of denoisers: checks inputs, flattens batches, embeds time and condition. A subclass denoises.
 
     Args:
         state_dim (int): number ``d`` of state columns.
@@ -78,7 +78,7 @@ class Denoiser(nn.Module):
         raise NotImplementedError
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Predicts clean sequences of noisy ones ``[*B, H, d]``, for times and conditions.
+        """Predicts clean sequences from noisy ones ``[*B, H, d]``, given times and conditions.
 
         Times are ``[*B]`` in training steps, conditions ``[*B, c]``.
         """
@@ -94,7 +94,7 @@ class Denoiser(nn.Module):
 class MLPDenoiser(Denoiser):
     """Residual network on the flattened sequence, for one fixed horizon; the default for tasks with objects.
 
-    On Avoiding its plans touch obstacles more often than those of
+    On Avoiding, its plans touch obstacles more often than those of
     :class:`~torchrl_koap.modules.planning.unet.TemporalUnet`.
 
     Args and errors as for :class:`Denoiser`.
@@ -143,19 +143,19 @@ class MLPDenoiser(Denoiser):
 
 
 class RelativePositionFeatures(nn.Module):
-    r"""Tells where the tool is as seen from the objects, plain and magnified near zero: to a millimetre near a contact.
+    r"""Computes positions relative to objects, plain and magnified near zero (to a millimetre near a contact).
 
     .. math::
         d = R(-\theta) (p - o), \qquad (d,\; \tanh(d / 0.05\,\mathrm{m}),\; \tanh(d / 0.015\,\mathrm{m}))
 
-    for every position ``p`` to an origin ``o`` with yaw ``theta``; heights are not turned. A normalised state in world
-    coordinates tells them to some per cent of the table's size. They only ever join the condition; plans stay states.
-    Histories of states ``[*B, h, d]`` give ``[*B, num_features]``, by their last frame.
+    for every position ``p`` and an origin ``o`` with yaw ``theta``; heights are not rotated. Normalised states in world
+    coordinates resolve ``d`` only to some per cent of the table's size. The features are part of the condition only;
+    plans remain states. Histories of states ``[*B, h, d]`` give ``[*B, num_features]``, from their last frame.
 
     Args:
-        pairs (sequence): state columns of up to four parts each: a position of 2 or 3 columns; the position it is seen
-            from, whose height is taken as it is where it has 2; ``cos, sin`` of the yaw of the frame it is seen in;
-            ``cos, sin`` of a yaw to be told relative to that frame, too.
+        pairs (sequence): state columns of up to four parts each: a position of 2 or 3 columns; the origin, and if it
+            has 2 columns the height stays absolute; ``cos, sin`` of the yaw of the frame of reference; ``cos, sin`` of
+            a yaw that is also expressed in that frame.
     """
 
     def __init__(self, pairs: Sequence[Sequence[slice]]):
@@ -169,7 +169,7 @@ class RelativePositionFeatures(nn.Module):
         return sum((1 + len(NEAR)) * size for size in sizes) + sum(2 for *_, turned in self.pairs if turned)
 
     def forward(self, history: Tensor) -> Tensor:
-        """Features of the last frame."""
+        """Computes the features of the last frame."""
         state = history[..., -1, :]
         parts = []
         for *positions, yaw, turned in self.pairs:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Diffusion Policy: a generative model of the next actions given the last observed states, without a plan between."""
+"""Diffusion Policy: a generative model of the next actions given the last observed states, without a plan."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ ACTION_CHUNK = "action_chunk"
 class DiffusionPolicy(ConditionalSampler):
     """Samples the next ``horizon`` actions given the last ``history`` states (Chi et al. 2023).
 
-    What the planner is for states, this is for actions: same denoiser, noise, solvers and condition. It learns from
-    labelled steps alone. The first action of a chunk is the one to take *now*, in the last frame of the history::
+    It models actions as the planner models states, with the same denoiser, noise, solvers and condition. It learns only
+    from labelled steps. The first action of a chunk is the one to take *now*, in the last frame of the history::
 
         frame        0      1      2      3      ...  14          (history = 2, horizon = 14)
                      x_0    x_1
@@ -28,8 +28,8 @@ class DiffusionPolicy(ConditionalSampler):
 
     KOAP's first public code diffuses ``a_2, a_3, ...`` here and begins to execute them in frame 1, one step too early.
 
-    Args as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`, like keywords that are not listed; a
-    sequence is a chunk, of ``act`` columns.
+    Args and other keywords as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`; a sequence is a
+    chunk, of ``act`` columns.
 
     Keyword Args:
         action_dim (int): number ``act`` of action entries.
@@ -62,10 +62,10 @@ class DiffusionPolicy(ConditionalSampler):
         self.action_normalizer = Normalizer(action_dim)
 
     def fit_normalizers(self, windows: Tensor, actions: Tensor) -> None:
-        """Takes the statistics of condition and actions from data, in place, as a planner does.
+        """Computes the statistics of condition and actions from data, in place, as a planner does.
 
-        Raw states are windows ``[*N, history + horizon, d]``; no label is needed for them. Labelled raw actions ``[*M,
-        act]`` must be finite and those of the label budget; all steps of a chunk share their statistics.
+        Raw states are windows ``[*N, history + horizon, d]``, labelled or not. Raw actions ``[*M, act]`` must be finite
+        and in the label budget; all steps of a chunk share their statistics.
         """
         if actions.ndim < 2 or actions.shape[-1] != self.action_dim:
             raise ValueError(f"actions must be [*M, {self.action_dim}] (action_dim), got {list(actions.shape)}")
@@ -75,10 +75,10 @@ class DiffusionPolicy(ConditionalSampler):
         self.condition_normalizer.load_state_dict(condition.state_dict())
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Maps raw actions ``[*B, H, act]`` to normalised ones, wherever the state is."""
+        """Maps raw actions ``[*B, H, act]`` to normalised ones, independently of the history."""
         self.check_sequence(sequence)
         return self.action_normalizer(sequence)
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Maps normalised actions ``[*B, H, act]`` to raw ones, wherever the state is."""
+        """Maps normalised actions ``[*B, H, act]`` to raw ones, independently of the history."""
         return self.action_normalizer.inverse(sequence)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scores of sampled sequences against recorded ones: the energy score, and how far from all recordings they are."""
+"""Scores of sampled sequences against recorded ones: the energy score, and the distance from all recordings."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torch import Tensor
 
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
-_BATCH = 512  # sequences that are sampled at a time
+_BATCH = 512  # sequences that are processed at once
 
 
 def energy_score(samples: Tensor, true: Tensor) -> Tensor:
-    r"""Computes the energy score ``[*B]`` of samples ``[S, *B, d]``, in their unit; smaller is better.
+    r"""Computes the energy score ``[*B]`` of samples ``[S, *B, d]``, in their unit; lower is better.
 
     .. math:: \mathrm{ES} = \mathbb{E}\,\|X - y\| - \tfrac{1}{2}\, \mathbb{E}\,\|X - X'\|
 
-    with what is true, ``y [*B, d]``. Its mean is least for samples of the true distribution with all its modes. The
-    second mean is over pairs of different samples. Of a single sample the score is the distance. Shapes that disagree
-    are an error.
+    with the true ``y [*B, d]``. Its mean is lowest for samples of the true distribution with all its modes. The second
+    mean is over pairs of different samples; for a single sample the score is the distance. Raises a ValueError if
+    shapes disagree.
     """
     if samples.ndim < 2 or samples.shape[1:] != true.shape:
         raise ValueError(f"wanted samples [S, *B, d] and true [*B, d], got {list(samples.shape)}, {list(true.shape)}")
@@ -34,9 +34,9 @@ def energy_score(samples: Tensor, true: Tensor) -> Tensor:
 
 @torch.no_grad()
 def sample_sequences(sampler: ConditionalSampler, history: Tensor, *, samples: int, seed: int = 0) -> Tensor:
-    """Samples ``S`` sequences ``[S, N, H, width]`` of planner or Diffusion Policy for each history ``[N, h, d]``.
+    """Samples ``S`` sequences ``[S, N, H, width]`` from planner or Diffusion Policy for each history ``[N, h, d]``.
 
-    Their noise is drawn with the seed; torch's global generator is not used.
+    The seed determines their noise; torch's global generator is not used.
     """
     generator = torch.Generator().manual_seed(seed)
     drawn = []
@@ -48,10 +48,10 @@ def sample_sequences(sampler: ConditionalSampler, history: Tensor, *, samples: i
 
 
 def relative_score(samples: Tensor, true: Tensor, reference: Tensor, groups: Sequence[Sequence[int]]) -> float:
-    """Computes the energy score of ``[S, N, H, d]`` as a share of that of a reference, such as standing still.
+    """Computes the energy score of samples ``[S, N, H, d]``, divided by that of a reference, such as standing still.
 
-    True and reference are ``[N, H, d]``. Shares are averaged over ``groups`` of columns of one unit each; those in
-    which the reference makes no error are left out, and NaN is returned if nothing moves.
+    True and reference are ``[N, H, d]``. Ratios are averaged over ``groups`` of columns, each of one unit. Groups in
+    which the reference has no error are left out; NaN is returned if none is left.
     """
     shares = []
     for columns in map(list, groups):
@@ -62,15 +62,15 @@ def relative_score(samples: Tensor, true: Tensor, reference: Tensor, groups: Seq
 
 
 def relative_distance(samples: Tensor, true: Tensor, recorded: Tensor, groups: Sequence[Sequence[int]]) -> float:
-    """Computes how far samples are from the nearest recorded sequence, as a share of how far true ones are.
+    """Computes the distance of samples from the nearest recorded sequence, divided by that of true sequences.
 
-    A plan between two recorded ways, or one that is blurred, is farther from all recordings than a new recording is;
-    the energy score alone hardly tells it. The measure is the precision of generative models (Kynkäänniemi et al. 2019)
+    A blurred plan, or one between two recorded paths, is farther from all recordings than a new recording is; the
+    energy score alone hardly detects it. The measure is the precision of generative models (Kynkäänniemi et al. 2019)
     as a mean distance.
 
-    Samples are ``[S, N, H, d]``, true ones, which are not among the recorded, ``[N, H, d]``, recorded ones
-    ``[M, H, d]``. Shares are averaged over ``groups`` of columns of one unit each; those in which true ones lie on
-    recorded ones are left out, and 1 is returned if none is left.
+    Samples are ``[S, N, H, d]``, recorded sequences ``[M, H, d]``, and true ones, which are not among the recorded,
+    ``[N, H, d]``. Ratios are averaged over ``groups`` of columns, each of one unit. Groups in which true sequences have
+    the distance 0 are left out; 1 is returned if none is left.
     """
     shares = []
     for columns in map(list, groups):
@@ -81,7 +81,7 @@ def relative_distance(samples: Tensor, true: Tensor, recorded: Tensor, groups: S
 
 
 def _to_nearest(sequences: Tensor, recorded: Tensor) -> Tensor:
-    """Mean distance ``[]`` of sequences ``[*B, H, d]`` to the nearest of the recorded ones ``[M, H, d]``."""
-    known = recorded.flatten(-2).double()  # distances are small beside places
+    """Computes the mean distance ``[]`` of sequences ``[*B, H, d]`` to the nearest recorded one ``[M, H, d]``."""
+    known = recorded.flatten(-2).double()  # distances are small compared with coordinates
     parts = sequences.flatten(0, -3).flatten(-2).double().split(_BATCH)
     return torch.cat([torch.cdist(part, known).amin(-1) for part in parts]).mean()

@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The noise schedule of planner and Diffusion Policy, and the solvers that remove the noise again.
+"""The noise schedule of planner and Diffusion Policy, and the solvers that remove the noise.
 
 A noisy sequence at time ``t`` is
 
     x_t = signal(t) x_0 + noise(t) eps,    eps ~ N(0, I),    signal^2 + noise^2 = 1
 
-with ``t`` counted in training steps ``0 .. 49``. Networks predict ``x_0``. Solvers walk from much noise to none: pure
-functions in :data:`SOLVERS`, to which adding one is a function and a line.
+with ``t`` counted in training steps ``0 .. 49``. Networks predict ``x_0``. Solvers remove noise level by level. They
+are pure functions in :data:`SOLVERS`; a new solver is one function and one entry there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NUM_TRAIN_STEPS = 50
 
 
 class NoiseLevel(NamedTuple):
-    """One stop of a solver: time in training steps, amplitude of the signal and of the noise there."""
+    """One step of a solver: time in training steps, and the amplitudes of signal and noise."""
 
     time: float
     signal: float
@@ -35,10 +35,10 @@ Denoise = Callable[[Tensor, NoiseLevel], Tensor]
 
 
 def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
-    """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0): clean sequences ``[*B, H, d]``.
+    """Samples clean sequences ``[*B, H, d]`` by DDIM (Song et al. 2021, eq. 12 with eta = 0).
 
-    ``denoise(x, level)`` gives the clean sequence seen in ``x``, of noise ``[*B, H, d]`` at first; the levels go from
-    much noise to none, one more than steps.
+    ``denoise(x, level)`` predicts the clean sequence from ``x``, which is pure noise ``[*B, H, d]`` at first. Levels
+    decrease to no noise; there is one more level than steps.
     """
     for level, after in zip(levels[:-1], levels[1:], strict=True):
         sample = denoise(x, level)
@@ -47,7 +47,7 @@ def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
 
 
 def dpm_solver_2m(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
-    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2); as :func:`ddim`."""
+    """Samples as :func:`ddim`, by a second-order multistep solver in the log-SNR (Lu et al. 2022, algorithm 2)."""
     previous, previous_step = None, 0.0
     for level, after in zip(levels[:-1], levels[1:], strict=True):
         sample = denoise(x, level)
@@ -66,36 +66,36 @@ SOLVERS = {"dpm++2m": dpm_solver_2m, "ddim": ddim}
 
 
 class NoiseSchedule(nn.Module):
-    """Adds noise to sequences, and removes it again.
+    """Adds noise to sequences, and removes it.
 
-    The variance of the signal falls nearly as a squared cosine in 50 steps (Nichol and Dhariwal 2021).
+    The variance of the signal decreases nearly as a squared cosine over 50 steps (Nichol and Dhariwal 2021).
     """
 
     def __init__(self):
         super().__init__()
-        with torch.device("cpu"):  # the numbers are read below, also where modules are built without storage
+        with torch.device("cpu"):  # values are read below, which a meta tensor would not have
             edges = torch.arange(NUM_TRAIN_STEPS + 1, dtype=torch.float64) / NUM_TRAIN_STEPS
             kept = torch.cos((edges + 0.008) / 1.008 * math.pi / 2).square()
             variance = (kept[1:] / kept[:-1]).clamp_min(1e-3).cumprod(0)
         signal, noise = variance.sqrt(), (1 - variance).sqrt()
-        # Solvers read numbers from here: exact in every dtype, no device synchronisation, constants for torch.compile.
+        # Python numbers for solvers: exact in every dtype, no device synchronisation, constants for torch.compile.
         self._levels = tuple(zip(signal.tolist(), noise.tolist(), strict=True))
         default = {"dtype": torch.get_default_dtype(), "device": torch.get_default_device()}
         self.register_buffer("signal", signal.to(**default))
         self.register_buffer("noise", noise.to(**default))
 
     def sample_time(self, like: Tensor) -> Tensor:
-        """Draws training times ``[*B]``, in training steps, of the type and device of sequences ``[*B, H, d]``."""
+        """Draws times ``[*B]``, in training steps, with dtype and device of sequences ``[*B, H, d]``."""
         return torch.randint(NUM_TRAIN_STEPS, like.shape[:-2], device=like.device).to(like.dtype)
 
     def add_noise(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """Mixes the noisy sequence ``signal(t) x_0 + noise(t) eps``, ``[*B, H, d]``, at times ``[*B]``."""
+        """Computes noisy sequences ``signal(t) x_0 + noise(t) eps``, ``[*B, H, d]``, at times ``[*B]``."""
         index = time.long()
         signal, amplitude = self.signal[index].to(time.dtype), self.noise[index].to(time.dtype)
         return signal[..., None, None] * sample + amplitude[..., None, None] * noise
 
     def noise_levels(self, num_steps: int) -> list[NoiseLevel]:
-        """Lists the stops of a solver, one more than steps, evenly spaced from the noisiest level to no noise."""
+        """Returns the ``num_steps + 1`` levels of a solver, evenly spaced from the noisiest level to no noise."""
         if not 1 <= num_steps <= NUM_TRAIN_STEPS:
             raise ValueError(f"num_steps must lie in 1..{NUM_TRAIN_STEPS}, the steps of training, got {num_steps}")
         times = [round(NUM_TRAIN_STEPS * (num_steps - step) / num_steps) - 1 for step in range(num_steps)]
@@ -112,8 +112,8 @@ class NoiseSchedule(nn.Module):
     ) -> Tensor:
         """Turns standard normal noise ``[*B, H, d]`` into sequences, by ``network(x [*B, H, d], time [*B])``.
 
-        The network gives the clean sequence. The first frames of a ``prefix`` ``[*B, k, d]`` replace what it says at
-        every step, so that the rest is made to fit them. Errors as of :meth:`noise_levels`, and for an unknown solver.
+        The network predicts the clean sequence. A ``prefix`` ``[*B, k, d]`` replaces its first frames at every step, so
+        that the rest fits it. Errors as for :meth:`noise_levels`, and a ValueError for an unknown solver.
         """
         run, levels, batch = lookup(SOLVERS, solver, "solver"), self.noise_levels(num_steps), noise.shape[:-2]
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner: a generative model of the next states given the last observed ones. It never sees an action."""
+"""The planner: a generative model of the next states given the last observed ones. It reads no actions."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class StatePlanner(ConditionalSampler):
         condition    x_0-x_1, x_1
         plan                        x_2-x_1, x_3-x_1, ...
 
-    Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
-    dict. Conditions are scaled by their range, plans by their spread while they move (``"moving"`` of
-    :meth:`Normalizer.fit`). By range first frames would be a tenth as wide as last ones, and the noise of the schedule
-    would cover them. By standard deviation an object that rarely moves would outweigh the robot in the loss.
+    Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`), part of the state dict.
+    Conditions are scaled by their range, plans by their spread while they move (``"moving"`` of
+    :meth:`Normalizer.fit`). Scaled by range, first frames would be a tenth as wide as last ones, and the noise of the
+    schedule would hide them. Scaled by standard deviation, an object that rarely moves would dominate the loss.
 
-    Args as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`, like keywords that are not listed; a
-    sequence is a plan, of ``d`` columns.
+    Args and other keywords as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`; a sequence is a
+    plan, of ``d`` columns.
 
     Keyword Args:
         relative (bool): model displacements from the present state. Defaults to True.
@@ -62,11 +62,11 @@ class StatePlanner(ConditionalSampler):
         self.plan_normalizer = Normalizer(self.horizon * state_dim)
 
     def fit_normalizers(self, windows: Tensor) -> None:
-        """Takes the statistics of condition and plan from data, in place.
+        """Computes the statistics of condition and plan from data, in place.
 
-        A loss built before sees them; its averaged weights only move towards them unless ``SoftUpdate`` is built after.
-        Raw states are windows ``[*N, history + horizon, d]``, padded as those that are trained on: where ends stand
-        still in training alone, their plans are far out of the range of the network.
+        Call it before building ``SoftUpdate``: otherwise averaged weights only move towards the statistics. A loss may
+        be built earlier. Raw states are windows ``[*N, history + horizon, d]``, padded as in training; otherwise padded
+        plans in training, which stand still, are far outside the range of the network.
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
         self.condition_normalizer.load_state_dict(Normalizer.fit(self.condition(history)).state_dict())
@@ -83,5 +83,5 @@ class StatePlanner(ConditionalSampler):
         return plan + history[..., -1:, :] if self.relative else plan
 
     def _displaced(self, history: Tensor, plan: Tensor) -> Tensor:
-        """Raw plans as they are modelled, flat ``[*B, H * d]``."""
+        """Returns raw plans as they are modelled (``relative``), flattened to ``[*B, H * d]``."""
         return (plan - history[..., -1:, :] if self.relative else plan).flatten(-2)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What planner and Diffusion Policy share: a sequence sampled given the last observed states."""
+"""The base class of planner and Diffusion Policy, which sample a sequence given the last observed states."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from torchrl_koap.modules.planning.noise_schedule import SOLVERS, NoiseSchedule
 
 
 class ConditionalSampler(TensorDictModuleBase):
-    """Samples sequences from noise, given the last observed states; a subclass says what a sequence is.
+    """Samples sequences from noise, given the last observed states; a subclass defines the sequences.
 
     A subclass maps raw sequences to normalised ones and back (:meth:`encode`, :meth:`decode`). Sampling always starts
     from random noise, also under ``ExplorationType.DETERMINISTIC`` (or ``MODE``, ``MEAN``): one fixed start noise would
-    give one fixed mode. For evaluations that can be repeated put standard normal noise into the entry ``noise_key``.
+    give one fixed mode. For reproducible evaluations, write standard normal noise to the entry ``noise_key``.
 
     Args:
-        denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])``, the clean
-            sequence.
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])`` returns the
+            clean sequence.
 
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
-        width (int): columns of a sequence.
+        width (int): number of columns of a sequence.
         out_keys (list of NestedKey): the entry of the sequence ``[*B, H, width]``, raw units.
         relative (bool): the condition holds older frames as displacements from the present one.
         in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``, raw units. Defaults to ``["history"]``.
         history (int): number ``h`` of observed frames, the present one included. Defaults to 2.
         horizon (int): number ``H`` of frames of a sequence. Defaults to 14.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
-            further numbers that the condition holds, such as the relative positions of objects.
+            further entries of the condition, such as relative positions of objects.
         solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
         num_steps (int): solver steps. Defaults to 10.
         noise_key (NestedKey, optional): entry of start noise ``[*B, H, width]``, read if present. Default: ``"noise"``.
 
     Raises:
-        ValueError: for sizes below 1, several in- or out-keys, an unknown solver; at the call for a history or noise of
-            another shape.
+        ValueError: for sizes below 1, several in- or out-keys or an unknown solver; at a call for a history or noise of
+            the wrong shape.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class ConditionalSampler(TensorDictModuleBase):
         self.in_keys, self.out_keys, self.noise_key = list(in_keys), list(out_keys), noise_key
         self.denoiser, self.schedule = denoiser, NoiseSchedule()
         lookup(SOLVERS, solver, "solver")
-        self.schedule.noise_levels(num_steps)  # refuses a number out of range
+        self.schedule.noise_levels(num_steps)  # raises if num_steps is out of range
         self.solver, self.num_steps = solver, num_steps
         self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
         self.features = features
@@ -86,7 +86,7 @@ class ConditionalSampler(TensorDictModuleBase):
         return self.horizon, self._width
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Maps raw sequences ``[*B, H, width]``, after raw histories ``[*B, h, d]``, to normalised ones."""
+        """Maps raw sequences ``[*B, H, width]``, which follow raw histories ``[*B, h, d]``, to normalised ones."""
         raise NotImplementedError
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
@@ -94,16 +94,16 @@ class ConditionalSampler(TensorDictModuleBase):
         raise NotImplementedError
 
     def check_sequence(self, sequence: Tensor) -> None:
-        """Refuses sequences that are not ``[*B, H, width]``."""
+        """Raises a ValueError for sequences that are not ``[*B, H, width]``."""
         _check(sequence, repr(self.out_keys[0]), *self.noise_shape, "horizon, columns")
 
     def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
-        """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
+        """Splits windows of states ``[*B, history + horizon, d]`` into history and future."""
         _check(window, "windows", self.history + self.horizon, self.state_dim, "history + horizon, state_dim")
         return window[..., : self.history, :], window[..., self.history :, :]
 
     def condition(self, history: Tensor) -> Tensor:
-        """The condition ``[*B, h * d + f]`` of raw histories ``[*B, h, d]``, in raw units."""
+        """Computes the condition ``[*B, h * d + f]`` of raw histories ``[*B, h, d]``, in raw units."""
         displaced = history
         if self.relative:
             now = history[..., -1:, :]
@@ -117,7 +117,7 @@ class ConditionalSampler(TensorDictModuleBase):
         return self.condition_normalizer(self.condition(history))
 
     def far(self, state: Tensor) -> Tensor:
-        """Says which columns of states ``[*B, d]`` are beyond the range fitted to by more than that range, as bool."""
+        """Returns which columns of states ``[*B, d]`` exceed the fitted range by more than its width, as bool."""
         end, fitted = self.history * self.state_dim, self.condition_normalizer
         now = slice(end - self.state_dim, end)
         return (state - fitted.offset[now]).abs() > 3 * fitted.scale[now]
@@ -128,11 +128,11 @@ class ConditionalSampler(TensorDictModuleBase):
         Args:
             history (Tensor): observed states, the present one last.
             noise (Tensor, optional): start noise ``[*B, H, width]``. Default: drawn.
-            prefix (Tensor, optional): first frames ``[*B, k, width]`` that the sequence has to have, ``k`` below the
-                horizon: what is executed anyway while it is sampled (real-time chunking, arXiv 2506.07339).
+            prefix (Tensor, optional): prescribed first frames ``[*B, k, width]`` of the sequence, ``k`` below the
+                horizon: those that are executed while it is sampled (real-time chunking, arXiv 2506.07339).
 
         Raises:
-            ValueError: for a history, noise or prefix of another shape.
+            ValueError: for a history, noise or prefix of the wrong shape.
         """
         condition = self.encode_history(history)
         expected = (*history.shape[:-2], *self.noise_shape)
@@ -159,7 +159,7 @@ class ConditionalSampler(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.sample(history, noise))
 
     def _encode_prefix(self, history: Tensor, prefix: Tensor) -> Tensor:
-        """Normalised first frames; each has statistics of its own, so the rest is filled up before."""
+        """Normalises first frames. Every frame has its own statistics, so the sequence is padded for :meth:`encode`."""
         frames = prefix.shape[-2]
         if not 1 <= frames < self.horizon or prefix.shape[-1] != self._width:
             raise ValueError(
@@ -170,6 +170,6 @@ class ConditionalSampler(TensorDictModuleBase):
 
 
 def _check(value: Tensor, name: str, frames: int, columns: int, sizes: str) -> None:
-    """Refuses what is not ``[*B, frames, columns]``."""
+    """Raises a ValueError for values that are not ``[*B, frames, columns]``."""
     if value.shape[-2:] != (frames, columns):
         raise ValueError(f"{name} must be [*B, {frames}, {columns}] ({sizes}), got {list(value.shape)}")

@@ -17,10 +17,9 @@ KERNEL, GROUPS = 5, 8  # width of the convolutions in steps; groups of the group
 class TemporalUnet(Denoiser):
     """One-dimensional U-Net over the steps of a plan, conditioned by FiLM (Janner et al. 2022; Chi et al. 2023).
 
-    Each block is convolution, group norm, activation, twice, with a residual path; between them the features are
-    scaled and shifted per channel by a linear function of the step embedding and the condition. Every level but the
-    last halves the number of steps; plans of any horizon are padded at the end by repeating the last step, and cut
-    again.
+    Each block is twice a convolution, group norm and activation, with a residual path. In between, a linear function of
+    the step embedding and the condition scales and shifts every channel. Every level but the last halves the number of
+    steps. Plans of any horizon are padded by repeating the last step, and truncated at the end.
 
     Args and errors as for :class:`~torchrl_koap.modules.planning.denoisers.Denoiser`.
 
@@ -29,7 +28,7 @@ class TemporalUnet(Denoiser):
         frequencies (int): octaves of the condition's Fourier features. Defaults to 4.
 
     Raises:
-        ValueError: for other channels.
+        ValueError: for channels that are not multiples of 8.
 
     Examples:
         >>> import torch
@@ -44,11 +43,11 @@ class TemporalUnet(Denoiser):
         channels = tuple(channels)
         if not channels or any(width < 1 or width % GROUPS for width in channels):
             raise ValueError(f"channels must be multiples of {GROUPS}, got {channels}")
-        # steps that plans are padded to a multiple of: the gradient of group norm is slow on fewer than 8
+        # plans are padded to a multiple of these steps: the gradient of group norm is slow on fewer than 8
         self.multiple = max(8, 2 ** (len(channels) - 1))
 
         def block(width_in: int, width_out: int) -> nn.ModuleList:
-            return nn.ModuleList([_Block(width_in, width_out)])  # of one: pretrained weights are named so
+            return nn.ModuleList([_Block(width_in, width_out)])  # a list, since pretrained weights have its names
 
         levels = list(zip((state_dim, *channels[:-1]), channels, strict=True))
         self.down = nn.ModuleList(block(*level) for level in levels)
@@ -64,7 +63,7 @@ class TemporalUnet(Denoiser):
             nn.SiLU(),
             nn.Conv1d(channels[0], state_dim, 1),
         )
-        # One matrix product serves the FiLM of all blocks: at batch 1 the number of calls is what costs.
+        # One matrix product serves the FiLM of all blocks: at batch size 1 the number of calls determines the time.
         self._film_sizes = [2 * stage.width for (stage,) in (*self.down, self.middle, *self.up)]
         self.film = nn.Sequential(nn.SiLU(), nn.Linear(self.context_dim, sum(self._film_sizes)))
 
