@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Saving that never damages an earlier result (write aside, then rename), and reading that always comes to an end."""
+"""Saves without damaging earlier results (writes beside, then renames) and reads only plain files of bounded size."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 import filelock
 from safetensors import SafetensorError
 
-_NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
+_DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 _UNIONS = (Union, UnionType)
-_LARGEST_INTEGER = 2**63 - 1  # that JSON may hold
-LARGEST = 1 << 28  # bytes of a file that is read as a whole: hundreds of times what any of them has
+_LARGEST_INTEGER = 2**63 - 1  # largest integer that is accepted from JSON
+LARGEST = 1 << 28  # bytes; largest file that is read as a whole, hundreds of times larger than any of them
 
 
 class DataError(ValueError):
-    """Data that cannot be used, with every fault that was found.
+    """Data cannot be used; the message lists every fault.
 
     Args:
-        source (str or Path): what cannot be used: a file, a folder, or what the caller calls the whole.
+        source (str or Path): the file, the folder, or another name of the data.
         problems (str or sequence of str): the faults.
 
     Examples:
@@ -50,19 +50,19 @@ class DataError(ValueError):
 
 
 def refuse(source: str | Path, problems: Sequence[str]) -> None:
-    """Raises a :class:`DataError` with all faults of a source, where there are any."""
+    """Raises a :class:`DataError` with all faults of a source, if there are any."""
     if problems:
         raise DataError(source, problems)
 
 
 def some(names: Sequence[object]) -> str:
-    """Joins names for a message, the first five of them: ``"a.csv, b.csv, c.csv, d.csv, e.csv and 1 more"``."""
+    """Joins up to five names for a message: ``"a.csv, b.csv, c.csv, d.csv, e.csv and 1 more"``."""
     more = len(names) - 5
     return ", ".join(map(str, names[:5])) + (f" and {more} more" if more > 0 else "")
 
 
 def gathered(faults: Iterable[tuple[str, str]]) -> list[str]:
-    """Puts faults of many things into sentences, each once with the first of those that it is about.
+    """Groups pairs of name and fault: returns one sentence per fault, with the first names that have it.
 
     Examples:
         >>> from torchrl_koap.files import gathered
@@ -76,14 +76,14 @@ def gathered(faults: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def option(name: str) -> str:
-    """Says what an option is called, in Python and in the shell: ``"control_hz (--control-hz)"``."""
+    """Returns the name of an option in Python and in the shell: ``"control_hz (--control-hz)"``."""
     return f"{name} (--{name.replace('_', '-')})"
 
 
 def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
-    """Refuses what is no plain file (a pipe never ends, nor does a device), and files of more than ``largest`` bytes.
+    """Raises an OSError, with the reason, for files above ``largest`` bytes and for anything but plain files.
 
-    A link is followed. The OSError names the file and what it is.
+    Pipes and devices are excluded since reading them may never end. Links are followed.
     """
     about = os.stat(path)
     if not stat.S_ISREG(about.st_mode):
@@ -93,7 +93,7 @@ def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Reads a plain file; an OSError refuses it as :func:`check_file` does, or if it cannot be read."""
+    """Reads a plain file; raises an OSError as :func:`check_file` does, or if it cannot be read."""
     check_file(path)
     return Path(path).read_bytes()
 
@@ -102,8 +102,8 @@ def read_json(path: str | Path) -> dict[str, Any]:
     """Reads a JSON object from a plain file.
 
     Raises:
-        FileNotFoundError: if it is not there.
-        DataError: if it cannot be read, or holds anything else.
+        FileNotFoundError: if the file does not exist.
+        DataError: if it cannot be read, or is not a JSON object.
     """
     try:
         content = json.loads(read_bytes(path))
@@ -127,7 +127,7 @@ def sha256_of(path: str | Path) -> str:
 
 
 def check_folder(path: str | Path) -> None:
-    """Tries whether a folder, which need not exist, takes files; the OSError names it and what is in the way."""
+    """Checks that files can be written to a folder, which need not exist; an OSError names it and the obstacle."""
     there = next(above for above in (Path(path), *Path(path).absolute().parents) if above.exists())
     if not there.is_dir():
         raise NotADirectoryError(f"{path} cannot be made: {there} is no folder")
@@ -139,12 +139,12 @@ def check_folder(path: str | Path) -> None:
 
 @contextlib.contextmanager
 def replacing_file(path: str | Path) -> Iterator[Path]:
-    """Gives a new, empty file to write to, which takes the place of ``path`` when the block ends without an error.
+    """Yields a new, empty file, which replaces ``path`` when the block ends without an error.
 
     Missing parent folders are created.
 
     Raises:
-        OSError: naming the file, if the disk is full or refuses; what was there before is kept.
+        OSError: with the file's name, if the disk is full or cannot be written; an earlier file is kept.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -153,13 +153,13 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
         aside.touch(exist_ok=False)
         mode = aside.stat().st_mode
         yield aside
-        aside.chmod(mode)  # safetensors takes everybody's but the owner's rights away
+        aside.chmod(mode)  # safetensors removes the access rights of all users but the owner
         os.replace(aside, path)
     except BaseException as error:
         aside.unlink(missing_ok=True)
         if isinstance(error, SafetensorError):  # it has no errno
             error = OSError(errno.EIO, str(error))
-        if not isinstance(error, OSError) or error.errno not in _NO_PLACE:
+        if not isinstance(error, OSError) or error.errno not in _DISK_ERRORS:
             raise
         kept = "what was there before is kept" if path.exists() else "nothing of it is left"
         raise OSError(error.errno, f"{path} could not be written: {error.strerror}; {kept}") from error
@@ -167,7 +167,7 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(path: str | Path) -> Iterator[Path]:
-    """Gives a folder to write into, beside ``path``, whose place it takes when the block ends without an error."""
+    """Yields a new folder beside ``path``, which replaces ``path`` when the block ends without an error."""
     path = Path(path)
     aside = _beside(path, "tmp")
     aside.mkdir(parents=True)
@@ -180,17 +180,17 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
 
 
 class LockedError(RuntimeError):
-    """A folder or file that another process works on."""
+    """Another process works on a folder or file."""
 
 
 @contextlib.contextmanager
 def one_at_a_time(path: str | Path, *, busy: str) -> Iterator[None]:
-    """Lets one process, or thread, at a time into the block and refuses the others.
+    """Allows only one process or thread at a time to execute the block.
 
-    The lock is the system's: it is free again however its process ends. The lock file stays.
+    The operating system releases the lock however its process ends. The lock file stays.
 
     Raises:
-        LockedError: if somebody else is in the block; its message is ``busy``.
+        LockedError: if another process or thread executes the block; its message is ``busy``.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -203,7 +203,7 @@ def one_at_a_time(path: str | Path, *, busy: str) -> Iterator[None]:
 
 
 def _exchange(new: Path, path: Path) -> None:
-    """Renames ``new`` to ``path``; a folder cannot be renamed onto a full one, so the old one steps aside first."""
+    """Renames ``new`` to ``path``. A full folder cannot be the target, so it is renamed first."""
     try:
         os.replace(new, path)
         return
@@ -221,7 +221,7 @@ def _exchange(new: Path, path: Path) -> None:
 
 
 def _beside(path: Path, ending: str) -> Path:
-    """A hidden name of its own in the same folder."""
+    """Returns a random hidden name in the same folder."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{ending}")
 
 
@@ -229,12 +229,12 @@ _Made = TypeVar("_Made")
 
 
 def dataclass_from_json(kind: type[_Made], content: object) -> _Made:
-    """Builds a dataclass, and those that its fields hold, from what ``json`` read of ``dataclasses.asdict``.
+    """Builds a dataclass, including nested ones, from the JSON of ``dataclasses.asdict``.
 
-    What is left out keeps its default, lists become tuples, and the number ``"inf"`` infinity.
+    Missing fields keep their defaults, lists become tuples, and ``"inf"`` becomes infinity in a field of numbers.
 
     Raises:
-        ValueError: naming an option that is unknown, in another section, missing, of another type or out of range.
+        ValueError: if an option is unknown, in the wrong section, missing, of the wrong type or out of range; names it.
 
     Examples:
         >>> from torchrl_koap.files import dataclass_from_json
@@ -246,7 +246,7 @@ def dataclass_from_json(kind: type[_Made], content: object) -> _Made:
 
 
 def _read(kind: Any, value: Any, place: str, known: tuple[str, ...]) -> Any:
-    """A value of JSON as a type hint has it; ``place`` is its name with that of its section."""
+    """Converts a JSON value to the type of a hint; ``place`` is its name with that of its section."""
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         if not isinstance(value, Mapping):
             raise ValueError(f"{place or 'the file'} must be an object, got {_short(value)}")
@@ -272,13 +272,13 @@ def _read(kind: Any, value: Any, place: str, known: tuple[str, ...]) -> Any:
 
 
 def _each(kind: Any, value: Sequence[Any]) -> tuple[Any, ...]:
-    """The types of the entries of a tuple."""
+    """Returns the types of the entries of a tuple or list."""
     inner = get_args(kind) or (Any, ...)
     return inner[:1] * len(value) if inner[-1] is ... else inner
 
 
 def _names(kind: Any, prefix: str = "") -> Iterator[str]:
-    """Every option with its section, ``"planner.steps"``."""
+    """Yields the name of every option with its section, ``"planner.steps"``."""
     for name, inner in get_type_hints(kind).items():
         if dataclasses.is_dataclass(inner):
             yield from _names(inner, f"{prefix}{name}.")

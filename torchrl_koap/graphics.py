@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``MUJOCO_GL`` and imports: a back end that cannot be used stops pictures, not what draws none."""
+"""Imports MuJoCo such that an unusable ``MUJOCO_GL`` back end fails only when pictures are drawn."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def no_graphics() -> Iterator[None]:
-    """Hides ``MUJOCO_GL`` inside the block: what is imported there touches no graphics library."""
+    """Sets ``MUJOCO_GL=disable`` inside the block, so that imports load no graphics library."""
     chosen = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
     try:
@@ -23,7 +23,7 @@ def no_graphics() -> Iterator[None]:
 
 
 def import_mujoco() -> None:
-    """Imports MuJoCo before TorchRL does where ``MUJOCO_GL`` is set, and without graphics where that fails."""
+    """Imports MuJoCo, before TorchRL does, if ``MUJOCO_GL`` is set; without graphics if that fails."""
     if not os.environ.get("MUJOCO_GL"):
         return
     platform = os.environ.get("PYOPENGL_PLATFORM")
@@ -31,8 +31,8 @@ def import_mujoco() -> None:
         import mujoco  # noqa: F401
     except ModuleNotFoundError:
         return
-    except Exception:  # the back ends raise whatever their libraries raise
+    except Exception:  # back ends pass on any exception of their libraries
         if platform is None:
-            os.environ.pop("PYOPENGL_PLATFORM", None)  # set by the one that failed
+            os.environ.pop("PYOPENGL_PLATFORM", None)  # the failed back end set it
         with no_graphics():
             import mujoco  # noqa: F401

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Names of all tensordict entries, the two layouts they live in, and their validator.
+"""Names of all tensordict entries, the two layouts of data, and their validator.
 
 Storage layout (TorchRL's TED, flat over steps; ``N`` steps of all trajectories one after the other)::
 
@@ -51,7 +51,7 @@ NEXT_TERMINATED = ("next", "terminated")
 NEXT_TRUNCATED = ("next", "truncated")
 NEXT_REWARD = ("next", "reward")
 
-_PART = 1 << 18  # steps that are looked at together, as a check takes several times their memory
+_PART = 1 << 18  # steps that are checked at once: a check needs several times their memory
 
 LIFTED_STATE = "lifted_state"
 LATENT_ACTION = "latent_action"
@@ -75,8 +75,8 @@ def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, re
     """Reads an entry for a module.
 
     Raises:
-        KeyError: if it is not there; names those that are, and how the module is told of another name (``rename``).
-        ValueError: if it is of another floating type than the weights of the module.
+        KeyError: if the entry is missing; names the existing entries, and the call that renames keys (``rename``).
+        ValueError: if its floating dtype differs from that of the module's weights.
     """
     value = tensordict.get(key, None)
     if value is None:
@@ -92,7 +92,7 @@ def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, re
 
 
 def observed_numbers(given: Any) -> Tensor:
-    """Reads an observation as a tensor: tensors as they are, all else as float64; what is masked or None is NaN."""
+    """Converts an observation to a float64 tensor, masked values and None to NaN; returns tensors unchanged."""
     if isinstance(given, Tensor):
         return given
     try:
@@ -105,7 +105,7 @@ def observed_numbers(given: Any) -> Tensor:
 
 
 def frame_mask(mask: Tensor | None, name: object, state: Tensor) -> Tensor:
-    """Checks a mask of the frames of windows ``[*B, T, d]``, which may have a trailing 1, and returns ``[*B, T]``."""
+    """Checks a mask ``[*B, T]`` or ``[*B, T, 1]`` of the frames of windows ``[*B, T, d]``; returns ``[*B, T]``."""
     frames = state.shape[:-1]
     if mask is None or mask.shape not in (frames, (*frames, 1)) or mask.dtype != torch.bool:
         got = "None: hand in 'has_action'" if mask is None else f"{mask.dtype} {list(mask.shape)}"
@@ -115,7 +115,7 @@ def frame_mask(mask: Tensor | None, name: object, state: Tensor) -> Tensor:
 
 
 def check_actions(action: Tensor, key: NestedKey, state: Tensor) -> Tensor:
-    """Returns actions ``[*B, T, act]`` of windows ``[*B, T, d]``; a ValueError refuses other batches and frames."""
+    """Returns actions ``[*B, T, act]`` of windows ``[*B, T, d]``; raises a ValueError if ``[*B, T]`` differ."""
     if action.shape[:-1] != state.shape[:-1]:
         frames = f"the batch and frames {list(state.shape[:-1])} of the states, then columns"
         raise ValueError(f"{key!r} must have {frames}, got {list(action.shape)}")
@@ -123,7 +123,7 @@ def check_actions(action: Tensor, key: NestedKey, state: Tensor) -> Tensor:
 
 
 def check_window(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> None:
-    """Refuses states ``[T, d]`` of several trajectories: a flat batch of steps would be read as one window."""
+    """Raises for states ``[T, d]`` of several trajectories: a flat batch of steps would be read as one window."""
     if state.ndim != 2 or torch.compiler.is_compiling():
         return
     episode = tensordict.get(EPISODE, None)
@@ -137,13 +137,13 @@ def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDic
 
     Args:
         data (TensorDictBase): flat data, ``batch_size == [N]``.
-        command (slice, optional): columns of the observation that may be NaN, as a whole, because
-            :func:`~torchrl_koap.data.label_budget.hide_commands` blanked them. Default: none.
+        command (slice, optional): columns of the observation that may all be NaN in a step, because
+            :func:`~torchrl_koap.data.label_budget.hide_commands` hid them. Default: none.
 
     Raises:
-        DataError: with *all* problems: missing keys, wrong dtypes or shapes, non-finite states, labels that are NaN
-            although ``has_action`` says they are there (or the reverse: a leak), step counts that do not restart with
-            the trajectory, trajectories that are not contiguous.
+        DataError: with *all* problems: missing keys, wrong dtypes or shapes, non-finite states, NaN labels where
+            ``has_action`` is True (or, a leak, numbers where it is False), step counts that do not restart with the
+            trajectory, trajectories that are not contiguous.
 
     Examples:
         >>> import torch
@@ -164,7 +164,7 @@ def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDic
         present = set(data.keys(include_nested=True, leaves_only=True))
         problems = [f"missing key {key!r}" for key in REQUIRED if key not in present]
         problems += _shape_problems(data, present)
-        if not problems:  # the rules below compare entries with each other and need all of them
+        if not problems:  # checks of values compare entries with each other and need all of them
             problems = list(_value_problems(data, present, command))
     refuse("data that do not follow the storage layout", problems)
     return data
@@ -226,7 +226,7 @@ def _value_problems(data: TensorDictBase, present: set, command: slice | None) -
 
 
 def _not_finite(values: torch.Tensor, allowed: slice | None) -> torch.Tensor:
-    """Rows with a value that is NaN or infinite; those columns may be NaN as a whole."""
+    """Returns which rows hold NaN or infinite values; in a row, the ``allowed`` columns may all be NaN."""
     bad_entries = ~values.isfinite()
     if allowed is not None:
         bad_entries[:, allowed] &= ~values[:, allowed].isnan().all(-1, keepdim=True)

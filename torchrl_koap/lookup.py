@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Looking names up: in a table, where an unknown one suggests the nearest, and behind import strings."""
+"""Looks names up in tables, suggesting the most similar one, and resolves import strings."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from typing import Any
 
 
 def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) -> Any:
-    """Returns the entry ``name`` of a table, or ``name`` itself where the table is a plain collection of names.
+    """Returns the entry ``name`` of a table, or ``name`` itself if the table is a plain collection of names.
 
     Raises:
-        ValueError: if the name is unknown, or no string. The message begins with ``what`` the names stand for, and
-            suggests the nearest or else lists them all.
+        ValueError: if the name is unknown or not a string. The message says ``what`` the name stands for, and suggests
+            the most similar name or lists all.
 
     Examples:
         >>> from torchrl_koap.lookup import lookup
@@ -47,15 +47,15 @@ def unknown(asked: Iterable[str], known: Collection[str], what: str) -> list[str
 
 
 def nearest(known: Iterable[str], name: str) -> str | None:
-    """Finds the known name that is most like another one; None where none is."""
+    """Returns the known name that is most similar to ``name``; None if none is similar."""
     lowered = {each.lower(): each for each in known}
     return next((lowered[near] for near in difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)), None)
 
 
 def resolve(reference: Any, what: str) -> Any:
-    """Imports the object that an import string names; anything that is no string is returned as it is.
+    """Imports the object that an import string names; returns anything but a string unchanged.
 
-    Strings are ``"package.module:name"`` or ``"path/to/file.py:name"``; dots in ``name`` reach into a class.
+    Strings are ``"package.module:name"`` or ``"path/to/file.py:name"``; ``name`` may have dots, as in ``Class.method``.
 
     Raises:
         ValueError: if the string has no colon, the module cannot be imported, or it has no such name; the message
@@ -77,12 +77,12 @@ def resolve(reference: Any, what: str) -> Any:
 
 
 def import_code(module: str) -> ModuleType:
-    """Imports a module by its dotted name, or runs a file ``*.py``, which no import finds, once."""
+    """Imports a module by its dotted name, or runs a file ``*.py`` by its path, once per process."""
     return _run_file(absolute(module)) if module.endswith(".py") else importlib.import_module(module)
 
 
 def absolute(reference: str) -> str:
-    """Makes a file ``*.py``, or one of an import string ``"file.py:name"``, one that any folder finds."""
+    """Makes the path of a file ``*.py``, or of an import string ``"file.py:name"``, absolute."""
     is_file = reference.partition(":")[0].endswith(".py")
     return str(Path(reference).expanduser().resolve()) if is_file else reference
 
@@ -91,7 +91,7 @@ def import_extra(module: str, extra: str, needs: str) -> Any:
     """Imports an optional package.
 
     Raises:
-        RuntimeError: if it is not installed; the message begins with what ``needs`` it, and names the extra to install.
+        RuntimeError: if it is not installed; the message begins with ``needs``, and names the extra to install.
     """
     if importlib.util.find_spec(module) is None:
         raise RuntimeError(f"{needs} an extra: pip install 'torchrl_koap[{extra}]'")
@@ -109,7 +109,7 @@ def _run_file(path: str) -> ModuleType:
 
 
 def entry_points_of(group: str) -> list[Any]:
-    """Loads what installed packages announce in an entry-point group, such as ``"torchrl_koap.methods"``.
+    """Loads the objects that installed packages declare in an entry-point group, such as ``"torchrl_koap.methods"``.
 
     Raises:
         ValueError: if one cannot be imported; the message names entry and group.
@@ -125,11 +125,11 @@ def entry_points_of(group: str) -> list[Any]:
 
 
 def exports(package: str, offers: Mapping[str, Collection[str]]) -> tuple[Callable[[str], Any], list[str]]:
-    """Makes ``__getattr__`` and ``__all__`` of a package whose public names are imported when first asked for.
+    """Makes ``__getattr__`` and ``__all__`` of a package that imports its public names at first access.
 
     Args:
-        package (str): its name.
-        offers (mapping): modules, relative to the package, to the public names that they define.
+        package (str): name of the package.
+        offers (mapping): maps modules, relative to the package, to the public names that they define.
     """
     modules = {name: f"{package}.{module}" for module, names in offers.items() for name in names}
 

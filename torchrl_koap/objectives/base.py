@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Base classes of the losses: keys that can be renamed, masks, reduction."""
+"""Base classes of the losses, with keys that can be renamed, masks and reductions."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 class NetworkLoss(LossModule):
     """Base class of all losses here: one network, keys that can be renamed, a reduction.
 
-    A subclass has the dataclass ``_AcceptedKeys`` and names in :attr:`required` the entries that must be there. With
-    ``create_target_params`` an averaged copy of the weights is kept in ``target_network_params``; the reduction is
-    ``"mean"``, ``"sum"`` or ``"none"``. Another one, and a network of another kind than :attr:`trains`, are errors.
+    A subclass has the dataclass ``_AcceptedKeys`` and lists its mandatory entries in :attr:`required`. With
+    ``create_target_params``, ``target_network_params`` holds an averaged copy of the weights. Raises a ValueError if
+    the reduction is not ``"mean"``, ``"sum"`` or ``"none"``, and a TypeError for a network that is no :attr:`trains`.
     """
 
     trains: tuple[type[nn.Module], ...] = (nn.Module,)
@@ -43,25 +43,25 @@ class NetworkLoss(LossModule):
         self.reduction = reduction
 
     def train(self, mode: bool = True):
-        """Sets the mode of the loss, and of the network, which is no submodule of it."""
+        """Sets the mode of the loss and of its network, which is not a submodule."""
         super().train(mode)
         self.network.train(mode)
         return self
 
     def _apply(self, fn):
-        """Moves the network too: its parameters are those of the loss, its buffers would stay behind."""
+        """Moves the network too: the loss holds its parameters, but not its buffers."""
         super()._apply(fn)
         self.network_params.to_module(self.network)
         return self
 
     def __setstate__(self, state):
-        """Gives the network of a copy the weights of the copy."""
+        """Restores a copy or pickle; its network then uses the weights of the copy."""
         super().__setstate__(state)
         self.network_params.to_module(self.network)
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Entries that must be there, as renamed by ``set_keys``."""
+        """Mandatory entries, as renamed by ``set_keys``."""
         return [getattr(self.tensor_keys, name) for name in self.required]
 
     @in_keys.setter
@@ -69,7 +69,7 @@ class NetworkLoss(LossModule):
         raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """There is no value estimator."""
+        """Does nothing: there is no value estimator."""
 
     def _read(self, tensordict: TensorDictBase, name: str) -> Tensor:
         return read_entry(self, tensordict, getattr(self.tensor_keys, name), f"set_keys({name}=...)")
@@ -77,7 +77,7 @@ class NetworkLoss(LossModule):
     def _read_or_draw(
         self, tensordict: TensorDictBase, name: str, shape: torch.Size, draw: Callable[[], Tensor]
     ) -> Tensor:
-        """Reads an optional entry, such as noise, that must have a shape; draws it where it is not there."""
+        """Reads an optional entry, such as noise, or draws it if it is missing; raises for another shape."""
         key = getattr(self.tensor_keys, name)
         value = tensordict.get(key, None)
         value = draw() if value is None else value
@@ -86,18 +86,18 @@ class NetworkLoss(LossModule):
         return value
 
     def _read_mask(self, tensordict: TensorDictBase, name: str, state: Tensor) -> Tensor:
-        """Reads a mask ``[*B, T]`` of the frames of windows ``[*B, T, d]``, stored with a trailing 1 or not."""
+        """Reads a mask ``[*B, T]``, or ``[*B, T, 1]``, of the frames of windows ``[*B, T, d]``."""
         return frame_mask(self._read(tensordict, name), repr(getattr(self.tensor_keys, name)), state)
 
     def _recorded(self, tensordict: TensorDictBase, state: Tensor) -> Tensor:
-        """Transitions between two recorded frames, bool ``[*B, T - 1]``."""
+        """Returns which transitions are between two recorded (not padded) frames, bool ``[*B, T - 1]``."""
         if tensordict.get(self.tensor_keys.padded, None) is None:
             return torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
         padded = self._read_mask(tensordict, "padded", state)
         return ~(padded[..., 1:] | padded[..., :-1])
 
     def _reduce(self, error: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Reduces errors; those outside of a mask, of their shape or with a trailing 1, are 0 and do not count."""
+        """Reduces errors. Those outside a mask (of the same shape, or with a trailing 1) become 0 and do not count."""
         if mask is None:
             return self._reduce_loss(error)
         error = torch.where(mask, error, 0.0)
@@ -109,8 +109,8 @@ class NetworkLoss(LossModule):
 class WindowLoss(NetworkLoss):
     """Base class of the losses on windows of states of which some frames have an action label.
 
-    States and actions are read where the network, an InverseDynamics, has them. Reductions are ``"mean"`` (default),
-    ``"sum"`` and ``"none"`` (``[*B, frames]``, 0 where masked).
+    States and actions are read from the keys of the network, an InverseDynamics. Reductions are ``"mean"`` (default),
+    ``"sum"`` and ``"none"`` (``[*B, frames]``, masked entries are 0).
     """
 
     @dataclass
@@ -121,11 +121,11 @@ class WindowLoss(NetworkLoss):
             state (NestedKey): window of raw states ``[*B, T, d]``.
             action (NestedKey): raw actions ``[*B, T, act]``, NaN where unlabelled.
             has_action (NestedKey): labelled frames, bool ``[*B, T, 1]``.
-            padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T]``. A transition
-                into or out of one counts in no loss, labelled or not.
+            padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T]``. Transitions
+                to or from padded frames count in no loss, labelled or not.
 
-        The two masks may have a trailing 1 or not. A flat batch ``[B * T]``, as of TorchRL's ``SliceSampler``, must be
-        reshaped to ``[B, T]``: it would be one window, and is refused where ``episode`` tells.
+        Both masks may have a trailing 1. Reshape a flat batch ``[B * T]``, such as that of TorchRL's ``SliceSampler``,
+        to ``[B, T]``: it would be read as one window. It raises a ValueError if ``episode`` shows several trajectories.
         """
 
         state: NestedKey = STATE
@@ -143,9 +143,9 @@ class WindowLoss(NetworkLoss):
         super().set_keys(state=network.in_key, action=network.out_key)
 
     def set_keys(self, **kwargs) -> None:
-        """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too.
+        """Renames entries (None: restores the default); ``state`` and ``action`` are renamed in the network too.
 
-        Call ``set_keys`` of the network afterwards if it needs other names.
+        If the network needs other names, call its ``set_keys`` afterwards.
         """
         super().set_keys(**kwargs)
         self.network.set_keys(
@@ -153,7 +153,7 @@ class WindowLoss(NetworkLoss):
         )
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
+        """Reads the raw states, and which transitions are between two recorded frames, bool ``[*B, T - 1]``."""
         state = self._read(tensordict, "state")
         check_window(tensordict, self.tensor_keys.state, state)
         return state, self._recorded(tensordict, state)
@@ -161,16 +161,16 @@ class WindowLoss(NetworkLoss):
     def _targets(
         self, tensordict: TensorDictBase, state: Tensor, recorded: Tensor, span: range
     ) -> tuple[Tensor, Tensor]:
-        """Normalised actions ``[*B, frames, act]`` of a span, 0 where they do not count; and where they do."""
+        """Reads normalised actions ``[*B, frames, act]`` of a span and which count; others are 0 before normalising."""
         frames = slice(span.start, span.stop)
         action = check_actions(self._read(tensordict, "action"), self.tensor_keys.action, state)[..., frames, :]
         counts = self._read_mask(tensordict, "has_action", state)[..., frames] & recorded[..., frames]
-        # zeroed before the residual: masking afterwards would leave NaN in the gradient
+        # set to 0 before the residual: masking afterwards would leave NaN in the gradient
         action = torch.where(counts.unsqueeze(-1), action, 0.0)
         return self.network.normalize_action(action), counts
 
     def _action_error(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Mean squared error ``[*B, frames]`` of actions that must have as many columns as they are decoded to."""
+        """Computes the mean squared error ``[*B, frames]`` of actions; raises for different numbers of columns."""
         if predicted.shape[-1] != target.shape[-1]:  # a single column would be broadcast
             columns = f"{target.shape[-1]} columns, the network decodes {predicted.shape[-1]}"
             raise ValueError(f"{self.tensor_keys.action!r} has {columns}")

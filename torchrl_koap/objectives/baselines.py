@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Losses of the baselines: of predicted actions, and of latents that need no label (LAPO, auto-encoder of windows)."""
+"""Losses of the baselines: for predicted actions, and for latents without labels (LAPO, variational auto-encoder)."""
 
 from __future__ import annotations
 
@@ -17,19 +17,18 @@ from torchrl_koap.objectives.base import WindowLoss
 class ActionLoss(WindowLoss):
     """Computes the mean square error of predicted actions, ``loss_action``, over the labelled frames that count.
 
-    A batch without labels gives exactly 0; an unlabelled (NaN) action reaches neither value nor gradient.
+    A batch without labels gives exactly 0; unlabelled (NaN) actions affect neither value nor gradient.
 
     Args:
         network (InverseDynamics): the controller.
 
     Keyword Args:
-        freeze_latents (bool): fit the action decoder of a controller with a latent to latents that stay as they are.
-            Defaults to ``False``.
-        sample (bool): decode samples of the latents instead of what is inferred. Defaults to ``False``.
+        freeze_latents (bool): train only the action decoder of a controller with latents. Defaults to ``False``.
+        sample (bool): decode samples of the latents instead of inferred ones. Defaults to ``False``.
         reduction (str): as for :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Raises:
-        ValueError: for latents to freeze, or samples, of a network that has none.
+        ValueError: for ``freeze_latents`` if the network has no latents, or ``sample`` if they have no distribution.
 
     Examples:
         >>> import torch
@@ -82,7 +81,7 @@ class QuantizedDynamicsLoss(WindowLoss):
     .. math::
         L = \overline{|h_\psi(x_{t-n}, \dots, x_t, u_t) - (x_{t+1} - x_t)|^2}
 
-    No label is read: actions are decoded by :class:`~torchrl_koap.objectives.ActionLoss`, afterwards. Args as for
+    It reads no labels; :class:`~torchrl_koap.objectives.ActionLoss` trains the action decoder afterwards. Args as for
     :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Examples:
@@ -111,25 +110,25 @@ class QuantizedDynamicsLoss(WindowLoss):
 
 
 class VariationalLoss(WindowLoss):
-    r"""Computes the error of what frames read, reconstructed from sampled latents, and the divergence of the latents.
+    r"""Computes the reconstruction error of each frame's input from sampled latents, and the latents' divergence.
 
     .. math::
         L = \overline{|g_\psi(u_t) - s_t|^2} + \beta \, \overline{D_{KL}(q(u_t \mid x_{0:T}) \,\|\, N(0, 1))},
         \qquad u_t = \mu_t + \sigma_t \epsilon
 
-    The squared error is averaged over the entries of a reconstruction, at unit scale; the divergence is summed over
-    those of a latent. No label is read: :class:`~torchrl_koap.objectives.ActionLoss` fits the action decoder.
+    The squared error is averaged over the entries of a reconstruction, at unit scale; the divergence is summed over the
+    entries of a latent. It reads no labels; :class:`~torchrl_koap.objectives.ActionLoss` trains the action decoder.
 
     Args:
         network (VariationalInverseDynamics): the model.
 
     Keyword Args:
-        kl_coeff (float): ``beta``, already applied to ``loss_kl``. Defaults to ``0.01``. Assigning to it later is an
-            in-place buffer write.
+        kl_coeff (float): ``beta``, already applied to ``loss_kl``. Defaults to ``0.01``. Later assignments write to the
+            buffer in place.
         reduction (str): as for :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Raises:
-        ValueError: if the noise handed in has another shape than the latents.
+        ValueError: if the given noise differs from the latents in shape.
 
     Examples:
         >>> import torch
@@ -146,7 +145,7 @@ class VariationalLoss(WindowLoss):
         """Keys read from the input, as in :class:`WindowLoss`.
 
         Attributes:
-            noise (NestedKey): optional; noise ``[*B, frames, m]`` of the frames that count instead of random.
+            noise (NestedKey): optional; noise ``[*B, frames, m]`` of the frames that count. Default: random.
         """
 
         noise: NestedKey = "latent_noise"

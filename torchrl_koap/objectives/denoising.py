@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Denoising losses: what trains the planner on states, and the Diffusion Policy on labelled actions."""
+"""Denoising losses, which train the planner on states and the Diffusion Policy on labelled actions."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ class DenoisingLoss(NetworkLoss):
 
         L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - x_0 |^2
 
-    A subclass says what a batch holds (:meth:`read`).
+    A subclass defines how a batch is read (:meth:`read`).
 
     Args:
-        network (ConditionalSampler): network to train, its normalisers already fitted.
+        network (ConditionalSampler): network to train, with fitted normalisers.
 
     Keyword Args:
-        create_target_params (bool): keep an averaged copy of the weights in ``target_network_params``, to be moved by
+        create_target_params (bool): keep an averaged copy of the weights in ``target_network_params``, updated by
             :class:`torchrl.objectives.SoftUpdate` and used for sampling. Defaults to True.
         reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, width]`` that count
-            (``"none"``: 0 where they do not). Defaults to ``"mean"``.
-        dtype (torch.dtype, optional): of the denoiser's matrix products, such as ``torch.bfloat16``. Default: that of
-            its weights.
-        weights (Tensor, optional): of the columns ``[width]`` in the loss, scaled to a mean of 1. Default: all count
-            alike.
+            (``"none"``: others are 0). Defaults to ``"mean"``.
+        dtype (torch.dtype, optional): dtype of the denoiser's matrix products, such as ``torch.bfloat16``. Default: the
+            dtype of its weights.
+        weights (Tensor, optional): weights ``[width]`` of the columns in the loss, scaled to a mean of 1. Default:
+            equal weights.
 
     Raises:
-        ValueError: for weights of another shape, or that are not positive.
+        ValueError: for weights of the wrong shape, or that are not positive.
     """
 
     network: ConditionalSampler
@@ -69,7 +69,7 @@ class DenoisingLoss(NetworkLoss):
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads raw histories ``[*B, h, d]`` and sequences ``[*B, H, width]``, and which of their steps count.
 
-        The steps are bool ``[*B, H, 1]``, or None where all count.
+        The steps that count are bool ``[*B, H, 1]``, or None if all count.
         """
         raise NotImplementedError
 
@@ -79,10 +79,10 @@ class DenoisingLoss(NetworkLoss):
         network = self.network
         history, sequence, counts = self.read(tensordict)
         with self.network_params.to_module(network, preserve_module_state=False):
-            condition = network.encode_history(history)  # with a gradient: features may be trained too
+            condition = network.encode_history(history)  # with gradient, since features may be trained too
             with torch.no_grad():
                 clean = network.encode(history, sequence)
-                if counts is not None:  # before the network: masking afterwards would leave NaN in the gradient
+                if counts is not None:  # masking after the network would leave NaN in the gradient
                     clean = torch.where(counts, clean, 0.0)
                 noise = self._read_or_draw(tensordict, "noise", clean.shape, lambda: torch.randn_like(clean))
                 draw_time = partial(network.schedule.sample_time, clean)
@@ -90,7 +90,7 @@ class DenoisingLoss(NetworkLoss):
                 noisy = network.schedule.add_noise(clean, noise.to(clean.dtype), time)
             with torch.autocast(clean.device.type, self.dtype, enabled=self.dtype is not None):
                 predicted = network.denoiser(noisy, time, condition)
-            if predicted.shape != clean.shape:  # it would be broadcast
+            if predicted.shape != clean.shape:  # the difference would broadcast
                 raise ValueError(f"the denoiser must return {list(clean.shape)}, got {list(predicted.shape)}")
             error = (predicted - clean).square()  # [*B, H, width]
             if self.weights is not None:
@@ -121,12 +121,12 @@ class PlannerLoss(DenoisingLoss):
 
     @dataclass
     class _AcceptedKeys:
-        """Entries of the input; the last two are read if they are there.
+        """Entries of the input.
 
         Attributes:
             state (NestedKey): windows of raw states ``[*B, history + horizon, d]``.
-            noise (NestedKey): noise ``[*B, horizon, d]`` instead of random.
-            time (NestedKey): time ``[*B]`` in training steps instead of random.
+            noise (NestedKey): optional noise ``[*B, horizon, d]``. Default: random.
+            time (NestedKey): optional time ``[*B]`` in training steps. Default: random.
         """
 
         state: NestedKey = keys.STATE
@@ -140,18 +140,17 @@ class PlannerLoss(DenoisingLoss):
     network: StatePlanner
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Reads histories and recorded futures, of which all steps count (:meth:`DenoisingLoss.read`)."""
+        """Reads histories and recorded futures; all steps count (:meth:`DenoisingLoss.read`)."""
         return *self.network.split_window(self._read(tensordict, "state")), None
 
 
 class DiffusionPolicyLoss(DenoisingLoss):
     """Trains a Diffusion Policy on labelled steps of windows; Args as for :class:`DenoisingLoss`.
 
-    The sequence are the actions of frames ``history - 1 .. T - 2``. A step counts if it has a label and neither its
-    frame nor the next one is padded. The denoiser sees steps that do not count as the middle of the range of actions,
-    noise added; what was stored there (NaN) reaches neither value nor gradient. A batch without labels gives exactly 0.
-    This method learns from labels only: draw windows with
-    ``labelled_share=1`` (:class:`~torchrl_koap.data.WindowSampler`).
+    A sequence holds the actions of frames ``history - 1 .. T - 2``. A step counts if it has a label and neither its
+    frame nor the next one is padded. For other steps, the denoiser reads the middle of the range of actions plus noise;
+    their stored values (NaN) affect neither value nor gradient. A batch without labels gives exactly 0. This method
+    learns from labels only: draw windows with ``labelled_share=1`` (:class:`~torchrl_koap.data.WindowSampler`).
 
     Examples:
         >>> import torch
@@ -166,11 +165,11 @@ class DiffusionPolicyLoss(DenoisingLoss):
 
     @dataclass
     class _AcceptedKeys(WindowLoss._AcceptedKeys):
-        """Entries of the input, as in :class:`WindowLoss` with ``T = history + horizon``; the others are optional.
+        """Entries of the input, as in :class:`WindowLoss` with ``T = history + horizon``, and two optional ones.
 
         Attributes:
-            noise (NestedKey): noise ``[*B, horizon, act]`` instead of random.
-            time (NestedKey): time ``[*B]`` in training steps instead of random.
+            noise (NestedKey): noise ``[*B, horizon, act]``. Default: random.
+            time (NestedKey): time ``[*B]`` in training steps. Default: random.
         """
 
         noise: NestedKey = "policy_noise"
@@ -184,7 +183,7 @@ class DiffusionPolicyLoss(DenoisingLoss):
     network: DiffusionPolicy
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Reads histories, actions from now on and which of them are labelled (:meth:`DenoisingLoss.read`)."""
+        """Reads histories, actions from the present frame on, and which count (:meth:`DenoisingLoss.read`)."""
         names, now = self.tensor_keys, self.network.history - 1
         state, action = self._read(tensordict, "state"), self._read(tensordict, "action")
         history, _ = self.network.split_window(state)

@@ -7,8 +7,8 @@ r"""Losses of the Koopman inverse dynamics model.
     L_{kpm} = \overline{|K g(x_t) + u_t - g(x_{t+1})|^2}, \quad
     L_a = \overline{|D u_t + b - a_t|^2}
 
-All residuals are in normalised units. ``L_a`` averages over the labelled frames alone; a batch
-without labels gives exactly 0, and an unlabelled (NaN) action reaches neither value nor gradient.
+All residuals are in normalised units. ``L_a`` averages over the labelled frames only. A batch without labels gives
+exactly 0; unlabelled (NaN) actions affect neither value nor gradient.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ RECONSTRUCTION, KOOPMAN, ACTION = "loss_reconstruction", "loss_koopman", "loss_a
 
 
 class _KoopmanLoss(WindowLoss):
-    """Computes those of the three terms that are its out-keys, from one pass through the networks."""
+    """Computes the terms named by its out-keys in one pass through the networks."""
 
     trains = (KoopmanInverseDynamics, LiftedInverseDynamics)
     network: LiftedInverseDynamics
 
     def _terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        network, wanted = self.network, self.out_keys_source  # all, also where few are selected
+        network, wanted = self.network, self.out_keys_source  # all out-keys, even if only some are selected
         state, recorded = self._inputs(tensordict)
         found = {}
         with self.network_params.to_module(network, preserve_module_state=False):
@@ -122,18 +122,18 @@ class LatentActionLoss(_KoopmanLoss):
 
 
 class KOAPLoss(_KoopmanLoss):
-    """Computes the three terms from one pass through the networks; their sum is the total, coefficients applied.
+    """Computes the three terms in one pass through the networks, coefficients applied; their sum is the total loss.
 
-    The reconstruction averages over all frames, the dynamics over those of :meth:`InverseDynamics.valid_frames`, the
-    actions over the labelled ones of these. A subclass adds terms by :meth:`further_errors`.
+    The reconstruction term averages over all frames, the dynamics term over :meth:`InverseDynamics.valid_frames`, the
+    action term over the labelled ones of these. A subclass adds terms by :meth:`further_errors`.
 
     Args:
         network (KoopmanInverseDynamics or NonlinearInverseDynamics): the model.
 
     Keyword Args:
-        koopman_coeff (float): ``lambda_1``. Defaults to ``1``. Assigning to it later is an in-place buffer write.
+        koopman_coeff (float): ``lambda_1``. Defaults to ``1``. Later assignments write to the buffer in place.
         action_coeff (float): ``lambda_2``. Defaults to ``1``.
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, T]``, then twice ``[*B, frames]``).
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, T]``, other terms ``[*B, frames]``).
 
     Examples:
         >>> import torch
