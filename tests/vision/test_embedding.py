@@ -139,7 +139,7 @@ def test_bad_data_are_refused_by_camera_trajectory_and_frame(tmp_path):
     assert not (tmp_path / "seen" / "ted").exists()
     with pytest.raises(ValueError, match="unknown camera 'tip'; did you mean 'top'"):
         embed(own, tmp_path / "seen", cameras=["tip"])
-    with pytest.raises(ValueError, match="one projection cannot be for 2 cameras"):
+    with pytest.raises(ValueError, match="a projection fits one camera, got 2"):
         embed(own, tmp_path / "seen", projection=Projection(torch.zeros(4), torch.zeros(4, 2)))
     with pytest.raises(DataError, match="`koap convert` it, or name its --task"):
         read_sources([tmp_path / "raw"], None)

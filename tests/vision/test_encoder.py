@@ -152,7 +152,7 @@ def test_networks_that_are_missing(monkeypatch):
 
 def test_a_projection_of_other_weights_is_refused(tmp_path):
     file = fitted().save(tmp_path / "own.safetensors")
-    with pytest.raises(WeightsError, match="fitted behind the weights"):
+    with pytest.raises(WeightsError, match="fitted with weights"):
         load_encoder(file, OTHER)
 
 

@@ -54,7 +54,7 @@ def test_numbers_that_no_policy_sees_may_be_left_out():
     ("change", "says"),
     [
         ({"wrst": FRAME}, "has an unknown 'wrst': wanted state, top, wrist"),
-        ({"state": np.zeros(3)}, r"'state' must be \[4\] beside these frames, got \[3\]"),
+        ({"state": np.zeros(3)}, r"'state' must be \[4\] with these frames, got \[3\]"),
         ({"top": FRAME[..., :1]}, "the frame of camera 'top' is greyscale"),
     ],
 )

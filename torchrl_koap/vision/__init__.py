@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Frozen image encoders: camera frames in, embeddings that keep where things are out."""
+"""Frozen image encoders, which map camera frames to embeddings that retain positions."""
 
 from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
 from torchrl_koap.vision.encoder import FrozenImageEncoder, Projection, load_encoder

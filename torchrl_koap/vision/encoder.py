@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A frozen network as a TorchRL transform, frames in, embeddings out, and the principal components behind it."""
+"""A frozen network as a TorchRL transform from frames to embeddings, and its principal components."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from torchrl_koap.keys import read_entry
 from torchrl_koap.lookup import absolute
 from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
 
-BATCH = 32  # frames that go through the network at once
-SHORT_SIDE = 96  # pixels that the network is shown of the shorter side of a frame
+BATCH = 32  # frames that the network processes at once
+SHORT_SIDE = 96  # pixels; frames with a longer short side are scaled down to it
 
 
 class FrozenImageEncoder(ObservationTransform):
-    """Embeds camera frames: a frozen network, where its channels differ from their medians, principal components.
+    """Embeds camera frames by a frozen network, moments of its channels and principal components.
 
-    Frames are ``pixels``, uint8 ``[*B, H, W, 3]``, and become ``embedding``, float32 ``[*B, d]``. Feature maps are
+    Frames are ``pixels``, uint8 ``[*B, H, W, 3]``; embeddings are ``embedding``, float32 ``[*B, d]``. Feature maps are
     pooled by :func:`pool_moments`.
 
-    The network is shown 96 pixels of the shorter side of a frame, and all of it where it has fewer.
+    Frames whose shorter side exceeds 96 pixels are scaled down to 96 pixels for the network.
 
     Args:
         backbone (Backbone, optional): the network. Default: EfficientNet-Lite0
             (:func:`~torchrl_koap.vision.load_backbone`).
 
     Keyword Args:
-        projection (nn.Module, optional): maps pooled features ``[*B, F]`` to embeddings ``[*B, d]``, such as a
-            :class:`~torchrl_koap.vision.Projection`. Default: none, the features are the embedding.
+        projection (nn.Module, optional): maps pooled features ``[*B, F]`` to embeddings ``[*B, d]``, for example a
+            :class:`~torchrl_koap.vision.Projection`. Default: features are the embedding.
         size (int, or sequence of int): height and width of the recorded frames. Frames of another size are resized,
             with a warning at the first one.
 
     Raises:
         WeightsError: if there are no weights.
-        ValueError: in use, for frames of another dtype or without three colours, or a network that returns no features.
+        ValueError: in use, for frames that are not uint8 or not of three colours, or a network without feature output.
 
     Examples:
         >>> import torch
@@ -68,11 +68,11 @@ class FrozenImageEncoder(ObservationTransform):
         if shorter < 1:
             raise ValueError(f"size of the frames must be at least 1, got {size}")
         self._shown = tuple(round(side * min(1.0, SHORT_SIDE / shorter)) for side in self.size)
-        self._told = False
+        self._warned = False
 
     @property
     def identity(self) -> dict[str, str]:
-        """What pooled features depend on: weights, network, size of maps and of frames."""
+        """All that pooled features depend on: weights, network, sizes of feature maps and of frames."""
         maps = self.backbone(torch.zeros(1, 3, *self._shown))
         return {
             "weights": self.backbone.digest,
@@ -83,14 +83,14 @@ class FrozenImageEncoder(ObservationTransform):
 
     @torch.no_grad()
     def features(self, frames: Tensor) -> Tensor:
-        """Computes pooled features ``[*B, F]`` of frames, uint8 ``[*B, H, W, 3]``; all else is refused."""
+        """Computes pooled features ``[*B, F]`` of frames, uint8 ``[*B, H, W, 3]``; raises a ValueError for others."""
         if frames.dtype != torch.uint8:
             raise ValueError(f"frames must be uint8 in 0 to 255, got {frames.dtype}")
         if frames.ndim < 3 or frames.shape[-1] != 3:
             raise ValueError(f"frames must be [*B, {self.size[0]}, {self.size[1]}, 3], got shape {list(frames.shape)}")
         got = tuple(frames.shape[-3:-1])
-        if got != self.size and not self._told:
-            self._told = True
+        if got != self.size and not self._warned:
+            self._warned = True
             warnings.warn(
                 f"frames are {got[0]} x {got[1]}, recorded were {self.size[0]} x {self.size[1]}: they are resized",
                 stacklevel=2,
@@ -100,7 +100,7 @@ class FrozenImageEncoder(ObservationTransform):
         return torch.cat(pooled).reshape(*batch, -1)
 
     def _pooled(self, pictures: Tensor) -> Tensor:
-        """Features ``[B, F]`` of pictures ``[B, 3, H, W]`` in 0 to 1."""
+        """Computes features ``[B, F]`` of pictures ``[B, 3, H, W]`` in 0 to 1."""
         if tuple(pictures.shape[-2:]) != self._shown:
             pictures = F.interpolate(pictures, self._shown, mode="bilinear", antialias=True)
         maps = self.backbone(pictures.contiguous(memory_format=torch.channels_last))
@@ -117,7 +117,7 @@ class FrozenImageEncoder(ObservationTransform):
     _apply_transform = embed
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Sets the embeddings of the frames of a tensordict."""
+        """Writes the embeddings of the frames."""
         return tensordict.set(self.out_keys[0], self.embed(read_entry(self, tensordict, self.in_keys[0])))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -132,19 +132,19 @@ class FrozenImageEncoder(ObservationTransform):
 
 
 def pool_moments(maps: Tensor) -> Tensor:
-    """Computes where each channel differs from its median over the picture: ``[B, 10 C]`` of maps ``[B, C, h, w]``.
+    """Computes moments ``[B, 10 C]`` of the regions where maps ``[B, C, h, w]`` differ from each channel's median.
 
-    Weighted by how far a channel is above its median, then by how far below: the centre (x, y, each from -1 to 1) and
-    the central second moments (xx, yy, xy).
+    Weights are the amounts by which a channel exceeds its median over the picture, then those by which it falls below.
+    The moments are the centre (x, y, from -1 to 1) and the central second moments (xx, yy, xy).
     """
     axes = [torch.linspace(-1, 1, side).to(maps) for side in maps.shape[2:]]
     y, x = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
     powers = torch.stack([x, y, x * x, y * y, x * y], 1)
     flat = maps.flatten(2)
-    away = flat - flat.median(-1, keepdim=True).values
+    deviation = flat - flat.median(-1, keepdim=True).values
     pooled = []
-    for side in (away, -away):
-        weights = side.clamp_min(0) + 1e-6  # a channel that is the same everywhere has its centre in the middle
+    for side in (deviation, -deviation):
+        weights = side.clamp_min(0) + 1e-6  # the centre of a constant channel is the middle of the picture
         x, y, xx, yy, xy = ((weights / weights.sum(-1, keepdim=True)) @ powers).unbind(-1)
         pooled += [x, y, xx - x * x, yy - y * y, xy - x * y]
     return torch.cat(pooled, 1)
@@ -159,10 +159,10 @@ class Projection(nn.Module):
     Args:
         mean (Tensor): ``[F]``.
         components (Tensor): ``[F, d]``; scaled so that the first component has variance 1.
-        about (mapping, optional): what the features are of: :attr:`FrozenImageEncoder.identity`.
+        about (mapping, optional): the :attr:`FrozenImageEncoder.identity` of the features.
 
     Raises:
-        ValueError: if mean and components have other shapes.
+        ValueError: if mean or components have the wrong shape.
 
     Examples:
         >>> import torch
@@ -185,7 +185,7 @@ class Projection(nn.Module):
 
     @classmethod
     def fit(cls, features: Tensor, dim: int, about: Mapping[str, str] | None = None) -> Projection:
-        """Fits ``dim`` components to features ``[N, F]``, more of both, of frames that are not all alike."""
+        """Fits ``dim`` components to features ``[N, F]``; ``N`` and ``F`` must exceed ``dim``, and rows differ."""
         if min(features.shape) <= dim:
             raise ValueError(f"{option('components')} must be below frames and features {[*features.shape]}, got {dim}")
         features = features.double()
@@ -194,7 +194,7 @@ class Projection(nn.Module):
         mean = features.mean(0)
         _, values, axes = torch.linalg.svd(features - mean, full_matrices=False)
         axes = axes[:dim].T
-        signs = axes.gather(0, axes.abs().argmax(0, keepdim=True)).sign()  # the same on every machine
+        signs = axes.gather(0, axes.abs().argmax(0, keepdim=True)).sign()  # fixed signs, the same on every machine
         scale = values[0] / (len(features) - 1) ** 0.5
         return cls(mean.float(), (axes * signs / scale).float(), about)
 
@@ -205,7 +205,7 @@ class Projection(nn.Module):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the frames that it was fitted to, by its description; a ValueError refuses another."""
+        """Height and width of the frames that it was fitted to; a ValueError if its description lacks a valid size."""
         try:
             height, width = (int(side) for side in self.about["size"].split("x"))
         except ValueError as error:
@@ -214,7 +214,7 @@ class Projection(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> Projection:
-        """Reads a file that :meth:`save` wrote; no network is needed. One that is missing or damaged is refused."""
+        """Reads a file of :meth:`save`, without the network; raises an error if it is missing or damaged."""
         if not Path(path).is_file():
             raise FileNotFoundError(f"no projection: there is no file {path}")
         check_file(path)
@@ -226,73 +226,73 @@ class Projection(nn.Module):
             if missing:
                 raise ValueError(f"its description has no {missing[0]!r}")
             return cls(mean, components, about)
-        except Exception as error:  # what a damaged file makes of its reader
+        except Exception as error:  # safetensors raises various exceptions for damaged files
             raise ValueError(f"the projection {path} cannot be used: {error}") from error
 
     def save(self, path: str | Path) -> Path:
-        """Writes it and what it belongs to, its components in half precision; returns the file."""
+        """Writes it and its description, the components in half precision; returns the file."""
         tensors = {"mean": self.mean.contiguous(), "components": self.components.half().contiguous()}
         with replacing_file(path) as aside:
             save_file(tensors, aside, self.about)
         return Path(path)
 
     def find_network(self, files: Sequence[str]) -> None:
-        """Takes the file of its network from among those given, if one has the same name."""
+        """Points its network to the one of the given files that has the same file name, if there is one."""
         file, _, name = self.about["network"].rpartition(":")
         for each in files:
             if Path(each).name == Path(file).name:
                 self.about["network"] = f"{absolute(each)}:{name}"
 
     def kept(self, features: Tensor) -> float:
-        """Computes the share of the variance of features ``[N, F]`` that reconstructed ones keep."""
+        """Computes the share of the variance of features ``[N, F]`` that their reconstruction keeps."""
         centred = (features - self.mean).double()
         axes = torch.linalg.qr(self.components.double())[0]
         left = (centred - centred @ axes @ axes.T).square().sum() / centred.square().sum().clamp_min(1e-12)
         return 1 - float(left)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Computes components ``[*B, d]`` of features ``[*B, F]``; refuses those of another size."""
+        """Computes components ``[*B, d]`` of features ``[*B, F]``; raises a ValueError for another ``F``."""
         if features.shape[-1] != len(self.mean):
             raise ValueError(
-                f"the projection was fitted on {len(self.mean)} features, got {features.shape[-1]}: another network,"
-                " stage or size of the frames"
+                f"the projection was fitted on {len(self.mean)} features, got {features.shape[-1]}: use the same"
+                " network, stage and size of the frames"
             )
         return (features - self.mean) @ self.components
 
 
 def projection_of(task: str) -> Path:
-    """Returns the file of a task's projection that comes with the package; a task without one is refused."""
+    """Returns the file of a task's projection in the package; raises a ValueError for a task without one."""
     path = SCOOPING.with_stem(task)
     if not path.is_file():
         known = ", ".join(sorted(each.stem for each in SCOOPING.parent.glob("*.safetensors")))
-        raise ValueError(f"no projection comes with the package for task {task!r} (only for {known}): pass your own")
+        raise ValueError(f"the package has no projection for task {task!r} (only for {known}): pass your own")
     return path
 
 
 def load_cameras(folder: str | Path) -> dict[str, Projection]:
-    """Reads the projections in a folder, such as ``cameras`` of a run, by the name of the camera; needs no network."""
+    """Reads the projections in a folder, such as ``cameras`` of a run, by camera name; needs no network."""
     return {file.stem: Projection.load(file) for file in sorted(Path(folder).glob("*.safetensors"))}
 
 
 def cameras_of(dataset: str | Path | None) -> dict[str, Projection]:
-    """Reads the projections that ``koap embed`` wrote beside a data set; none where its columns are no embeddings."""
+    """Reads the projections that ``koap embed`` wrote beside a data set; empty if there are none."""
     stored = None if dataset is None else stored_folder(Path(dataset).expanduser())
     return {} if stored is None else load_cameras(stored.parent / CAMERAS)
 
 
 def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | None = None) -> FrozenImageEncoder:
-    """Makes the encoder that a projection was fitted behind.
+    """Makes the encoder whose features a projection was fitted to.
 
     Args:
-        projection (Projection, str or Path): it, or its file. Default: the one of Scooping that comes with the package.
-        network (str, optional): see :func:`~torchrl_koap.vision.load_backbone`. Default: as it was fitted.
+        projection (Projection, str or Path): the projection or its file. Default: that of Scooping in the package.
+        network (str, optional): see :func:`~torchrl_koap.vision.load_backbone`. Default: that of the projection.
 
     Returns:
         FrozenImageEncoder: frozen, in evaluation mode.
 
     Raises:
-        WeightsError: if there are no weights, or others than those the projection was fitted behind.
-        FileNotFoundError: if there is no such file.
+        WeightsError: if the weights are missing, or differ from those that the projection was fitted with.
+        FileNotFoundError: if the file does not exist.
 
     Examples:
         >>> from torchrl_koap.vision import load_encoder
@@ -306,7 +306,7 @@ def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | 
     backbone = load_backbone(network or about["network"])
     if backbone.digest != about["weights"]:
         raise WeightsError(
-            f"the projection was fitted behind the weights {about['weights'][:12]} of {about['network']}, these are"
-            f" {backbone.digest[:12]} of {backbone.name}: fit one for them, or pass the network it belongs to"
+            f"the projection was fitted with weights {about['weights'][:12]} of {about['network']}, got"
+            f" {backbone.digest[:12]} of {backbone.name}: fit a projection for them, or pass its network"
         )
     return FrozenImageEncoder(backbone, projection=fitted, size=size)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Converts numbers and camera frames of a robot to the observation that a policy was trained on."""
+"""Converts numbers and camera frames of a robot to the observations that a policy was trained on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STATE = "state"
 
 
 def part_widths(task: Task) -> dict[str, int]:
-    """Number of columns of every part of a task's observation."""
+    """Returns the number of columns of every part of a task's observation."""
     return {name: part.stop - part.start for name, part in task.observation.items()}
 
 
@@ -28,12 +28,12 @@ class Observer:
     """Concatenates the numbers of a robot and the embeddings of its frames in the order of the task's columns.
 
     Args:
-        task (Task): whose observation; a part with the name of a camera is that camera's embedding.
-        cameras (mapping): projection of every camera; its network is loaded here.
+        task (Task): defines the observation; a part with the name of a camera holds that camera's embedding.
+        cameras (mapping): projection of every camera; their networks are loaded here.
 
     Raises:
         ValueError: if the task has no part of a camera's name and size, or its network cannot be loaded. In use, for
-            entries that are missing, unknown, of another width or no frames.
+            entries that are missing, unknown, of the wrong width or not frames.
 
     Examples:
         >>> import numpy as np
@@ -50,21 +50,21 @@ class Observer:
             if widths.get(name) != projection.dim:
                 raise ValueError(
                     f"camera {name!r} has embeddings of {projection.dim} columns, task {task.name!r} has"
-                    f" {widths.get(name, 'none')} of that name"
+                    f" {widths.get(name, 'none')} for that name"
                 )
         self._parts = list(widths)
-        self._numbers = {name: width for name, width in widths.items() if name not in cameras}  # no embeddings
+        self._numbers = {name: width for name, width in widths.items() if name not in cameras}
         self._needed = [*([] if self._numbers.keys() <= {*task.hidden} else [STATE]), *cameras]
-        self.state_dim = sum(self._numbers.values())  # columns that are no embedding
+        self.state_dim = sum(self._numbers.values())  # columns that are not embeddings
         self._encoders = {name: _load(name, projection) for name, projection in cameras.items()}
 
     @classmethod
     def of(cls, task: Task, cameras: Mapping[str, Projection]) -> Observer | None:
-        """Makes one where there are cameras, else None."""
+        """Makes an observer if there are cameras, else returns None."""
         return cls(task, cameras) if cameras else None
 
     def example(self) -> dict[str, np.ndarray]:
-        """Zeros and black frames, as a robot gives them."""
+        """Returns zeros and black frames in the format of a robot."""
         black = {name: np.zeros((*each.size, 3), np.uint8) for name, each in self.cameras.items()}
         return {STATE: np.zeros(self.state_dim, np.float32), **black}
 
@@ -72,8 +72,8 @@ class Observer:
         """Computes observations ``[*B, obs]``.
 
         Args:
-            given (mapping): ``"state"``, the columns that are no embedding ``[*B, d]``, left out where the policy sees
-                none of them; and a frame of every camera by its name, uint8 ``[*B, H, W, 3]``.
+            given (mapping): ``"state"``, the columns that are not embeddings ``[*B, d]``, optional if the policy reads
+                none of them; and a frame of every camera under its name, uint8 ``[*B, H, W, 3]``.
         """
         wanted = [*([STATE] if self._numbers else []), *self.cameras]
         missing = [name for name in self._needed if name not in given]
@@ -85,13 +85,13 @@ class Observer:
         batch = next(iter(seen.values())).shape[:-1]
         state = observed_numbers(given.get(STATE, np.zeros((*batch, self.state_dim))))
         if state.shape != (*batch, self.state_dim):
-            raise ValueError(f"'state' must be {[*batch, self.state_dim]} beside these frames, got {list(state.shape)}")
+            raise ValueError(f"'state' must be {[*batch, self.state_dim]} with these frames, got {list(state.shape)}")
         seen |= dict(zip(self._numbers, state.split(list(self._numbers.values()), -1), strict=True))
         dtype = torch.promote_types(state.dtype, torch.float32)
         return torch.cat([seen[name].to(dtype) for name in self._parts], -1)
 
     def _embedded(self, name: str, frames: Any) -> Tensor:
-        """Embeddings ``[*B, d]`` of one camera's frames."""
+        """Computes the embeddings ``[*B, d]`` of one camera's frames."""
         given = frames.cpu().numpy() if isinstance(frames, Tensor) else np.asarray(frames)
         fault = fault_of(given if given.ndim < 4 else given[(0,) * (given.ndim - 3)])
         if fault is not None:
