@@ -64,7 +64,7 @@ def test_a_robot_gives_numbers_and_frames_to_run_and_file(run, tmp_path):
         agent = Agent(policy, seed=1)
         agent.reset()
         np.testing.assert_allclose(agent.act(given), action, rtol=1e-3, atol=1e-4)
-    with pytest.raises(CheckpointError, match="embeds frames by code of tiny_network: name it in plugins"):
+    with pytest.raises(CheckpointError, match="embeds frames with code of tiny_network: name it in plugins"):
         Trained.load(file)
 
 
@@ -74,7 +74,7 @@ def test_a_plugin_is_taken_for_a_network_s_file_that_lies_elsewhere(run, tmp_pat
     file = trained.save(tmp_path / "policy.safetensors")
     (tmp_path / "net.py").write_text("from tiny_network import random_layer\n")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CheckpointError, match="embeds frames by code of net.py: name it in plugins"):
+    with pytest.raises(CheckpointError, match="embeds frames with code of net.py: name it in plugins"):
         Trained.load(file)
     loaded = Trained.load(file, plugins=["net.py"])
     assert loaded.cameras["top"].about["network"] == f"{tmp_path}/net.py:random_layer"
@@ -107,7 +107,7 @@ def test_an_exported_file_says_that_it_takes_embeddings(run, tmp_path, capsys):
 def test_a_policy_with_a_network_of_one_s_own_is_exported_where_the_plugin_is_named(run, tmp_path, capsys):
     file = Trained.load(run).save(tmp_path / "policy.safetensors")
     assert koap("export", file, "--out", tmp_path / "exported") == 1
-    assert "embeds frames by code of tiny_network: name it in plugins" in capsys.readouterr().err
+    assert "embeds frames with code of tiny_network: name it in plugins" in capsys.readouterr().err
     assert koap("export", file, "--out", tmp_path / "exported", "--plugin", "tiny_network") == 0
 
 

@@ -160,7 +160,7 @@ def test_frames_come_as_lerobot_scales_them(tmp_path):
     assert koap("embed", tmp_path / "own", "--camera", "image", "--out", tmp_path / "seen", *embed) == 0
     assert koap("train", "--dataset", tmp_path / "seen", "--out", tmp_path / "run", *TINY, "--quiet") == 0
     assert koap("export", tmp_path / "run", "--format", "lerobot", "--out", tmp_path / "out", "--quiet") == 0
-    with pytest.raises(CheckpointError, match="embeds frames by code of tiny_network: name it in plugins"):
+    with pytest.raises(CheckpointError, match="embeds frames with code of tiny_network: name it in plugins"):
         loaded(tmp_path / "out", env_cfg=PushtEnv())
     policy, before, _ = loaded(tmp_path / "out", '--plugins=["tiny_network"]', env_cfg=PushtEnv())
     frames, state = np.load(tmp_path / "raw" / "00" / "image.npy")[:2], np.ones((2, 2), np.float32)

@@ -143,7 +143,7 @@ def test_what_is_no_method_is_refused():
         Method("other", "", build, sees="labeled")
     with pytest.raises(ValueError, match="the name of a method must be letters, digits"):
         Method("a/b", "", build)
-    with pytest.raises(ValueError, match="phases of method 'other' need names of their own"):
+    with pytest.raises(ValueError, match="phases of method 'other' must have different names"):
         Method("other", "", build, (Phase("x", loss), Phase("x", loss)))
     with pytest.raises(ValueError, match="unknown kind of windows 'labeled'; did you mean 'labelled'"):
         Phase("x", loss, "labeled")

@@ -50,7 +50,7 @@ def test_the_folder_describes_the_columns_and_acts_as_the_training(trained, tmp_
 def test_columns_of_a_feature_that_lie_apart_are_named(trained, tmp_path):
     parts = {"robot": ("x",), "surroundings": ("environment_state_0",), "robot_2": ("y", "z")}
     apart = replace(trained, task=replace(trained.task, observation_parts=parts, observation_origin=()))
-    with pytest.raises(ValueError, match=r"columns of observation.state lie apart \(y\): convert the data with them"):
+    with pytest.raises(ValueError, match=r"columns of observation.state are not adjacent \(y\): convert the data"):
         number_features(apart)
 
 

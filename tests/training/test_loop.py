@@ -210,7 +210,7 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path):
         run_training(Controller, tmp_path, resume=True)
     weights = nn.Linear(2, 2).state_dict()
     save_tensors(tmp_path / "checkpoints" / "controller.safetensors", weights, {"task": "avoiding"})
-    with pytest.raises(CheckpointError, match="is no state of a training"):
+    with pytest.raises(CheckpointError, match="is not a training state"):
         run_training(Controller, tmp_path, resume=True)
 
 

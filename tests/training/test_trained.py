@@ -61,7 +61,7 @@ def test_an_unfinished_training_is_told_from_a_damaged_one(trained_run, tmp_path
     with pytest.raises(CheckpointError, match="planner.safetensors is missing"):
         Trained.load(run)
     (run / "summary.json").unlink()
-    said = r"run is not finished \(no summary.json\): go on with `koap train --out .*run --resume`"
+    said = r"run is not finished \(no summary.json\): resume it with `koap train --out .*run --resume`"
     for unfinished in (Trained.load, check_run):
         with pytest.raises(RunDirectoryError, match=said):
             unfinished(run)
@@ -127,7 +127,7 @@ def test_files_that_cannot_be_used_are_named(own, trained_run, tmp_path):
     plugin["config"] = plugin["config"] | {"method": "m"}
     wrong = {
         cut: "cut.safetensors is damaged",
-        trained_run / "planner.safetensors": "planner.safetensors is no policy that Trained.save",
+        trained_run / "planner.safetensors": "planner.safetensors is not a policy that Trained.save",
         written("new", tensors, about | {"version": 3}): "new is a policy of format 3, this version reads 2",
         written("half", half, about): r"half \(controller\) does not fit the model: .*Missing key",
         written("wide", tensors, changed("planner", width=16)): r"wide \(planner\) does not fit .*size mismatch",

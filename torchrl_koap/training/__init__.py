@@ -3,7 +3,7 @@
 
 from torchrl_koap.lookup import exports
 
-# imported when first asked for: a method of one's own needs no training loop
+# imported on first access: a module that only registers a method needs no training loop
 _OFFERS = {
     "in_memory": ("fit",),
     "method": ("Method", "Phase"),

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The latest averaged weights whose score on held-out trajectories is near the best one."""
+"""Keeps the latest averaged weights whose score on held-out trajectories is near the best one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import torch
 from torch import nn
 from torchrl.objectives import LossModule
 
-ROOM = 1.05  # times the best score; of weights below it the latest are kept, since they follow plans more exactly
-PATIENCE = 1.5  # a training ends after that many times the updates of the kept weights
+ROOM = 1.05  # weights up to this factor of the best score are kept: later weights follow plans more exactly
+PATIENCE = 1.5  # training ends after this many times the updates of the kept weights
 
 
 class BestWeights(nn.Module):
-    """Scores the averaged weights of a loss now and then; keeps the latest within 5 % of the best score.
+    """Scores the averaged weights of a loss at intervals; keeps the latest ones within 5 % of the best score.
 
     Its state dict holds everything that a resumed training needs.
 
@@ -32,7 +32,7 @@ class BestWeights(nn.Module):
 
     def __init__(self, loss: LossModule, score: Callable[[nn.Module], float], every: int):
         super().__init__()
-        self._loss, self._score = (loss,), score  # a tuple: the loss is no part of this module
+        self._loss, self._score = (loss,), score  # a tuple, so that the loss is not registered as a submodule
         self._now = (copy.deepcopy(loss.network),)
         self.network = copy.deepcopy(loss.network)
         self.every = every
@@ -41,11 +41,11 @@ class BestWeights(nn.Module):
         self.register_buffer("step", torch.tensor(0))
 
     def check(self, step: int) -> dict[str, float]:
-        """Scores the averaged weights after so many updates and keeps good ones; returns the score and :meth:`kept`."""
+        """Scores the averaged weights after ``step`` updates, keeps good ones; returns the score and :meth:`kept`."""
         began, (loss,), (now,) = time.perf_counter(), self._loss, self._now
         now.load_state_dict(loss.target_network_params.flatten_keys(".").to_dict())
         score = self._score(now)
-        if score < ROOM * self.best or not self.best.isfinite():  # where nothing moves there is no score
+        if score < ROOM * self.best or not self.best.isfinite():  # the score is not finite if nothing moves
             self.network.load_state_dict(now.state_dict())
             self.best.fill_(min(score, self.best.item()))
             self.step.fill_(step)
@@ -53,9 +53,9 @@ class BestWeights(nn.Module):
         return {"held_out_score": score} | self.kept()
 
     def kept(self) -> dict[str, float]:
-        """The best score, and the update of the weights that are kept."""
+        """Returns the best score, and the update at which the kept weights were scored."""
         return {"best_held_out_score": self.best.item(), "kept_update": self.step.item()}
 
     def finished(self, step: int) -> bool:
-        """Whether a better score is no longer to be expected after that many updates."""
+        """Returns whether training should end after ``step`` updates, as no better score is expected."""
         return step >= PATIENCE * self.step.item() + 4 * self.every

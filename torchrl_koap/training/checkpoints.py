@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Training states from which a run goes on bit for bit: parameters, optimiser, random numbers."""
+"""Checkpoints from which a training resumes bit for bit: parameters, optimiser, random numbers."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensor
 def save_training_state(
     path: str | Path, module: nn.Module, optimizer: torch.optim.AdamW, about: Mapping[str, Any]
 ) -> None:
-    """Writes everything a training loop needs to go on: parameters (targets included), moments, random state, facts.
+    """Writes all that a training loop needs to resume: parameters (targets included), moments, random state, ``about``.
 
-    The module holds the loss, and what else has a state. Facts are such as ``{"phase": "planner", "step": 500}``.
+    The module holds the loss and all else that has a state. An ``about`` is ``{"phase": "planner", "step": 500}``.
     """
     moments = optimizer.state_dict()["state"]
     tensors = _state(module)
@@ -30,19 +30,19 @@ def save_training_state(
 
 
 def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.optim.AdamW) -> dict[str, Any]:
-    """Restores what :func:`save_training_state` wrote, the global random state included, and returns the facts.
+    """Restores what :func:`save_training_state` wrote, with the global random state; returns ``about``.
 
     Raises:
-        CheckpointError: if the file is damaged, no training state, or does not fit the module or the optimiser. Nothing
-            has been changed then.
+        CheckpointError: if the file is damaged, is not a training state, or does not fit the module or the optimiser;
+            nothing is changed then.
     """
     tensors, about = load_tensors(path)
     known = about.pop("moments", None)
     if not isinstance(known, list):
-        raise CheckpointError(f"{path} is no state of a training")
+        raise CheckpointError(f"{path} is not a training state")
     if type(about.get("step")) is not int or about["step"] < 0:
         raise CheckpointError(
-            f"{path} is damaged: its step must be a whole number from 0 on, got {about.get('step')!r}"
+            f"{path} is damaged: its step must be a whole number >= 0, got {about.get('step')!r}"
         )
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     moments = {
@@ -64,7 +64,7 @@ def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.op
         for name, value in _state(module).items():
             value.copy_(saved[name])
     state = {index: {name: saved[f"optimizer.{index}.{name}"] for name in held} for index, held in moments.items()}
-    # the settings are those of the run, and its learning rate is set at every update
+    # hyperparameters come from the run's options; the loop sets the learning rate at every update
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     torch.set_rng_state(saved["rng.cpu"])
     cuda = [tensors[name] for name in sorted(tensors) if name.startswith("rng.cuda.")]
@@ -74,6 +74,6 @@ def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.op
 
 
 def _state(module: nn.Module) -> dict[str, Tensor]:
-    """The tensors of a module, and the random state."""
+    """Returns the tensors of a module, and the random state."""
     own = {name: value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
     return own | {"rng.cpu": torch.get_rng_state()}

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Fitting a controller's decoder in closed form on all labelled steps of a data set."""
+"""Fits a controller's decoder in closed form on all labelled steps of a data set."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.tasks import Task
 
-MOST = 50_000  # labelled steps: random features of them take a gigabyte
+MOST = 50_000  # labelled steps at most: random features of this many take a gigabyte
 
 
 def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: Any) -> dict[str, Any]:
-    """Fits a controller's decoder on every labelled step that sees its whole look-ahead, each used once.
+    """Fits a controller's decoder on every labelled step whose whole look-ahead was recorded; each is used once.
 
-    Of more than 50,000 such steps, so many are used, spread evenly. The data are flat ``[N]``, after the label budget
-    was applied; what is ``known`` of the actions is that of :func:`action_facts`. Returns what
-    :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` found.
+    At most 50,000 steps are used, spread evenly. The data are flat ``[N]``, after the label budget was applied;
+    ``known`` are the facts of :func:`action_facts`. Returns the result of
+    :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels`.
     """
     data = data[torch.isin(data[EPISODE], labelled_episodes(data))]
     table = WindowTable.build(data, controller.num_window_frames, pad_before=controller.num_past)
@@ -31,7 +31,7 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     frames = spread_evenly(frames[data[HAS_ACTION].squeeze(-1)[frames[:, controller.num_past]]], MOST)
     windows = data.select(STATE, ACTION, EPISODE)[frames]
     mask = torch.zeros_like(frames, dtype=torch.bool)
-    mask[:, controller.num_past] = True  # at other frames a clamped look-ahead would count a step again
+    mask[:, controller.num_past] = True  # other frames would use a step twice, with a clamped look-ahead
     for name, own in ((STATE, controller.in_key), (ACTION, controller.out_key)):
         if own != name:
             windows.rename_key_(name, own)
@@ -39,9 +39,9 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
 
 
 def action_facts(task: Task, columns: Sequence[int]) -> dict[str, Any]:
-    """Finds the column of those read that each action moves; for a robot that came with data alone, the likely one.
+    """Finds which of the state columns that the controller reads each action moves.
 
-    ``axes`` are empty where nothing is known or likely; ``guessed`` tells a likely one from a known one. Actions are
+    ``axes`` is empty if this is unknown. For a task without an environment it may be ``guessed``. Actions are
     ``alike`` unless all are raw.
     """
     axes = list(task.moved_columns())

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The part of a training that spends labels: a controller, or a network that samples actions."""
+"""The part of a training that uses labels: a controller, or a network that samples actions."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from torchrl_koap.training.policy_facts import command_ranges, controller_data, 
 from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
-FEW_VALUES = 5  # an action of more numbers is no switch and no mode
-FITTED = 50_000  # windows that statistics without labels are fitted to
+FEW_VALUES = 5  # an action with more distinct values is neither a switch nor a mode
+FITTED = 50_000  # windows at most that statistics without labels are fitted to
 _KEYS = [STATE, ACTION, HAS_ACTION]
 
 
 def learn_controller(
     task: Task, config: TrainConfig, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any]]:
-    """Builds and trains what turns states into actions, from flat data ``[N]`` after the label budget was applied.
+    """Builds and trains the network that gives actions, from flat data ``[N]`` after the label budget was applied.
 
-    Beside the module stand, for the summary, the last losses ``controller``, ``controller_updates``, what a closed form
-    found ``decoder_fit`` and the ``command_ranges``.
+    Returns the network, and for the summary: the last losses ``controller``, ``controller_updates``, the result
+    ``decoder_fit`` of a closed form, and the ``command_ranges``.
     """
     method, before = get_method(config.method), loop.updates
-    ranges = command_ranges(task, data)  # of labels, not of what a teacher says
+    ranges = command_ranges(task, data)  # of recorded labels, not of a teacher's actions
     data = data if method.fit is not None else with_commands(task, data)
     if method.teacher:
         data = _relabelled(task, config, get_method(method.teacher), data, loop)
@@ -65,9 +65,9 @@ def learn_controller(
 
 
 def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None:
-    """Refuses flat data ``[N]`` of which a trajectory is shorter than a window, before anything is trained.
+    """Raises a ValueError before training if a trajectory of flat data ``[N]`` is shorter than a window.
 
-    A controller that does not give actions of the task's width is refused, too. Of labels that no fit sees it warns.
+    A controller whose actions do not have the task's width is refused, too. Warns of labels that no fit sees.
     """
     method, window, past, ahead = get_method(config.method), WINDOW, 1, 0
     if method.plans and method.fit is None:
@@ -82,11 +82,11 @@ def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None
 
 
 def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, window: int) -> None:
-    """Runs a controller once on a window of zeros."""
+    """Runs a controller once on a window of zeros; raises a ValueError if it fails or gives another shape."""
     states, wanted = torch.zeros(1, window, state_reader(task, config.controller).width), [1, window, task.action_dim]
     try:
         with torch.no_grad():
-            given = controller.predict(states)  # in normalised units: statistics would hide a width of 1
+            given = controller.predict(states)  # in normalised units: denormalising would broadcast a width of 1
             if list(given.shape) == wanted:
                 given = controller(TensorDict({controller.in_key: states}, [1]))[controller.out_key]
     except Exception as error:
@@ -97,7 +97,7 @@ def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, windo
 
 
 def _warn_of_late_switches(task: Task, data: TensorDictBase, ahead: int) -> None:
-    """Names raw actions of few values that change in the last steps, to which a controller is not fitted."""
+    """Warns of raw actions with few values that change in the last steps, to which no controller is fitted."""
     parts = [part for part in data.split(trajectory_lengths(data).tolist()) if part[HAS_ACTION].all()]
     if not parts:
         return
@@ -116,7 +116,7 @@ def _warn_of_late_switches(task: Task, data: TensorDictBase, ahead: int) -> None
 def _train_network(
     task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
-    """A controller's phases, and its closed form if it has one."""
+    """Trains a controller in its phases, then fits its closed form if it has one."""
     data, budget = controller_data(task, config.controller, data), config.controller.steps
     controller = build_controller(task, method, config.controller, data).to(config.run.device)
     history, shortest = controller.num_past, controller.num_window_frames
@@ -127,7 +127,7 @@ def _train_network(
         windows = spread_evenly(windows[windows[HAS_ACTION].any(dim=(1, 2))], FITTED)
     states = windows[STATE]
     losses: dict[str, float] = {}
-    with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
+    with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most controllers prepare nothing
         controller.prepare(states, updates=budget if method.phases else 0, progress=count_up_to(bar))
     for phase in method.phases_of(config.controller.preset) if budget else ():
         batch = BATCHES[phase.windows]
@@ -161,13 +161,13 @@ def _train_network(
 def _train_sampler(
     task: Task, config: TrainConfig, method: Method, data: TensorDictBase, loop: Phases
 ) -> tuple[nn.Module, dict[str, float]]:
-    """A network that samples actions, with the updates that a planner would have."""
+    """Trains a network that samples actions, with the updates that a planner would have."""
     (phase,) = method.phases
     section = config.planner
     sampler = method.build(task, section).to(config.run.device)
     _, states = planned_windows(data[torch.isin(data[EPISODE], labelled_episodes(data))])
     sampler.fit_normalizers(states, data[ACTION][data[HAS_ACTION].squeeze(-1)])
-    # at the end of a demonstration only the steps that were recorded count
+    # at the end of a demonstration only recorded steps count
     buffer = make_window_buffer(
         data,
         WINDOW,
@@ -195,7 +195,7 @@ def _train_sampler(
 
 
 def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDictBase, loop: Phases) -> TensorDictBase:
-    """The data with the teacher's actions where there is no label."""
+    """Trains the teacher and returns the data with its actions where there is no label."""
     phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
     controller, _, _ = _train_network(task, config, replace(teacher, phases=phases), data, loop)
     view = controller_data(task, config.controller, data)

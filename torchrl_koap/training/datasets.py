@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which trajectories and labels of the demonstrations are learnt from."""
+"""Selects the trajectories and labels of the demonstrations that a training uses."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.policy_facts import tells_commands
 
-# what is derived from these may differ from version to version
+# without columns derived from these, which may differ between versions
 _RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("next", "observation"), ("next", "done"))
 
 
 def fingerprint(data: TensorDictBase) -> dict[str, Any]:
-    """What tells flat data ``[N]`` from others: their size, and a checksum of what was recorded."""
+    """Returns the size of flat data ``[N]`` and a checksum of what was recorded."""
     present = set(data.keys(True, True))
     return {"steps": len(data), "sha256": digest_of((name, data.get(name)) for name in _RECORDED if name in present)}
 
 
 def within_budget(task: Task, config: TrainConfig, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
-    """Hides the labels of flat data ``[N]`` that a training of these options does not see; the budget reports."""
-    told = tells_commands(task, get_method(config.method))
-    return config.labels.budget(config.run.seed).apply(data, command=task.command_columns, tell_commands=told)
+    """Hides the labels of flat data ``[N]`` that a training with these options does not see; also returns a report."""
+    tell = tells_commands(task, get_method(config.method))
+    return config.labels.budget(config.run.seed).apply(data, command=task.command_columns, tell_commands=tell)
 
 
 def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int = 0) -> list[int]:
-    """Numbers of the trajectories to hold out from the planner: those without a label first.
+    """Returns the numbers of the trajectories to hold out from the planner, those without a label first.
 
-    Trajectories with labels are taken only where the others do not suffice. They lose no label: the planner does not
-    see them, the controller does. At least one trajectory is held out, of ten or more at least two, and at least one is
-    left; of a single trajectory none can be.
+    Trajectories with labels are taken only if the others do not suffice. They lose no label: the planner does not
+    see them, the controller does. At least one trajectory is held out (two of ten or more), and at least one is left.
+    A single trajectory is not held out.
 
     The fraction is a share of all trajectories of flat data ``[N]``, in ``[0, 1)``; None is 0.
     """
@@ -58,7 +58,7 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
 
 
 def held_out_facts(data: TensorDictBase, episodes: Sequence[int]) -> dict[str, Any]:
-    """What ``config.json`` says of the trajectories that a planner does not see: numbers and a checksum of states."""
+    """Returns what ``config.json`` records of held-out trajectories: numbers and a checksum of states."""
     if not len(episodes):
         return {}
     states = data[STATE][torch.isin(data[EPISODE].cpu(), torch.tensor(list(episodes)))]
@@ -66,7 +66,7 @@ def held_out_facts(data: TensorDictBase, episodes: Sequence[int]) -> dict[str, A
 
 
 def held_out_by(source: Path, data: TensorDictBase) -> list[int]:
-    """Numbers of the trajectories that the planner of a run has never seen; none where flat data hold others there."""
+    """Returns the numbers of the trajectories that a run's planner has never seen; none if ``data`` differ there."""
     content = RunDirectory(source).read_json("config.json")
     episodes = content.get("held_out_episodes") or []
     return episodes if held_out_facts(data, episodes).items() <= content.items() else []
@@ -75,9 +75,9 @@ def held_out_by(source: Path, data: TensorDictBase) -> list[int]:
 def split_held_out(
     data: TensorDictBase, episodes: Sequence[int]
 ) -> tuple[TensorDictBase, TensorDictBase | None, TensorDictBase]:
-    """Parts flat data ``[N]`` in what a planner learns from, what is held out from it, and what a controller sees.
+    """Splits flat data ``[N]``: what a planner learns from, what is held out from it, what a controller sees.
 
-    The second is None where nothing is held out. A controller sees held-out trajectories that have a label.
+    The second is None if nothing is held out. A controller sees held-out trajectories that have a label.
     """
     if not len(episodes):
         return data, None, data

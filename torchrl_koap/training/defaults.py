@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Defaults of a training, filled in once: asked > method > task > network > library."""
+"""Fills in the defaults of a training once. Precedence: given options > method > task > network > library."""
 
 from __future__ import annotations
 
@@ -24,19 +24,18 @@ from torchrl_koap.training.networks import NETWORKS
 from torchrl_koap.training.policy_facts import tells_commands
 
 CONTROLLER_UPDATES = 500
-PLACES = "absolute"  # the default preset where decoded actions are places
-FOLLOWED = "delayed"  # where they are targets of state columns, which a robot takes its time to reach
-# a planner for the hundred or so demonstrations that people record: one that does not overfit them
+PLACES = "absolute"  # default preset if decoded actions are positions
+FOLLOWED = "delayed"  # default preset if they are targets of state columns, which a robot reaches with a delay
+# planner options for recorded data: about a hundred demonstrations, which larger networks overfit
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
-OWN_TEMPERATURE = 0.4  # of plans where no figure counts the modes
-PLAN_SECONDS = 0.1  # with feedback, at least: plans made anew every few ms begin where the robot lags behind the last
+OWN_TEMPERATURE = 0.4  # of plans in tasks without an environment, where no modes are counted
+PLAN_SECONDS = 0.1  # least time between plans with feedback: a new plan starts where the robot lags behind the last one
 
 
 def resolve(config: TrainConfig, task: Task) -> TrainConfig:
-    """Looks every name up and fills every default in, in one pass; plugins must have been imported.
+    """Looks up every name and fills in every default, in one pass; plugins must have been imported.
 
-    Of the options that are returned none is None but ``planner.source`` and the two ways to draw labels that are not
-    used.
+    Returns options without None, except ``planner.source`` and the two ways to draw labels that are not used.
 
     Raises:
         ValueError: for unknown names, and options that exclude each other.
@@ -81,13 +80,13 @@ def _planner(asked: PlannerConfig, method: Method, task: Task) -> PlannerConfig:
 
 
 def _unsized(layer: Mapping[str, Any]) -> dict[str, Any]:
-    """A layer without what belongs to its network: another one comes with its own."""
+    """Returns defaults without those of their network, for use with another network."""
     return {name: value for name, value in layer.items() if name in ("steps", "frames", "held_out")}
 
 
 def _taken_over(asked: PlannerConfig) -> PlannerConfig:
-    """The planner section of the run that the planner is taken from."""
-    if all(getattr(asked, field.name) is not None for field in fields(asked)):  # of a run that is resumed
+    """Returns the planner section of the run that the planner is taken from."""
+    if all(getattr(asked, field.name) is not None for field in fields(asked)):  # a resumed run: filled in already
         return asked
     theirs = read_config(RunDirectory(asked.source)).planner
     for name in (field.name for field in fields(asked) if field.name != "source"):
@@ -102,7 +101,7 @@ def _taken_over(asked: PlannerConfig) -> PlannerConfig:
 def _controller(asked: ControllerConfig, method: Method, task: Task) -> ControllerConfig:
     own = dict(task.defaults.controller)
     if method.name != task.defaults.method or own.get("preset") not in method.presets:
-        own.pop("preset", None)  # of the task's own method
+        own.pop("preset", None)  # it belongs to the task's default method
     places = tells_commands(task, method) or not (task.delta_actions or task.targets)
     presets, usual = method.presets, method.presets[0]
     if usual == "default":
@@ -129,7 +128,7 @@ def _execution(asked: ExecutionConfig, method: Method, task: Task, preset: str) 
     usual = Execution().replaced(**own)
     method.check_execution(asked, usual)
     if asked.on(usual).strategy == "feedback":
-        # actions of later frames would need frames beyond the plan's end
+        # decoding later actions would need frames beyond the end of the plan
         most = HORIZON + 1 - np.max(PRESETS[preset]["look_ahead"]).item()
         own = {"replan_interval": min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), most)} | own
     return ExecutionConfig(**vars(asked.on(Execution().replaced(**own))))

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Training in memory as ``koap train`` does it: demonstrations in, trained networks out.
+"""Trains in memory as ``koap train`` does: demonstrations in, trained networks out.
 
-Normalisers, scales, losses, augmentation, averaged weights and the closed form at the end are those of ``koap train``:
-with the same data, seed and options the weights are the same bit for bit.
+Normalisers, scales, losses, augmentation, averaged weights and the final closed form are those of ``koap train``: the
+same data, seed and options give the same weights, bit for bit.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def fit(
 ) -> Trained:
     """Trains planner and controller, or a network that samples actions, on data in memory.
 
-    From recorded arrays to an action on the robot::
+    From recorded arrays to an action for the robot::
 
         data, task = make_demonstrations(states, actions, control_hz=30, robot=range(7))
         trained = torchrl_koap.fit(data, task)
@@ -61,10 +61,10 @@ def fit(
     Args:
         data (TensorDictBase): flat data ``[N]`` (:func:`~torchrl_koap.data.make_demonstrations`, or a data set of D3IL
             or LeRobot). Without ``state``, the columns that the task names are taken from ``observation``.
-            ``has_action`` says which actions may be seen; without it, those that are not NaN. A
-            :class:`~torchrl_koap.data.LabelBudget` takes labels away.
-        task (Task, optional): the task, as ``make_demonstrations`` returns it. Default: all columns of ``state`` (of
-            ``observation`` where there is none) are the robot's.
+            ``has_action`` marks the actions that may be seen; without it, those that are not NaN. A
+            :class:`~torchrl_koap.data.LabelBudget` hides labels.
+        task (Task, optional): the task, as ``make_demonstrations`` returns it. Default: all columns of ``state`` (or
+            ``observation``, if there is no state) are the robot's.
 
     Keyword Args:
         method (str, optional): a name in :data:`~torchrl_koap.training.METHODS`. Default: the task's, mostly
@@ -73,16 +73,16 @@ def fit(
             :class:`~torchrl_koap.PlannerConfig` such as ``{"steps": 5000}``; False trains a controller alone. Default:
             the task's options.
         controller (mapping, optional): options of :class:`~torchrl_koap.ControllerConfig`.
-        seed (int): seed of initialisation and batches; torch's generators and threads are left as they were.
+        seed (int): seed of initialisation and batches; torch's generators and threads are restored afterwards.
         device (str): ``"cpu"`` or ``"cuda"``.
-        precision (str): of the planner's matrix products, see :class:`~torchrl_koap.RunConfig`.
+        precision (str): number type of the planner's matrix products, see :class:`~torchrl_koap.RunConfig`.
         progress (bool): show progress bars.
 
     Returns:
         Trained: its networks are in evaluation mode.
 
     Raises:
-        ValueError: for an unknown method or option, data without any label or that do not fit the task, or trajectories
+        ValueError: for an unknown method or option, data without labels or that do not fit the task, or trajectories
             shorter than a window.
         DataError: if the data do not follow the storage layout.
 
@@ -113,7 +113,7 @@ def fit(
             f"planner must be a StatePlanner, a mapping of options, None or False, got {type(planner).__name__}"
         )
     set_up_torch(None, device)
-    # a planner from elsewhere may have seen all trajectories
+    # a given planner may have seen all trajectories, so none counts as held out
     given = {"held_out": 0.0} | ({} if shared is None else sizes_of(shared))
     options = given if shared is not None or planner is False else dict(planner or {})
     config = resolve(
@@ -156,7 +156,7 @@ def _section(kind: type, options: Mapping[str, Any]) -> Any:
 
 
 def _prepared(data: TensorDictBase, task: Task | None) -> tuple[TensorDictBase, Task]:
-    """The data with labels marked and ``state``, and the task they are of."""
+    """Returns the data with labels marked and with ``state``, and their task."""
     if keys.ACTION not in data.keys() or keys.HAS_ACTION not in data.keys():
         data = mark_labels(data, action_dim=None if task is None else task.action_dim)
     task = _task_of_columns(data) if task is None else task
@@ -172,7 +172,7 @@ def _prepared(data: TensorDictBase, task: Task | None) -> tuple[TensorDictBase, 
 
 
 def _task_of_columns(data: TensorDictBase) -> Task:
-    """A task about which nothing is known but the number of columns."""
+    """Returns a task of which only the number of columns is known."""
     seen = data.get(keys.STATE, None)
     width = (data[keys.OBSERVATION] if seen is None else seen).shape[-1]
     actions = {f"action_{column}": Action() for column in range(data[keys.ACTION].shape[-1])}

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A policy as the folder that LeRobot's commands run, with the distribution ``lerobot_policy_koap``."""
+"""Writes a policy as a folder that LeRobot's commands run, with the distribution ``lerobot_policy_koap``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_koap.vision import Observer
 WEIGHTS = "model.safetensors"
 _KIND = "koap"
 _DEVICE = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
-_PROCESSORS = {  # LeRobot looks for them; ranges, units and frames are the policy's own affair
+_PROCESSORS = {  # LeRobot requires these files; the policy itself converts ranges, units and frames
     "policy_preprocessor": [
         {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
         {"registry_name": "to_batch_processor", "config": {}},
@@ -27,13 +27,13 @@ _PROCESSORS = {  # LeRobot looks for them; ranges, units and frames are the poli
 
 
 def number_features(trained: Trained) -> dict[str, tuple[str, ...]]:
-    """Finds the columns of numbers that each feature of LeRobot gives, in the order in which the policy takes them.
+    """Finds the columns of numbers that each LeRobot feature gives, in the policy's order.
 
     A column is of ``observation.environment_state`` if its name begins with ``environment_state``, else of
-    ``observation.state``; :func:`~torchrl_koap.data.read_recordings` names them so.
+    ``observation.state``; :func:`~torchrl_koap.data.read_recordings` gives these names.
 
     Raises:
-        ValueError: if columns of another feature lie between those of one.
+        ValueError: if the columns of a feature are not adjacent.
     """
     task, found = trained.task, dict[str, tuple[str, ...]]()
     names = [
@@ -45,20 +45,20 @@ def number_features(trained: Trained) -> dict[str, tuple[str, ...]]:
     for feature, group in groupby(names, _feature_of):
         columns = tuple(group)
         if feature in found:
-            raise ValueError(f"columns of {feature} lie apart ({columns[0]}): convert the data with them side by side")
+            raise ValueError(f"columns of {feature} are not adjacent ({columns[0]}): convert the data so that they are")
         found[feature] = columns
     return found
 
 
 def camera_features(trained: Trained) -> dict[str, str]:
-    """Finds the feature of LeRobot that gives the frames of each camera."""
+    """Returns the LeRobot feature with the frames of each camera."""
     return {name: f"{PREFIX}image" if name == "image" else f"{PREFIX}images.{name}" for name in trained.cameras}
 
 
 def write_lerobot_folder(trained: Trained, out: str | Path) -> dict[str, Any]:
-    """Writes the folder: weights and task as :meth:`Trained.save`, and the descriptions that LeRobot reads first.
+    """Writes the folder: weights and task as :meth:`Trained.save`, and the descriptions that LeRobot reads.
 
-    Returns the folder, columns and cameras by feature, and the call of ``lerobot-eval`` that runs it.
+    Returns the folder, columns and cameras by feature, and the ``lerobot-eval`` command that runs it.
 
     Raises:
         FileExistsError: if the folder holds another ``config.json``, such as that of the run.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""One loop that trains planner and controllers: logged, checkpointed, resumable bit for bit."""
+"""The loop that trains planners and controllers: logged, checkpointed, resumable bit for bit."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.checkpoints import load_training_state, save_training_state
 
 CHECKPOINT_EVERY = 500
-WARMUP = 100  # updates until the learning rate has its peak
-TIMES = 5.0  # lengths of mini-batch gradients vary by a factor of two or so about their mean square
-SETTLED = 100  # updates before which their mean says little
-AVERAGE_EVERY = 4  # updates between two steps of the average: each reads and writes every weight
+WARMUP = 100  # updates until the learning rate reaches its peak
+TIMES = 5.0  # of the root mean square length; mini-batch gradients vary by about a factor of two
+SETTLED = 100  # updates until the mean square is reliable
+AVERAGE_EVERY = 4  # updates between two steps of the average, which reads and writes every weight
 
 
 def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
-    """Share of the peak learning rate at an update, from 0 on: linear warm-up, then half a cosine to 0."""
+    """Returns the share of the peak learning rate at update ``step`` (from 0): linear warm-up, half a cosine to 0."""
     return min(1.0, (step + 1) / max(warmup, 1)) * 0.5 * (1 + math.cos(math.pi * step / num_steps))
 
 
 def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
-    """The average of a loss's ``target_*_params`` that is used after training, for :func:`train_phase` to step.
+    """Makes the moving average, in a loss's ``target_*_params``, that is used after training.
 
-    Its memory is a share of a short training: the decay per update is ``1 - 10 / (num_steps + 10)``, at most 0.998.
+    :func:`train_phase` steps it. The decay per update is ``1 - 10 / (num_steps + 10)``, at most 0.998.
     """
     decay = min(0.998, 1 - 10 / (num_steps + 10))
-    return SoftUpdate(loss_module, eps=max(0.5, decay**AVERAGE_EVERY))  # of less it warns
+    return SoftUpdate(loss_module, eps=max(0.5, decay**AVERAGE_EVERY))  # SoftUpdate warns below 0.5
 
 
 class DivergedError(RuntimeError):
@@ -68,18 +68,18 @@ def train_phase(
 ) -> dict[str, float]:
     """Minimises the sum of all ``loss_*`` entries of a TorchRL ``LossModule`` with AdamW, in ``num_steps`` updates.
 
-    The rate is that of :func:`warmup_cosine`, and a gradient far longer than those before it is clipped
+    :func:`warmup_cosine` schedules the learning rate. Gradients far longer than earlier ones are clipped
     (:class:`AdaptiveClipping`). ``target_update`` is stepped every fourth update; ``best`` scores averages, keeps good
-    ones and ends the training early. ``sample`` returns a batch, by torch's global generator. ``run``, ``logger`` and
-    ``resume`` are as of :class:`Phases`: on a CPU a training goes on bit for bit. ``replay`` records an update once as
-    a CUDA graph: the loss must take the same path for every batch, as denoising losses do. ``progress`` is called with
-    the number of updates done and the last logged values. These are returned, with ``updates`` and
+    ones and ends training early. ``sample`` returns a batch, drawn by torch's global generator. ``run``, ``logger`` and
+    ``resume`` are those of :class:`Phases`; on a CPU a training resumes bit for bit. ``replay`` records an update once
+    as a CUDA graph: the loss must take the same path for every batch, as denoising losses do. ``progress`` is called
+    with the number of updates done and the last logged values. These are returned, with ``updates`` and
     ``iterations_per_second`` of the whole phase.
 
     Raises:
-        DivergedError: if a loss is not finite where it is logged, or a parameter is not where a checkpoint is due;
-            the message names step and term. The last checkpoint is kept.
-        CheckpointError: if the checkpoint is damaged or that of another model.
+        DivergedError: if a loss is not finite when logged, or a parameter is not when a checkpoint is due; the message
+            names step and term. The last checkpoint is kept.
+        CheckpointError: if the checkpoint is damaged or of another model.
         ValueError: if a number of steps is below 1.
     """
     checkpoint_every = CHECKPOINT_EVERY if checkpoint_every is None else checkpoint_every
@@ -88,7 +88,7 @@ def train_phase(
             raise ValueError(f"{name} must be >= 1, got {value}")
     device = next(loss_module.parameters()).device
     replay = replay and device.type == "cuda"
-    # fused AdamW is the quickest on CPU and on CUDA, and its state is plain tensors
+    # fused AdamW is the fastest on CPU and CUDA, and its state is plain tensors
     optimizer = torch.optim.AdamW(
         loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True, capturable=replay
     )
@@ -103,7 +103,7 @@ def train_phase(
                 raise CheckpointError(f"{checkpoint} is at step {start}, this training has {num_steps}")
         run.rewind_metrics(phase, start)
     values: dict[str, float] = run.last_metrics(phase) if start else {}
-    device_rate = torch.tensor(learning_rate, device=device)  # a graph reads tensors alone
+    device_rate = torch.tensor(learning_rate, device=device)  # a CUDA graph reads tensors only
 
     def update(batch: TensorDictBase) -> TensorDictBase:
         losses = loss_module(batch)
@@ -115,7 +115,7 @@ def train_phase(
         return terms.detach()
 
     if replay:
-        with warnings.catch_warnings():  # it says that it changes how torch walks through tensordicts
+        with warnings.catch_warnings():  # CudaGraphModule warns that it takes tensordicts out of torch's pytrees
             warnings.simplefilter("ignore", UserWarning)
             update = CudaGraphModule(update)
     done = start
@@ -163,12 +163,12 @@ def train_phase(
 
 @dataclass
 class Phases:
-    """Runs the phases of a training with what they share, a bar for each, and counts their updates.
+    """Runs the phases of a training with shared options and a progress bar each, and counts their updates.
 
     Args:
-        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
+        run (RunDirectory, optional): where metrics and checkpoints are written. Default: nowhere.
         logger (optional): a TorchRL logger.
-        resume (bool): go on from the checkpoints of the run.
+        resume (bool): resume from the checkpoints of the run.
     """
 
     run: RunDirectory | None = None
@@ -186,33 +186,33 @@ class Phases:
 
 @contextlib.contextmanager
 def _interrupts_let_through() -> Iterator[None]:
-    """Ctrl-C stays Ctrl-C: a loss's ``with params.to_module(network)`` makes a tensordict error of it."""
+    """Raises a KeyboardInterrupt again that ``with params.to_module(network)`` of a loss made a tensordict error."""
     try:
         yield
     except Exception as error:
-        behind: BaseException | None = error  # a second signal is met while the first one is
-        while behind is not None and not isinstance(behind, KeyboardInterrupt):
-            behind = behind.__context__
-        if behind is not None:
-            raise behind from None
+        cause: BaseException | None = error  # after two signals the interrupt lies deeper in the chain
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__context__
+        if cause is not None:
+            raise cause from None
         raise
 
 
 class AdaptiveClipping(nn.Module):
-    """Adaptive gradient clipping: no gradient is longer than five times the root mean square of earlier lengths.
+    """Clips gradients to five times the root mean square of earlier gradient lengths.
 
-    Where gradients have become short, so has the second moment that AdamW divides by. One that is several times as long
-    then moves every parameter by several learning rates, the next one is longer still, and within twenty updates the
-    loss is what it was at the beginning. Such jumps are known from large models (Wortsman et al. 2023, which limits the
-    update by the same comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a
-    training without outliers is unchanged.
+    Once gradients are short, so is the second moment that AdamW divides by. A gradient several times as long then moves
+    every parameter by several learning rates. The next gradient is longer still, and within twenty updates the loss is
+    back at its initial value. Such jumps are known from large models (Wortsman et al. 2023, which limits the update by
+    the same comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a training
+    without outliers is unchanged.
 
-    Call it between ``backward`` and the optimiser's step. Its state dict goes into checkpoints, so that a training that
-    is resumed goes on the same.
+    Call it between ``backward`` and the optimiser's step. Checkpoints hold its state dict, so that a resumed training
+    is the same.
 
     Args:
-        parameters (iterable): what is trained.
-        decay (float): of the mean of squared lengths: the optimiser's second beta.
+        parameters (iterable): the trained parameters.
+        decay (float): decay of the mean squared length: the optimiser's second beta.
     """
 
     mean_square: Tensor
@@ -226,13 +226,13 @@ class AdaptiveClipping(nn.Module):
 
     @torch.no_grad()
     def forward(self) -> Tensor:
-        """Returns the factor ``[]`` that the gradient was multiplied by: 1 for any ordinary one, and the first 100."""
+        """Scales the gradient in place; returns the factor ``[]``, 1 except for outliers after 100 updates."""
         gradients = [each.grad for each in self._trained if each.grad is not None]
         length = torch.nn.utils.get_total_norm(gradients)
         typical = (self.mean_square / (1 - self.decay**self.seen)).sqrt()
-        factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # a gradient of zero, or not finite
+        factor = (TIMES * typical / length).clamp(max=1.0).nan_to_num(1.0)  # if zero or not finite
         factor = torch.where((self.seen < SETTLED) | (typical == 0), 1.0, factor).to(length)
-        if factor.is_cuda or factor < 1:  # not read on a GPU, which would have to be waited for
+        if factor.is_cuda or factor < 1:  # reading it on a GPU would synchronise
             torch._foreach_mul_(gradients, factor)
         self.mean_square.lerp_((factor * length).square().to(self.mean_square), 1 - self.decay)
         self.seen += 1

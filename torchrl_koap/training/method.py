@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a method is: the network that it builds, the phases that it is trained in, what it may see, its defaults."""
+"""Defines a method: the network that it builds, its training phases, the data it may see, its defaults."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
 
 
 class Batch(NamedTuple):
-    """How a batch of a controller's training is drawn: the share of windows with labels, their number and length.
+    """How training batches of a controller are drawn: the share of windows with labels, their number and length.
 
-    A share of None takes windows as they come. In the ``shortest`` windows that a controller can read one frame counts,
-    so the labels of a batch are of as many situations as it has labelled windows.
+    If the share is None, labels do not matter. ``shortest`` windows, the shortest that a controller can read, have one
+    frame that counts: every labelled window of a batch then shows another situation.
     """
 
     labelled_share: float | None
@@ -41,11 +41,11 @@ class Phase:
     """One stage of a training: its loss, and the windows that it reads.
 
     Args:
-        name (str): its name in the log.
-        loss (callable): the loss of a network, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
+        name (str): name in the log.
+        loss (callable): ``loss(network)``, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
         windows (str): ``"all"`` (labelled or not), ``"mixed"`` (25 % of every batch have labels), ``"labelled"``, or
-            ``"short"`` (as short as can be, 75 % with labels).
-        share (float): of the updates that a controller may have.
+            ``"short"`` (the shortest possible, 75 % with labels).
+        share (float): share of the controller's updates.
 
     Raises:
         ValueError: for an unknown kind of windows, or a share outside (0, 1].
@@ -70,37 +70,37 @@ class Phase:
 
 @dataclass(frozen=True)
 class Method:
-    """A way to get from few labels to a policy, with its own defaults.
+    """A way to learn a policy from few labels, with its own defaults.
 
-    Its network maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the planner
-    that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`. With ``closed_form`` its
+    Its network, a :class:`~torchrl_koap.modules.InverseDynamics`, maps windows of states ``[*B, T, d]`` to actions
+    ``[*B, T, act]``. It follows the plans of the planner that all controllers share. With ``closed_form``, its
     :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels` is called once after all updates.
 
-    A method that does not plan samples actions: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
+    A method that does not plan samples actions: :class:`~torchrl_koap.modules.DiffusionPolicy` shows its interface.
 
     Args:
-        name (str): what ``--method`` calls it.
-        title (str): what tables and legends call it.
+        name (str): its name for ``--method``.
+        title (str): its name in tables and legends.
         build (callable): ``build(task, columns, normalizers, preset)`` with the state columns that the controller
-            reads (relative positions are counted on from the last one), and ``state_normalizer`` and
-            ``action_normalizer`` as keyword arguments in ``normalizers``; of a method that does not plan
-            ``build(task, section)`` with the planner's section.
-        phases (tuple of Phase): how it is trained.
+            reads (relative positions follow the last one), and ``state_normalizer`` and ``action_normalizer`` as
+            keyword arguments in ``normalizers``; for a method that does not plan ``build(task, section)`` with the
+            planner's section.
+        phases (tuple of Phase): its training phases.
         closed_form (bool): its decoder is fitted in closed form at the end.
-        sees (str): ``"all"`` windows, or ``"labelled"`` ones and nothing else, statistics of the states included.
-        plans (bool): it follows the plans of a planner; otherwise it has the planner's updates instead of one.
-        teacher (str): the method whose controller labels the rest of the data first.
-        presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
+        sees (str): ``"all"`` windows, or only ``"labelled"`` ones, also for statistics of the states.
+        plans (bool): it follows the plans of a planner; otherwise it is trained with the planner's number of updates.
+        teacher (str): the method whose controller labels the unlabelled data first.
+        presets (tuple of str): values of ``--preset`` that it can be built with; the first is its default.
         columns (str, optional): what its controller reads, ``"robot"`` or ``"all"``. Default: the task's.
-        updates (int, optional): of its controller. Default: the task's.
-        execution (mapping): fields of :class:`~torchrl_koap.modules.Execution` that are its own.
-        fit (callable, optional): ``fit(controller, data, updates) -> dict`` fits a controller that is no inverse
-            dynamics to flat data after the label budget was applied, in place of phases and closed form; returns
+        updates (int, optional): updates of its controller. Default: the task's.
+        execution (mapping): fields of :class:`~torchrl_koap.modules.Execution` that it sets.
+        fit (callable, optional): ``fit(controller, data, updates) -> dict``, in place of phases and closed form: fits a
+            controller that is not an inverse dynamics model to flat data after the label budget was applied; returns
             numbers for the summary.
-        phases_by_preset (mapping): the phases of a preset that is trained otherwise.
+        phases_by_preset (mapping): phases of presets that are trained differently.
 
     Raises:
-        ValueError: for a name that cannot be a folder's, two phases of one name, or an unknown default.
+        ValueError: for a name that cannot be a folder name, two phases of one name, or an unknown default.
 
     Examples:
         >>> from torchrl_koap.modules import LinearInverseDynamics
@@ -132,22 +132,22 @@ class Method:
             raise ValueError(f"the name of a method must be letters, digits, '_' and '.', got {self.name!r}")
         names = [phase.name for phase in self.phases]
         if len(set(names)) < len(names):
-            raise ValueError(f"phases of method {self.name!r} need names of their own, got {names}")
+            raise ValueError(f"phases of method {self.name!r} must have different names, got {names}")
         if not self.plans and len(names) != 1:
-            raise ValueError(f"a policy is trained in one phase, method {self.name!r} has {len(names)}")
+            raise ValueError(f"method {self.name!r} does not plan: it must have one phase, got {len(names)}")
         if self.fit is not None and (names or self.closed_form):
-            raise ValueError(f"method {self.name!r}: fit comes without phases or closed form")
+            raise ValueError(f"method {self.name!r}: fit excludes phases and closed_form")
         Execution().replaced(**self.execution)
 
     def phases_of(self, preset: str) -> tuple[Phase, ...]:
-        """Returns how it is trained with a preset."""
+        """Returns the training phases of a preset."""
         return self.phases_by_preset.get(preset, self.phases)
 
     def check_execution(self, asked: Execution | ExecutionConfig, usual: Execution) -> None:
-        """Raises a ValueError for options of plans that are asked, other than usual, of a method that has none."""
+        """Raises a ValueError if a method without plans is given plan options other than the usual ones."""
         for name in () if self.plans else ("strategy", "blend"):
             if getattr(asked, name) not in (None, getattr(usual, name)):
                 raise ValueError(
                     f"{name} {getattr(asked, name)!r} was asked of method {self.name!r}, which samples actions and"
-                    " executes chunks of them: there is no plan to follow"
+                    " executes chunks of them: it follows no plan"
                 )

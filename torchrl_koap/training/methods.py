@@ -1,23 +1,22 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Every method that the library compares, one entry each: the network, and what it is trained on.
+"""All methods that the library compares, one entry each: the network, and what it is trained on.
 
-A method from outside the package is registered the same way (:func:`register_method`) by a module that ``--plugin`` or
+A method from outside the package is registered the same way (:func:`register_method`), by a module that ``--plugin`` or
 an entry point of the group ``torchrl_koap.methods`` names.
 
-Fair by construction: all controllers get the same labelled windows and the same planner. Each has the execution and
-the number of updates that suited it best on demonstrations that no table uses (``benchmarks/tune_methods.py``).
-Two-stage methods share their updates between the stages. Networks that may look ahead read the same frames, 4 before
-and up to 5 after the present one, but for two that are defined otherwise: Decision Diffuser's controller (``dd``, and
-``relabel``, which is one trained on a teacher's actions) is told the next state, ``vae`` encodes the whole window.
-``dp`` and ``vpt`` have no planner and make its number of updates instead; relabelling costs the updates of the
-teacher besides.
+For a fair comparison, all controllers get the same labelled windows and the same planner. Each has the execution and
+the number of updates that were best on demonstrations that no table uses (``benchmarks/tune_methods.py``). Two-stage
+methods share their updates between the stages. Networks that may look ahead read the same frames, 4 before and up to 5
+after the present one. Two are defined differently: Decision Diffuser's controller (``dd``, and ``relabel``, the same
+trained on a teacher's actions) reads the next state only, ``vae`` encodes the whole window. ``dp`` and ``vpt`` have no
+planner and are trained with its number of updates. Relabelling also costs the updates of the teacher.
 
-One controller is no inverse dynamics and has nothing of KOAP: ``mpc`` follows plans by an identified model of how the
-robot answers commands.
+``mpc`` is the only controller that is not an inverse dynamics model and shares nothing with KOAP: it follows plans with
+an identified model of how the robot answers commands.
 
-Four controls say what the Koopman model itself adds: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
+Four controls show what the Koopman model itself adds: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
 none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
-``koap_untrained``, KOAP with random features, of which nothing but the decoder is fitted;
+``koap_untrained``, KOAP with random features, where only the decoder is fitted;
 ``pca``, a ridge on principal components of all windows, labelled or not.
 """
 
@@ -75,19 +74,19 @@ def _network(task, columns, normalizers, preset, *, kind):
 
 
 def without_actions(network: nn.Module) -> LossModule:
-    """KOAP's loss on states alone."""
+    """Makes KOAP's loss on states alone."""
     return KOAPLoss(network, action_coeff=0.0)
 
 
 _UNLABELLED = Phase("controller", without_actions)
 _LABELS = (Phase("controller", ActionLoss, "labelled"),)
 _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
-# the decoder that is fitted afterwards, on a frozen encoder
+# fits the decoder afterwards, with a frozen encoder
 _DECODER = Phase("decoder", partial(ActionLoss, freeze_latents=True), "labelled", share=0.5)
 _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
 
 _ANY_PRESET = tuple(PRESETS)
-_EVERY_STEP = {"strategy": "feedback", "gain": 1.0}  # they know the command that they gave, and how it is answered
+_EVERY_STEP = {"strategy": "feedback", "gain": 1.0}  # mpc knows its last command and predicts the robot's response
 _OPEN_LOOP = {"strategy": "open_loop"}
 _AS_PLANNED = _OPEN_LOOP | {"blend": 0.0}
 
@@ -95,7 +94,7 @@ METHODS: dict[str, Method] = {}
 
 
 def register_method(method: Method) -> Method:
-    """Adds a method, which ``koap train --method``, curves and reports then know by its name.
+    """Adds a method, which ``koap train --method``, curves and reports then find by its name.
 
     Args:
         method (Method): the method.
@@ -104,7 +103,7 @@ def register_method(method: Method) -> Method:
         Method: the same.
 
     Raises:
-        ValueError: if there is a method of that name already, or the methods that it names are unknown.
+        ValueError: if the name is taken, or the teacher is unknown or not a controller.
 
     Examples:
         >>> from torchrl_koap.training.methods import METHODS, register_method
@@ -236,7 +235,7 @@ for _method in (
 
 
 def get_method(name: str) -> Method:
-    """Looks a method up; the ValueError for an unknown name suggests the nearest."""
+    """Looks up a method; the ValueError for an unknown name suggests the nearest."""
     if name not in METHODS:
         entry_points_of(GROUP)
     return lookup(METHODS, name, "method")

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Networks of the options that a run keeps in ``config.json``; weights, or data, bring their statistics."""
+"""Builds networks from the options in ``config.json``; their statistics come from saved weights or from data."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from torchrl_koap.tasks import HORIZON, Task
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.policy_facts import state_reader
 
-WEIGHT_DECAY = 1e-4  # decoupled, of all networks that denoise
+WEIGHT_DECAY = 1e-4  # decoupled; of all denoisers
 
 
 def _unet(columns: int, condition_dim: int, *, width: int, frequencies: int, horizon: int) -> nn.Module:
     return TemporalUnet(columns, condition_dim, channels=(width, 2 * width), frequencies=frequencies)
 
 
-# the networks of planners, and what they are built and trained with where nothing else is asked for
+# networks of planners, with their default sizes and training options
 NETWORKS: dict[str, dict[str, Any]] = {
     "unet": {"build": _unet, "width": 64, "octaves": 4, "batch_size": 128, "learning_rate": 3e-3},
     "mlp": {"build": MLPDenoiser, "width": 512, "octaves": 1, "batch_size": 512, "learning_rate": 1e-3},
@@ -33,15 +33,14 @@ NETWORKS: dict[str, dict[str, Any]] = {
 
 
 def register_network(name: str, build: Callable[..., nn.Module], **defaults: float) -> None:
-    """Adds a network of planners and Diffusion Policy, which ``--planner.network`` then knows by its name.
+    """Adds a network for planners and Diffusion Policy, which ``--planner.network`` then finds by its name.
 
     Args:
         name (str): its name.
         build (callable): ``build(columns, condition_dim, width=, frequencies=, horizon=)``, the denoiser of a
             :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`: its width, the octaves of the condition
             and the frames of a sequence.
-        **defaults: ``width``, ``octaves``, ``batch_size`` and ``learning_rate`` where nothing else is asked for.
-            Default: those of ``"mlp"``.
+        **defaults: default ``width``, ``octaves``, ``batch_size`` and ``learning_rate``; else those of ``"mlp"``.
 
     Raises:
         ValueError: if there is a network of that name already, or for an unknown default.
@@ -62,7 +61,7 @@ def register_network(name: str, build: Callable[..., nn.Module], **defaults: flo
 
 
 def build_planner(task: Task, section: PlannerConfig) -> StatePlanner:
-    """Builds a planner of states without statistics, of a section with nothing left open."""
+    """Builds a planner of states without statistics, from a section with all defaults filled in."""
     return StatePlanner(**_diffusion(task, section, task.state_dim))
 
 
@@ -72,7 +71,7 @@ def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
 
 
 def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
-    """What planner and Diffusion Policy take alike, with a network for sequences of that many columns."""
+    """Returns the arguments that planner and Diffusion Policy share; the denoiser's sequences have ``size`` columns."""
     build = lookup(NETWORKS, section.network, "planner.network")["build"]
     pairs = task.relative_columns()
     features = RelativePositionFeatures(pairs) if pairs else None
@@ -92,9 +91,9 @@ def build_controller(
 ) -> nn.Module:
     """Builds a controller, with statistics of the data if these are given.
 
-    Preset and columns of the section must be known. The data are flat ``[N]`` as the controller sees them, after the
-    label budget was applied: state statistics come from all of it (of the labelled steps for a method that sees no
-    others), action statistics from the labelled steps alone.
+    Preset and columns of the section must be filled in. The data are flat ``[N]`` as the controller sees them, after
+    the label budget was applied. State statistics come from all steps (from labelled steps for a method that sees no
+    others), action statistics from labelled steps alone.
     """
     modes = lookup(PRESETS, section.preset, "preset")["normalization"]
     reader = state_reader(task, section)
@@ -110,12 +109,12 @@ def build_controller(
 
 
 def sizes_of(planner: StatePlanner) -> dict[str, Any]:
-    """Options that a planner was built with; a ValueError for one with a network from outside the library."""
+    """Returns the options that a planner was built with; a ValueError if its network is not of this library."""
     network = planner.denoiser
     unet = isinstance(network, TemporalUnet)
     if not isinstance(network, TemporalUnet | MLPDenoiser):
         raise ValueError(
-            f"planner: its denoiser is a {type(network).__name__}: register it (register_network), and give its name as"
+            f"planner: its denoiser is a {type(network).__name__}: register it (register_network), and name it as"
             ' {"network": NAME} instead'
         )
     width = network.shrink[0].out_channels if unet else network.first.out_features

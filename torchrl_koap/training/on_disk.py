@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The whole training: demonstrations and a label budget in, a run directory with planner and controller out."""
+"""The whole training, from demonstrations and a label budget to a run directory with planner and controller."""
 
 from __future__ import annotations
 
@@ -51,20 +51,20 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
     """Trains planner and controller, or a network that samples actions; ``koap train`` calls this.
 
     Args:
-        config (TrainConfig): what to train on what, and where to write it.
+        config (TrainConfig): the options.
 
     Keyword Args:
-        command (str, optional): how it was called, if from a shell; kept in ``config.json``.
-        planner_only (bool): train a planner alone, for other runs to take over (``planner.source``); all actions are
-            hidden before.
+        command (str, optional): the shell command that called it; kept in ``config.json``.
+        planner_only (bool): train only a planner, which other runs can use (``planner.source``); all actions are
+            hidden.
 
     Returns:
-        Trained: the networks; its ``results`` are also written to ``summary.json``: labels spent, sizes, losses.
+        Trained: the networks; its ``results`` are also written to ``summary.json``: labels used, sizes, losses.
 
     Raises:
         ValueError: for unknown options and budgets that select nothing.
-        RunDirectoryError: if the folder holds another run, one that was not asked to be resumed, or one that is being
-            worked on.
+        RunDirectoryError: if the folder holds another run, or this one without ``resume``, or if another process works
+            in it.
         PluginError: if a plugin cannot be imported.
 
     Examples:
@@ -84,8 +84,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
     """
     run = RunDirectory(given_options(config, TrainConfig).out)
     with ExitStack() as held:
-        mine = (run.path / ".lock").exists()  # a new folder is not made before the options are known to do
-        if mine:
+        locked = (run.path / ".lock").exists()  # a new folder is created only after all checks
+        if locked:
             held.enter_context(run.locked("koap train"))
         config = begun_with(run, config)
         load_plugins(config.run.plugins)
@@ -105,13 +105,13 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         if not planner_only:
             check_lengths(task, config, used)
         for_planner, unseen, data = split_held_out(used, held_out)
-        if not mine:
+        if not locked:
             held.enter_context(run.locked("koap train"))
-            check_resume(run, config)  # another one may have begun here in the meantime
-        if (run.path / "config.json").exists():  # what it was begun with says what it is; going on leaves options out
+            check_resume(run, config)  # another process may have started a run here since the first check
+        if (run.path / "config.json").exists():  # a resumed run keeps its first command, which has all options
             begun = run.read_json("config.json")
             command, content["versions"] = begun.get("command") or command, begun.get("versions") or versions()
-        # not before the data are known to be good: a wrong call leaves nothing
+        # only after the data were checked, so that a failed call leaves no files
         run.write_json("config.json", content | ({"command": command} if command else {}))
         covers, short = plan_coverage(used, task.control_hz)
         if short is not None:
@@ -129,12 +129,12 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             if planner_only:
                 found = {"planner": losses}
                 return Trained(task, config, planner, None, found, tuple(held_out), run.path, cameras)
-            torch.manual_seed(config.run.seed)  # the controller does not depend on where the planner is from
+            torch.manual_seed(config.run.seed)  # the controller is the same whether the planner was trained or loaded
             controller, results = learn_controller(task, config, data, loop)
             facts = facts_of("controller", task, config)
             save_tensors(run.path / "controller.safetensors", controller.state_dict(), facts)
         seconds = {"planner": planned - began, "controller": time.perf_counter() - planned}
-        updating = run.seconds()  # of a run that was resumed, this call knows the end alone
+        updating = run.seconds()  # of a resumed run, this call has timed only the last part
         seconds["planner"] = max(seconds["planner"], updating.pop("planner", 0.0))
         seconds["controller"] = max(seconds["controller"], sum(updating.values()))
         summary = {
@@ -147,13 +147,13 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             "planner": losses,
             **results,
         }
-        save_tensors(run.path / "demonstrations.safetensors", _drawn(task, used.cpu()))
+        save_tensors(run.path / "demonstrations.safetensors", _report_data(task, used.cpu()))
         run.write_json("summary.json", summary)
     return Trained(task, config, planner, controller, summary, tuple(held_out), run.path, cameras)
 
 
 def _check_networks(task: Task, config: TrainConfig) -> None:
-    """Finds networks that cannot read the task's state, and weights to take over that do not fit, before any work."""
+    """Raises, before any work, if networks cannot read the task's state or weights of ``planner.source`` do not fit."""
     done = config.run.resume and (config.out / "planner.safetensors").exists()
     with torch.random.fork_rng(devices=[]):
         build_networks(task, config)
@@ -162,9 +162,9 @@ def _check_networks(task: Task, config: TrainConfig) -> None:
 
 
 def planner_of_source(task: Task, config: TrainConfig) -> StatePlanner:
-    """Loads the planner of ``planner.source``, a run on this task or on another one of the same columns and rate.
+    """Loads the planner of ``planner.source``, a run on this task or on one with the same columns and control rate.
 
-    A CheckpointError says what does not fit.
+    A CheckpointError names what does not fit.
     """
     facts, source = facts_of("planner", task, config), RunDirectory(config.planner.source)
     about, planner = source.read_json("config.json"), build_planner(task, config.planner)
@@ -179,12 +179,12 @@ def planner_of_source(task: Task, config: TrainConfig) -> StatePlanner:
 def _read_data(
     task: Task, config: TrainConfig, planner_only: bool
 ) -> tuple[TensorDictBase, list[int], LabelReport | None]:
-    """The trajectories that are used, those that the planner does not see, a report of the labels seen."""
-    with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:  # read in a moment, but for thousands
+    """Returns the trajectories that are used, those that the planner does not see, a report of the labels seen."""
+    with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:  # only thousands take this long
         data, _ = open_dataset(config.dataset, task=task, progress=count_up_to(bar))
     planner, share, seed = config.planner, config.labels.trajectories, config.run.seed
     if planner_only:
-        # all cells of a curve share it, whichever labels they draw: only labels that there are count as such here
+        # all cells of a curve share this planner, so no label draw counts here, only which actions were recorded
         hidden = data.copy().set("action", torch.full_like(data["action"], torch.nan))
         hidden.set("has_action", torch.zeros_like(data["has_action"]))
         few = len(labelled_episodes(data)) <= share * len(data["episode"].unique())
@@ -193,17 +193,17 @@ def _read_data(
         held_out = choose_held_out(data[known], planner.held_out, seed=seed)
         return hidden[known].to(config.run.device), held_out, None
     labelled, report = within_budget(task, config, data)
-    # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
+    # independent of the seed: runs differ only in the trajectories with labels, which come first
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:
         return labelled, held_out_by(planner.source, labelled), report
     return labelled, choose_held_out(labelled, planner.held_out, seed=seed), report
 
 
-def _drawn(task: Task, data: TensorDictBase) -> dict[str, Tensor]:
-    """What pictures show of the demonstrations: states, which steps had a label, where tool and objects were."""
+def _report_data(task: Task, data: TensorDictBase) -> dict[str, Tensor]:
+    """Returns what reports draw of the demonstrations: states, labelled steps, positions of tool and objects."""
     shown = {"state": data["state"], "episode": data["episode"], "labelled": data["has_action"].squeeze(-1)}
-    if task.env is None:  # nobody knows what lies in a plane
+    if task.env is None:  # planar positions are known only for tasks with an environment
         return shown
     starts = [task.observation[part].start for part in (task.position, *(body.position for body in task.bodies))]
     tool, *objects = (data["observation"][:, start : start + 2].contiguous() for start in starts)
@@ -218,7 +218,7 @@ def _planner(
     held_out: TensorDictBase | None,
     loop: Phases,
 ) -> tuple[StatePlanner, dict[str, float]]:
-    """The planner: trained, taken over from another run, or loaded where that is done."""
+    """Returns the planner and its last losses: trained, taken from another run, or loaded if it is finished."""
     path, facts = run.path / "planner.safetensors", facts_of("planner", task, config)
     if path.exists() and config.run.resume:  # weights are written once, at the end of their phase
         planner = build_planner(task, config.planner).to(config.run.device)

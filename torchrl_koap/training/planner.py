@@ -35,21 +35,21 @@ from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner
 
-SITUATIONS, SAMPLES = 64, 4  # held out, and plans in each, that weights are chosen by
-MOST_WINDOWS = 400_000  # windows that statistics are taken of; fewer miss rare steps, which scale plans
-RECORDED = 8192  # windows, of which the nearest one is looked for
-CHECKS = 30  # scores in a training at most
-COST = 0.05  # share of the training time that they may take
-BLIND = 1000  # updates at most where there is nothing to hold out
+SITUATIONS, SAMPLES = 64, 4  # held-out situations, and plans in each, by which weights are chosen
+MOST_WINDOWS = 400_000  # windows for statistics at most; fewer would miss rare steps, which set the scale of plans
+RECORDED = 8192  # recorded windows at most in which the nearest one to a plan is searched
+CHECKS = 30  # scores per training at most
+COST = 0.05  # share of the training time for scores at most
+BLIND = 1000  # updates at most if nothing can be held out
 
 
 def learn_planner(
     task: Task, config: TrainConfig, data: TensorDictBase, loop: Phases, *, held_out: TensorDictBase | None = None
 ) -> tuple[StatePlanner, dict[str, float]]:
-    """Builds and trains a planner on flat data ``[N]`` with the whole ``state``; no action is looked at.
+    """Builds and trains a planner on flat data ``[N]`` with the whole ``state``; it does not read actions.
 
-    Its weights are chosen by trajectories that are held out, where there are some. Beside it, which has the average of
-    its parameters, stand its last losses.
+    Held-out trajectories, if any, choose its weights. Returns the planner, with averaged parameters, and its last
+    losses.
 
     Warns:
         UserWarning: if trajectories are to be held out and there is only one.
@@ -59,11 +59,11 @@ def learn_planner(
         section = replace(section, steps=min(section.steps, BLIND))
         warnings.warn(
             f"one trajectory is too few to hold any out (planner.held_out {section.held_out:g}): the planner trains for"
-            f" {section.steps} updates and nothing tells when it overfits",
+            f" {section.steps} updates, and overfitting cannot be detected",
             stacklevel=2,
         )
     planner = build_planner(task, section).to(config.run.device)
-    # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
+    # windows hold two observed frames even for a planner that reads one: augmentations find the present frame by them
     unseen = HISTORY - planner.history
     extended, windows = planned_windows(data)
     planner.fit_normalizers(windows[:, unseen:])
@@ -94,7 +94,7 @@ def learn_planner(
 
 
 def planned_windows(data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-    """Continues trajectories of flat data ``[N]`` behind their ends; beside them stand windows of states ``[M, T, d]``.
+    """Extrapolates trajectories of flat data ``[N]`` beyond their ends; returns them and state windows ``[M, T, d]``.
 
     A plan made near the end of a demonstration needs a future, one made at its start a repeated first frame.
     """
@@ -103,9 +103,9 @@ def planned_windows(data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
 
 
 def column_weights(task: Task) -> Tensor | None:
-    """Weights ``[d]`` of the state columns in a planner's loss: those of the robot, which are executed, sum to 1/3.
+    """Returns weights ``[d]`` of the state columns in a planner's loss: those of the robot, which executes, sum to 1/3.
 
-    None, all columns alike, where the robot has that share anyway, and in tasks with an environment.
+    None, all columns alike, if the robot has no column or at least a third of them, or the task has an environment.
     """
     columns, robot = task.state_dim, len(task.robot)
     if task.env is not None or not 0 < 3 * robot < columns:
@@ -116,9 +116,9 @@ def column_weights(task: Task) -> Tensor | None:
 
 
 def check_interval(section: PlannerConfig, solver_steps: int) -> int:
-    """Updates between two scores, so that scores take 5 % of the time.
+    """Returns the number of updates between two scores for which scores take 5 % of the time.
 
-    An update costs three forward passes in bfloat16, about as much as one in float32, a plan ``solver_steps`` of these.
+    An update costs three bfloat16 forward passes, about one in float32; a plan costs ``solver_steps`` of the latter.
     """
     updates = SITUATIONS * SAMPLES * solver_steps / section.batch_size
     return min(max(section.steps // CHECKS, math.ceil(updates / COST)), section.steps)
@@ -127,15 +127,15 @@ def check_interval(section: PlannerConfig, solver_steps: int) -> int:
 def plan_score(
     planner: StatePlanner, data: TensorDictBase, recorded: Tensor, task: Task
 ) -> Callable[[StatePlanner], float]:
-    """Makes the score of planners on trajectories that none learns from; smaller is better.
+    """Makes a function that scores planners on held-out trajectories; smaller is better.
 
-    It is the energy score of plans as a share of standing still's, times the square of how far they are from recordings
-    (:func:`relative_distance`). The energy score is best long before rollouts are: it rewards plans that spread, and
-    what is executed is one of them. The product orders planners nearly as rollouts do on Push-T and Avoiding, less so
-    on Meta-World, and not on Adroit's door (``benchmarks/planner_scores.py``).
+    The score is the energy score of plans, relative to that of standing still, times the squared distance of plans from
+    recordings (:func:`relative_distance`). The energy score alone is best long before rollouts are: it rewards plans
+    that spread, but only one of them is executed. The product ranks planners nearly as rollouts do on Push-T and
+    Avoiding, less so on Meta-World, and not on Adroit's door (``benchmarks/planner_scores.py``).
 
-    Flat data ``[N]`` have ``state``; recorded are windows ``[M, T, d]`` that end with the planner's horizon. Planners
-    have the frames of the one given.
+    Flat data ``[N]`` have ``state``; ``recorded`` are windows ``[M, T, d]`` that end with the planner's horizon. Scored
+    planners have the history and horizon of the given one.
     """
     length = planner.history + planner.horizon
     past = planner.history - 1
@@ -152,10 +152,10 @@ def plan_score(
 
 
 def augmentation(task: Task, windows: Tensor, *, actions: bool = False) -> TensorDictSequential:
-    """Makes what windows undergo before a planner, or a network that samples actions, learns from them.
+    """Makes the augmentations of training windows for a planner, or for a network that samples actions.
 
-    Raw states are windows ``[N, T, d]``. ``actions`` of the windows have to fit the states afterwards. Scenes are then
-    moved, and the robot displaced, only where every action names the state column that it moves.
+    ``windows`` are raw states ``[N, T, d]``. With ``actions``, actions must fit the augmented states: scenes are then
+    moved, and the robot displaced, only if every action names the state column that it moves.
     """
     moved_by = list(task.moved_columns()) if actions else None
     steps = []
@@ -168,7 +168,7 @@ def augmentation(task: Task, windows: Tensor, *, actions: bool = False) -> Tenso
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         sigma: float | Tensor | None = task.defaults.recovery
-        if sigma is None:  # what columns usually change in a control step
+        if sigma is None:  # the usual change of a column in a control step
             sigma = (windows[:, 1] - windows[:, 0]).square().mean(0).sqrt()
         steps.append(
             RecoveryAugmentation(

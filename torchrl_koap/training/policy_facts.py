@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a task says of its data to a controller, and of the robot to :func:`~torchrl_koap.modules.make_policy`."""
+"""Facts of a task about its data for controllers, and about the robot for :func:`~torchrl_koap.modules.make_policy`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchrl_koap.training.method import Method
 def policy_facts(
     task: Task, *, reads: StateReader | None = None, ranges: Sequence[Sequence[float] | None] | None = None
 ) -> dict[str, Any]:
-    """The facts of a task as keyword arguments of :func:`~torchrl_koap.modules.make_policy`.
+    """Returns the facts of a task as keyword arguments of :func:`~torchrl_koap.modules.make_policy`.
 
     ``reads`` is what the controller reads of states (default: all columns), ``ranges`` are those of
     :func:`command_ranges`.
@@ -42,9 +42,9 @@ def policy_facts(
 
 
 def commanded_columns(task: Task) -> dict[str, list[int]] | None:
-    """The columns of action, observation (``"commands"``) and state that belong to each command.
+    """Returns the columns of action, observation (``"commands"``) and state that belong to each command.
 
-    None where the observation does not repeat the command, or it is not known what it moves.
+    None if the observation does not repeat the command, or if it is not known what the command moves.
     """
     if task.command is None or not task.moves:
         return None
@@ -53,33 +53,33 @@ def commanded_columns(task: Task) -> dict[str, list[int]] | None:
 
 
 def decoded_commands(task: Task) -> dict[str, list[int]] | None:
-    """The columns of action and observation (``"commands"``) of the commands that controllers decode; None if none."""
+    """Returns action and observation (``"commands"``) columns of the commands that controllers decode, or None."""
     return _commands_of(task, task.delta_actions) if task.defaults.commands else None
 
 
 def _commands_of(task: Task, actions: Sequence[int]) -> dict[str, list[int]]:
-    """Action columns, and the observation columns that repeat their commands."""
+    """Returns action columns, and the observation columns that repeat their commands."""
     commands = range(task.observation_dim)[task.command_columns][: len(actions)]
     return {"commands": list(commands), "actions": list(actions)}
 
 
 def tells_commands(task: Task, method: Method) -> bool:
-    """Whether labels tell a method the commands that actions change: one that has a fit of its own reads changes."""
+    """Returns whether labels of a method include the commands that actions change; with ``fit`` it reads changes."""
     return task.defaults.commands and method.fit is None
 
 
 def with_commands(task: Task, data: TensorDictBase) -> TensorDictBase:
-    """Flat data ``[N]`` whose actions are the commands that they lead to, where controllers decode these.
+    """Replaces changes of commands in flat data ``[N]`` by the new commands, if controllers decode these.
 
-    The last command is the one that a label tells (``label_command``), or of the observation where none does. A
-    labelled step whose command is not known is none.
+    The last command is that of the label (``label_command``) if there is one, else of the observation. A labelled
+    step whose command is not known loses its label.
     """
     decoded = decoded_commands(task)
     if decoded is None:
         return data
     actions = decoded["actions"]
-    told = LABEL_COMMAND in data.keys()
-    last = data[LABEL_COMMAND][:, : len(actions)] if told else data[OBSERVATION][:, decoded["commands"]]
+    in_label = LABEL_COMMAND in data.keys()
+    last = data[LABEL_COMMAND][:, : len(actions)] if in_label else data[OBSERVATION][:, decoded["commands"]]
     commands = data[ACTION].clone()
     commands[:, actions] += last.to(commands.dtype)
     known = data[HAS_ACTION] & ~commands.isnan().any(-1, keepdim=True)
@@ -87,13 +87,13 @@ def with_commands(task: Task, data: TensorDictBase) -> TensorDictBase:
 
 
 def state_reader(task: Task, section: ControllerConfig) -> StateReader:
-    """Makes what a controller reads of states: its columns, and relative positions where these are asked for."""
+    """Makes the reader of states for a controller: its columns, and relative positions if they are asked for."""
     pairs = task.relative_columns() if section.columns == "related" else ()
     return StateReader(task.controller_columns(section.columns), RelativePositionFeatures(pairs) if pairs else None)
 
 
 def controller_data(task: Task, section: ControllerConfig, data: TensorDictBase) -> TensorDictBase:
-    """Flat data ``[N]`` of :func:`with_commands` as a controller sees them: what it reads, and actions as distances."""
+    """Converts flat data ``[N]`` of :func:`with_commands` to the states and actions (as distances) of a controller."""
     state, view = data[STATE], data.copy()
     if task.distances:
         view.set(ACTION, shift_actions(data[ACTION], state, task.distances, -1))
@@ -101,13 +101,13 @@ def controller_data(task: Task, section: ControllerConfig, data: TensorDictBase)
 
 
 def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]:
-    """Finds the range of the demonstrated commands.
+    """Returns the least and greatest demonstrated number of every action column.
 
-    Few labels show few directions: changes of commands reach as far either way, and on every axis, as the largest one
-    in their unit. An absolute command may be wherever a demonstration took the column that it is the target of.
+    Few labels show few directions. So changes of commands in one unit get the range of the largest of them, on every
+    axis and in both directions. The range of a target includes the demonstrated values of its state column.
 
-    Of flat data ``[N]`` after the label budget was applied, the least and greatest number of every action column are
-    returned, None for a gripper's and for one that never changes.
+    The data are flat ``[N]`` after the label budget was applied. None stands for a gripper and for a column that never
+    changes.
     """
     labelled, meanings = data[ACTION][data[HAS_ACTION].squeeze(-1)], list(task.actions.values())
     ranges: list[list[float] | None] = [None] * len(meanings)

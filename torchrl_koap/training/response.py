@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Fitting the response of a robot to its commands on the labelled steps, and on no others.
+"""Fits the response of a robot to its commands, on labelled steps only.
 
 A ridge regression of single steps comes first, then nonlinear least squares of predictions over several steps.
 """
@@ -19,26 +19,26 @@ from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.policy_facts import commanded_columns
 
-AHEAD = 12  # control steps that are predicted, in the fit and where labelled steps are left out
-PENALTY = 1e-5  # relative; larger ones shrink momentum, and plans are lost
-MOST = 4000  # stretches that are predicted; of more, so many are taken at equal distances
-STAY = 1e-3  # weight of a change of the coefficients, in mean steps per mean coordinate, against relative errors
+AHEAD = 12  # control steps that are predicted, in the fit and in cross-validation
+PENALTY = 1e-5  # relative; larger ones shrink momentum, and the robot cannot follow plans
+MOST = 4000  # stretches that are predicted at most, evenly spaced
+STAY = 1e-3  # weight of changes of the coefficients (unit: mean step per mean coordinate) against relative errors
 _ITERATIONS = 30
 _FOLDS = 5
-_LEAST = 9  # steps of a block, where a single stretch is cut
+_LEAST = 9  # fewest steps per fold when folds are blocks of a few stretches
 
 
 def tracked_columns(task: Task) -> dict[str, Any]:
-    """What a :class:`~torchrl_koap.modules.ResponseModel` is built with: which columns a task's actions move.
+    """Returns the arguments of a :class:`~torchrl_koap.modules.ResponseModel`: which columns a task's actions move.
 
     Raises:
         ValueError: if its observation does not repeat the last command, or it is not known what the actions move.
     """
     columns, gripper = commanded_columns(task), task.gripper
-    told = (
+    known = (
         range(task.action_dim) if columns is None else (*columns["actions"], *(() if gripper is None else gripper[:1]))
     )
-    rest = [name for column, name in enumerate(task.action_names) if column not in told]
+    rest = [name for column, name in enumerate(task.action_names) if column not in known]
     lacks = None
     if task.command is None:
         lacks = "its observation has no part that repeats the last command (Task.command)"
@@ -55,24 +55,24 @@ def tracked_columns(task: Task) -> dict[str, Any]:
 
 
 class LabelledSteps(NamedTuple):
-    """Steps whose commands are known, in the order of time."""
+    """Labelled steps, in the order of time."""
 
-    coordinates: Tensor  # what the model reads [n, J, f]
-    steps: Tensor  # what followed [n, J]
-    segment: Tensor  # number of the unbroken stretch that each one lies in [n]
-    known: Tensor  # whether the command itself is known, not its changes alone [n]
-    row: Tensor  # where it is in the data [n]
+    coordinates: Tensor  # inputs of the model [n, J, f]
+    steps: Tensor  # change of position in the next control step [n, J]
+    segment: Tensor  # number of its unbroken stretch [n]
+    known: Tensor  # whether the command itself is known, or only its changes [n]
+    row: Tensor  # its row in the data [n]
 
 
 class Stretches(NamedTuple):
-    """Stretches of labelled steps of equal length ``N``, to predict the measured positions of."""
+    """Stretches of labelled steps of equal length ``N``, whose measured positions are predicted."""
 
-    positions: Tensor  # measured before each [n, memory + 1, J], the present one last
-    command: Tensor  # the last one [n, J]
-    changes: Tensor  # that led to it [n, memory, J]
-    future: Tensor  # changes of the command to come [n, N, J]
-    measured: Tensor  # positions to come [n, N, J]
-    known: Tensor  # whether the command itself is known, or counted from an unknown place [n]
+    positions: Tensor  # measured before the stretch [n, memory + 1, J], the present one last
+    command: Tensor  # the last command [n, J]
+    changes: Tensor  # changes that led to it [n, memory, J]
+    future: Tensor  # future changes of the command [n, N, J]
+    measured: Tensor  # future positions [n, N, J]
+    known: Tensor  # whether the command itself is known, not only up to a constant [n]
 
 
 Rows = TypeVar("Rows", LabelledSteps, Stretches)
@@ -84,16 +84,15 @@ def take(rows: Rows, chosen: Tensor) -> Rows:
 
 
 def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any]:
-    """Fits a response to labelled steps of flat data ``[N]``; axes are coupled if stretches left out call for it.
+    """Fits a response to labelled steps of flat data ``[N]``; couples axes if cross-validation favours it.
 
-    A ridge regression of single steps is where the fit of predictions over up to 12 steps begins
-    (:func:`fit_predictions`).
+    The fit of predictions over up to 12 steps (:func:`fit_predictions`) starts from a ridge regression of single steps.
 
-    Where a trajectory has labels on parts of it only, its commands are hidden and the changes alone are known: every
-    such stretch then has an unknown offset of its own, which is taken out (fixed effects).
+    If only parts of a trajectory have labels, its commands are hidden and only their changes are known: every such
+    stretch then has an unknown offset, which is eliminated (fixed effects).
 
-    Returned are ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up to 12
-    steps, in the unit of the axes; None if there was too little to leave out.
+    Returns ``coupled``, ``labels_used`` and ``held_out_error``: the root mean square error of predictions over up to 12
+    steps, in the unit of the axes; None if there were too few steps for cross-validation.
 
     Raises:
         ValueError: if no stretch of labelled steps is long enough.
@@ -101,7 +100,7 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
     steps, changes = labelled_steps(response, data)
     if not len(steps.row):
         raise ValueError(
-            f"following plans by prediction needs {response.memory} labelled steps in a row at least, there are none"
+            f"following plans by prediction needs at least {response.memory} labelled steps in a row, there are none"
         )
     folds, found = _folds(steps), dict[bool, float]()
     for coupled in (False, True) if folds is not None else ():
@@ -123,12 +122,12 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
 
 
 def _around(values: Tensor, row: Tensor, first: int, last: int) -> Tensor:
-    """What stands in ``values [N, ...]`` from ``first`` to ``last`` steps behind rows ``[n]``, both included."""
+    """Returns ``values [N, ...]`` from ``first`` to ``last`` steps after rows ``[n]``, both included."""
     return values[row.unsqueeze(-1) + torch.arange(first, last + 1, device=row.device)]
 
 
 def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[LabelledSteps, Tensor]:
-    """The steps that may be fitted to, and the changes of the command ``[N, J]``, NaN where they are not known."""
+    """Returns the steps for the fit, and the changes of the command ``[N, J]``, NaN where they are not known."""
     memory, axes = response.memory, response.num_axes
     episode, labelled = data[EPISODE], data[HAS_ACTION].reshape(-1)
     positions = data[STATE][:, response.states].double()
@@ -140,14 +139,14 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
         changes = action
         after = data[OBSERVATION][:, response.commands].double() + changes
     row = torch.arange(memory, len(episode) - 1, device=episode.device)
-    measured, told = (~values.isnan().any(-1) for values in (positions, changes))
-    good = _around(measured, row, -memory, 1).all(-1) & _around(told, row, -memory, -1).all(-1)
+    measured, commanded = (~values.isnan().any(-1) for values in (positions, changes))
+    good = _around(measured, row, -memory, 1).all(-1) & _around(commanded, row, -memory, -1).all(-1)
     row = row[good & (episode[row - memory] == episode[row + 1])]
     broken = torch.ones_like(row, dtype=torch.bool)
-    broken[1:] = row.diff() != 1  # before each row of an episode some are left out
+    broken[1:] = row.diff() != 1  # also at a new episode, whose first `memory` rows are left out
     segment = broken.cumsum(0) - 1
     known = ~after[row - 1].isnan().any(-1)
-    # where the command is hidden, it is counted from the beginning of the stretch
+    # a hidden command is summed up from the beginning of its stretch
     total = changes[row - 1].cumsum(0)
     counted = total - (total - changes[row - 1])[broken][segment]
     command = torch.where(known.unsqueeze(-1), after[row - 1], counted)
@@ -160,7 +159,7 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
 def _fit(
     response: ResponseModel, data: TensorDictBase, steps: LabelledSteps, changes: Tensor, *, coupled: bool
 ) -> None:
-    """A ridge after the means of the stretches with unknown commands were taken out, then predictions of many steps."""
+    """Fits a ridge, without the means of stretches with unknown commands, then predictions over many steps."""
     read, wanted = steps.coordinates, steps.steps
     if not steps.known.all():
         _, group, size = steps.segment.unique(return_inverse=True, return_counts=True)
@@ -175,7 +174,7 @@ def _fit(
 
 
 def _folds(steps: LabelledSteps) -> Tensor | None:
-    """Stretches to leave out together ``[n]``; a single one is cut into blocks. None if there is too little."""
+    """Returns the fold of each step ``[n]``: whole stretches, or blocks if these are few. None for too few steps."""
     count = int(steps.segment[-1]) + 1
     if count >= _FOLDS:
         return steps.segment % _FOLDS
@@ -185,7 +184,7 @@ def _folds(steps: LabelledSteps) -> Tensor | None:
 
 
 def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSteps, changes: Tensor) -> Stretches:
-    """What follows every second step that has as many labelled ones after it, :data:`AHEAD` where they are in a row."""
+    """Cuts a stretch at every second step: :data:`AHEAD` labelled steps, or the longest unbroken row if shorter."""
     row, memory = steps.row, response.memory
     length = min(AHEAD, int(steps.segment.bincount().max()))
     enough = torch.zeros_like(row, dtype=torch.bool)
@@ -198,17 +197,17 @@ def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSte
         _around(positions, row, -memory, 0),
         positions[row] + start.coordinates[..., memory],  # the lead
         _around(changes, row, -memory, -1),
-        _around(changes, row, 0, length - 1).nan_to_num(0.0),  # the last has no effect
+        _around(changes, row, 0, length - 1).nan_to_num(0.0),  # the last change has no effect
         _around(positions, row, 1, length),
         start.known,
     )
 
 
 def prediction_errors(response: ResponseModel, stretches: Stretches, weight: Tensor | None = None) -> Tensor:
-    """Errors of predicted positions ``[n, N, J]``, in the unit of the axes; gradients pass through the weight.
+    """Returns errors of predicted positions ``[n, N, J]``, in the unit of the axes; differentiable in the weight.
 
-    A command that is counted from an unknown place is wrong by a constant. Its effect is linear: only what no constant
-    explains is an error (fixed effects).
+    A hidden command is known up to a constant, whose effect is linear. The error is the part that no constant explains
+    (fixed effects).
     """
     given = stretches.positions, stretches.command, stretches.changes, stretches.future
     error = response.predict(*given, weight=weight) - stretches.measured
@@ -218,17 +217,17 @@ def prediction_errors(response: ResponseModel, stretches: Stretches, weight: Ten
     still, constants = error.new_zeros(axes, memory + 1, axes), torch.eye(axes).to(error)
     effect = response.predict(still, constants, still[:, 1:], still.new_zeros(axes, steps, axes), weight=weight)
     effect = effect.flatten(1)
-    with torch.no_grad():  # at the best constants the errors do not change with them to first order
+    with torch.no_grad():  # at the best constants, the gradient of the squared errors with respect to them is zero
         best = torch.linalg.lstsq(effect.T, error.flatten(1).T).solution.T * ~stretches.known.unsqueeze(-1)
     return error - (best @ effect).view_as(error)
 
 
 def fit_predictions(response: ResponseModel, stretches: Stretches, *, coupled: bool) -> None:
-    """Changes the coefficients such that positions are predicted best over the whole stretches (simulation error).
+    """Refines the coefficients such that positions are predicted best over whole stretches (simulation error).
 
-    A fit to single steps takes what it cannot explain for a shorter memory or a weaker pull of the command; the error
-    then grows with every step that is predicted. Coefficients stay near the ones that the response has
-    (:data:`STAY`), where stretches tell little; without any, nothing changes. Coupled axes have cross-axis terms.
+    A fit to single steps explains residuals by a shorter memory or a weaker pull of the command; the error then grows
+    with every predicted step. Coefficients that the stretches determine poorly stay near their present values
+    (:data:`STAY`); without stretches nothing changes. Coupled axes have cross-axis terms.
     """
     if not len(stretches.known):
         return

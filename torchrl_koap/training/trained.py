@@ -43,12 +43,11 @@ class Trained:
 
     Args:
         task (Task): the task.
-        config (TrainConfig): its options, nothing left open.
-        planner (StatePlanner, optional): None for a method that samples actions, or where only a controller was
-            trained.
-        controller (nn.Module, optional): the controller, or the network that samples actions; None where only a planner
+        config (TrainConfig): its options, with all defaults filled in.
+        planner (StatePlanner, optional): None for a method that samples actions, or if only a controller was trained.
+        controller (nn.Module, optional): the controller, or the network that samples actions; None if only a planner
             was trained.
-        results (mapping): last losses, labels spent and what a closed form found, as in ``summary.json``.
+        results (mapping): last losses, labels used and results of a closed form, as in ``summary.json``.
         held_out (tuple of int): trajectories that the planner has never seen.
         folder (Path, optional): the run directory or file that it was loaded from.
         cameras (mapping): projection of every camera whose embeddings are columns of the task.
@@ -69,7 +68,7 @@ class Trained:
     folder: Path | None = None
     cameras: Mapping[str, Projection] = field(default_factory=dict)
 
-    def __repr__(self) -> str:  # the fields' own fill pages
+    def __repr__(self) -> str:  # without the networks, which fill pages
         where = self.folder and str(self.folder)
         return f"Trained(task={self.task.name!r}, method={self.config.method!r}, folder={where!r})"
 
@@ -77,11 +76,11 @@ class Trained:
     def load(cls, where: str | Path, *, plugins: Sequence[str] = ()) -> Trained:
         """Loads a run directory, ``"pretrained:NAME"``, or a file of :meth:`save`.
 
-        Plugins are modules that register the task or method, or hold the network that embeds frames. Those of a run are
-        imported first; a file cannot have them imported itself. Files among them replace recorded ones of their names.
+        Plugins are modules that register the task or method, or define the network that embeds frames. A run directory
+        also imports those that it names, a file does not. A plugin file replaces a recorded one of the same name.
 
         Raises:
-            RunDirectoryError: if the folder is no finished run.
+            RunDirectoryError: if the folder is not a finished run.
             CheckpointError: if weights, or the file, are missing, damaged, of another task or of other options.
             PluginError: if a plugin cannot be imported.
         """
@@ -106,7 +105,7 @@ class Trained:
             raise RunDirectoryError(f"{path / 'config.json'} cannot be used: {problem}") from error
         if not (path / "summary.json").exists():  # it is written last
             how = f"`koap train --out {shlex.quote(str(path))} --resume`"
-            raise RunDirectoryError(f"the training of {path} is not finished (no summary.json): go on with {how}")
+            raise RunDirectoryError(f"the training of {path} is not finished (no summary.json): resume it with {how}")
         for name, module in {"planner": planner, "controller": controller}.items():
             if module is not None:
                 load_weights(path / f"{name}.safetensors", module, facts_of(name, task, config))
@@ -118,7 +117,7 @@ class Trained:
     def _from_file(cls, path: Path, plugins: Sequence[str]) -> Trained:
         tensors, about = load_tensors(path)
         if about.get("format") != FORMAT:
-            raise CheckpointError(f"{path} is no policy that Trained.save() wrote")
+            raise CheckpointError(f"{path} is not a policy that Trained.save() wrote")
         if about.get("version") != VERSION:
             raise CheckpointError(f"{path} is a policy of format {about.get('version')}, this version reads {VERSION}")
         try:
@@ -133,8 +132,8 @@ class Trained:
         load_parts(path, tensors, {"planner": planner, "controller": controller})
         code = {Path(facts["network"].rpartition(":")[0]).name for facts in about.get(CAMERAS, {}).values()}
         code -= {"", *(Path(name).name for name in plugins)}
-        if code:  # a file that somebody sent must not decide what is run
-            raise CheckpointError(f"{path} embeds frames by code of {some(sorted(code))}: name it in plugins")
+        if code:  # a file from elsewhere must not choose which code runs
+            raise CheckpointError(f"{path} embeds frames with code of {some(sorted(code))}: name it in plugins")
         results = {"command_ranges": about.get("command_ranges")}
         cameras = {
             name: Projection(tensors[f"{CAMERAS}.{name}.mean"], tensors[f"{CAMERAS}.{name}.components"], facts)
@@ -143,7 +142,7 @@ class Trained:
         return cls(task, config, planner, controller, results, folder=path, cameras=cameras)
 
     def save(self, path: str | Path) -> Path:
-        """Writes networks and options to one file, in one step, from which :meth:`load` makes the same without data.
+        """Writes networks and options atomically to one file, from which :meth:`load` restores them without data.
 
         Raises:
             IsADirectoryError: if the path is a folder.
@@ -183,7 +182,7 @@ class Trained:
 
     @property
     def execution(self) -> Execution:
-        """Default options of how its plans become actions."""
+        """Default options for turning plans into actions."""
         return self.config.execution.on(Execution())
 
     def policy(
@@ -192,19 +191,19 @@ class Trained:
         """Makes a policy of the networks: observations in, an action per control step out.
 
         Args:
-            execution (Execution or ExecutionConfig, optional): how plans become actions; what is None, as it was
-                trained for.
+            execution (Execution or ExecutionConfig, optional): how plans become actions. Fields that are None keep
+                the values of the training.
 
         Keyword Args:
             follower (Follower, optional): follows plans in place of the controller.
 
         Returns:
-            PlanningPolicy: in evaluation mode. A :class:`~torchrl_koap.modules.PolicyEnv` hands it what it reads; an
-            :class:`~torchrl_koap.modules.Agent` keeps that itself.
+            PlanningPolicy: in evaluation mode. A :class:`~torchrl_koap.modules.PolicyEnv` passes it the past that it
+            reads; an :class:`~torchrl_koap.modules.Agent` stores that itself.
 
         Raises:
-            ValueError: as :func:`~torchrl_koap.modules.make_policy`, for a strategy of plans where actions are sampled,
-                or where a planner or a controller was trained alone.
+            ValueError: as :func:`~torchrl_koap.modules.make_policy`, for a plan strategy with a method that samples
+                actions, or if only a planner or a controller was trained.
         """
         if not isinstance(execution, Execution):
             execution = given_options(execution, ExecutionConfig).on(self.execution)
@@ -218,14 +217,14 @@ class Trained:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
         self.method.check_execution(execution, self.execution)
         if follower is not None:
-            raise ValueError(f"method {self.method.name!r} samples actions: there is no plan for a follower")
+            raise ValueError(f"follower: method {self.method.name!r} samples actions and makes no plans to follow")
         return make_policy(self.controller, **facts, execution=execution)
 
     def data(self, dataset: str | None = None) -> TensorDictBase:
         """Reads the demonstrations of the training with all labels; ``dataset`` is their folder if it has moved.
 
         Raises:
-            RunDirectoryError: if they are not there.
+            RunDirectoryError: if they are missing.
         """
         where = dataset or self.config.dataset
         if where is None or not Path(where).is_dir() and find_format(where) is None:
@@ -233,7 +232,7 @@ class Trained:
         return open_dataset(where, task=self.task)[0]
 
     def names(self, data: TensorDictBase, dataset: str | None = None) -> dict[int, str]:
-        """What the trajectories of :meth:`data` were read from, by number; empty where the data set does not say."""
+        """Returns the source of each trajectory of :meth:`data`, by number; empty if the data set records none."""
         numbers = data["episode"].unique_consecutive().tolist()
         return dict(zip(numbers, source_names(dataset or self.config.dataset or ""), strict=False))
 
@@ -242,10 +241,10 @@ class Trained:
         return controller_data(self.task, self.config.controller, with_commands(self.task, data))
 
     def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
-        """Hides all labels of :meth:`data` that the training did not see: their actions are NaN; the budget reports.
+        """Hides all labels of :meth:`data` that the training did not see (NaN actions); also returns a report.
 
         Raises:
-            RunDirectoryError: if they are not the demonstrations that it was trained on.
+            RunDirectoryError: if they are not the demonstrations of the training.
         """
         hidden, report = within_budget(self.task, self.config, data)
         if "labels" not in self.results:
@@ -253,7 +252,7 @@ class Trained:
         recorded = self.results["labels"]
         if {name: vars(report).get(name) for name in recorded} != recorded:
             raise RunDirectoryError(
-                f"the data set at hand is not the one that {self.folder} was trained on: its trajectories or labels"
+                f"the given data set is not the one that {self.folder} was trained on: its trajectories or labels"
                 " differ"
             )
         return hidden, report
@@ -262,7 +261,7 @@ class Trained:
 def build_networks(task: Task, config: TrainConfig) -> tuple[StatePlanner | None, nn.Module]:
     """Builds the networks of a resolved configuration without weights, in evaluation mode.
 
-    The first is the planner, None for a method that samples actions; the second controls, or samples them.
+    Returns the planner (None for a method that samples actions), and the network that controls or samples actions.
 
     Raises:
         ValueError: for unknown names, or networks that cannot read the task's state.
@@ -274,7 +273,7 @@ def build_networks(task: Task, config: TrainConfig) -> tuple[StatePlanner | None
 
 
 def facts_of(part: str, task: Task, config: TrainConfig) -> dict[str, Any]:
-    """What a file of weights, of ``"planner"`` or ``"controller"``, says about them: the options of their network."""
+    """Returns the network options that a weights file of ``"planner"`` or ``"controller"`` records."""
     planner = {f"planner.{name}": getattr(config.planner, name) for name in ("network", "width", "frames")}
     if part == "planner":
         return {"task": task.name} | planner
