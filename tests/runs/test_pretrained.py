@@ -94,7 +94,7 @@ def test_nothing_is_written_beside_them(policies, tmp_path, capfd, monkeypatch):
     capfd.readouterr()
     for command in ("eval", "inspect", "export"):
         assert koap(command, "pretrained:avoiding") == 1
-        assert "nothing is written into pretrained:avoiding: name a folder" in capfd.readouterr().err
+        assert "nothing is written into pretrained:avoiding: choose another folder" in capfd.readouterr().err
 
 
 def test_another_run_is_not_overwritten(trained_run, tmp_path):

@@ -104,7 +104,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     with pytest.raises(CheckpointError, match="is damaged"):
         load_tensors(tmp_path / "text")
     weights.save_file({"x": torch.ones(1)}, tmp_path / "facts", metadata={"about": "[1]"})
-    with pytest.raises(CheckpointError, match="its facts are no object"):
+    with pytest.raises(CheckpointError, match="its header entry .about. must be an object"):
         load_tensors(tmp_path / "facts")
 
 

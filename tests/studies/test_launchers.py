@@ -61,8 +61,8 @@ def be_killed():
 DEATHS = {
     "raises": (lambda: raises("no such thing\nand more"), "RuntimeError: no such thing"),
     "killed": (be_killed, "killed by the system (signal 9): probably out of memory; try fewer --workers"),
-    "leaves": (lambda: os._exit(3), "its process ended without a word (exit code 3)"),
-    "aborts": (os.abort, "its process ended without a word (signal 6, Aborted)"),
+    "leaves": (lambda: os._exit(3), "its process ended without an error message (exit code 3)"),
+    "aborts": (os.abort, "its process ended without an error message (signal 6, Aborted)"),
     "memory": (out_of_memory, "MemoryError"),
     "talkative": (lambda: raises("x" * 200_000), f"RuntimeError: {'x' * 500}"),
 }
@@ -143,7 +143,7 @@ def test_a_job_without_a_place_for_its_log_fails_with_a_reason(tmp_path, capfd):
     [
         ({"launcher": "lokal"}, "unknown launcher 'lokal'; did you mean 'local'?"),
         ({"workers": 0}, "workers must be >= 1, got 0"),
-        ({"address": "10.0.0.1:6379"}, "launcher 'local' works on this machine alone"),
+        ({"address": "10.0.0.1:6379"}, "launcher 'local' uses only this machine"),
     ],
 )
 def test_machines_that_there_are_not_are_refused(options, message):

@@ -132,7 +132,7 @@ def test_cells_without_outcomes_are_not_compared(tmp_path):
     text = Page(write_study_report(tmp_path, rows, dict(list(outcomes.items())[2:]), title="t")).text
     nothing = [row for row in read_comparisons(tmp_path) if row["labels"] == "0.01"]
     assert [(row["n"], row["p"], row["p_holm"]) for row in nothing] == [("0", "", "")] * 2
-    assert "nothing in common" in text
+    assert "no common rollouts" in text
 
 
 def test_report_without_any_done_cell(tmp_path):

@@ -167,7 +167,7 @@ def test_the_same_demonstrations_may_lie_elsewhere(curve, demonstrations, tmp_pa
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, capsys):
     (tmp_path / "thesis.tex").write_text("precious")
-    assert "is not empty and no folder of `koap curve`" in fails(capsys, *command_of(tmp_path, demonstrations))
+    assert "is not empty and not a folder of `koap curve`" in fails(capsys, *command_of(tmp_path, demonstrations))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     assert "thesis.tex is no folder" in fails(capsys, *command_of(tmp_path / "thesis.tex", demonstrations))
 
@@ -191,7 +191,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
         ({"preset": "table3"}, "unknown preset 'table3'; did you mean 'table"),
         ({"methods": ("koap", "dp"), "execution.blend": 0.5}, "blend 0.5 was asked of method 'dp', which samples"),
         ({"execution.replan_interval": 15}, "replan_interval must be in 1..14"),
-        ({"tasks": ("avoiding", "sorting")}, "datasets must be TASK=FOLDER where there are several tasks"),
+        ({"tasks": ("avoiding", "sorting")}, "datasets must be TASK=FOLDER if there are several tasks"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line_before_any_work(

@@ -81,7 +81,7 @@ def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations
         asked(methods=("koap",), planners=(sorting,))
     assert not study.out.exists()
     wide = PlannerConfig(width=64)
-    with pytest.raises(ValueError, match="planner options are not for a study that trains no planner"):
+    with pytest.raises(ValueError, match="planner options have no effect"):
         asked(methods=("koap",), planners=("pretrained:avoiding",), planner=wide)
     asked(methods=("koap", "dp"), planners=("pretrained:avoiding",), planner=wide)  # of dp
     named, _ = asked(methods=("koap",), planners=("pretrained:avoiding",))

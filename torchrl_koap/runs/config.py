@@ -21,7 +21,7 @@ from torchrl_koap.runs.run_directory import find_run
 from torchrl_koap.tasks import HISTORY
 
 COLUMNS = ("robot", "all", "related")
-# what a number has to be, in words and as a test
+# conditions on numbers, in words and as a function
 _POSITIVE, _COUNT, _FROM_0 = ("> 0", lambda v: v > 0), (">= 1", lambda v: v >= 1), (">= 0", lambda v: v >= 0)
 _FRAMES = (f">= 1 and <= {HISTORY}", lambda v: 1 <= v <= HISTORY)
 _SHARE, _PART = ("> 0 and <= 1", lambda v: 0 < v <= 1), (">= 0 and < 1", lambda v: 0 <= v < 1)
@@ -32,7 +32,7 @@ _Options = TypeVar("_Options")
 
 @dataclass(frozen=True)
 class LabelConfig:
-    """Which labels of the data may be seen; by default all that there are.
+    """Which labels of the data may be seen; by default all.
 
     Attributes:
         fraction: share of the units that keep their actions.
@@ -56,7 +56,7 @@ class LabelConfig:
         _check("labels", self, trajectories=_SHARE)
 
     def budget(self, seed: int = 0) -> LabelBudget:
-        """Makes the budget that draws and hides."""
+        """Makes the label budget with these options."""
         drawn: dict[str, Any] = {"episodes": self.episodes or None, "unit": self.unit}
         return LabelBudget(fraction=self.fraction, count=self.count, seed=seed, **drawn)
 
@@ -191,7 +191,7 @@ class TrainConfig:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self):
-        object.__setattr__(self, "out", Path(self.out))  # so that a string will do in Python
+        object.__setattr__(self, "out", Path(self.out))  # accepts a string in Python
         for section in fields(self):
             kind: Any = section.default_factory
             given = getattr(self, section.name)
@@ -200,7 +200,7 @@ class TrainConfig:
 
 
 def _check(section: str, config: object, **wanted: tuple[str, Callable[[float], bool]]) -> None:
-    """Refuses numbers that are not what is wanted; None is left out."""
+    """Raises a ValueError for numbers that do not meet their condition; None is skipped."""
     for name, (words, fits) in wanted.items():
         value = getattr(config, name)
         if value is None:
@@ -209,17 +209,17 @@ def _check(section: str, config: object, **wanted: tuple[str, Callable[[float], 
             raise ValueError(f"{section}.{name} must be a number {words}, got {value!r}")
         if not (math.isfinite(value) and fits(value)):
             raise ValueError(f"{section}.{name} must be {words}, got {value}")
-        if (words, fits) in _WHOLE:  # torch takes neither 1e4 nor NumPy's numbers
+        if (words, fits) in _WHOLE:  # torch accepts neither 1e4 nor NumPy numbers as counts
             if value % 1:
                 raise ValueError(f"{section}.{name} must be a whole number, got {value}")
             object.__setattr__(config, name, int(value))
 
 
 def given_options(given: Any, kind: type[_Options]) -> _Options:
-    """Returns the options that a function was given, or the defaults of their kind where it was given None.
+    """Returns the given options, or the defaults of their class if they are None.
 
     Raises:
-        TypeError: for anything else, such as a number or a folder; the message names the kind.
+        TypeError: for anything else, such as a number or a folder; the message names the class.
     """
     if given is None:
         return kind()

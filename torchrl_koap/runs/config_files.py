@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Options as JSON: read into the dataclasses that they were written from, and refused with file and name otherwise."""
+"""Options as JSON: read back into their dataclasses; errors name the file and the option."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 Config = TypeVar("Config")
-# beside the options in config.json
+# entries of config.json that are not options
 FACTS = ("task_definition", "data", "held_out_episodes", "held_out_states", "versions", "command")
 _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
 
 
 def read_config(run: RunDirectory) -> TrainConfig:
-    """Reads the options of a run; a RunDirectoryError names file and entry that are not there or damaged."""
+    """Reads the options of a run; a RunDirectoryError names a file or entry that is missing or damaged."""
     content = run.read_json("config.json")
     for field in fields(TrainConfig):
         if field.name not in content:
@@ -34,13 +34,13 @@ def read_config(run: RunDirectory) -> TrainConfig:
 
 
 def to_json(config: Any) -> dict[str, Any]:
-    """Returns options as ``json`` reads them, section by section; infinity, which JSON does not know, as ``"inf"``."""
+    """Returns options as JSON objects, section by section; infinity, which JSON lacks, becomes ``"inf"``."""
     text = json.dumps(asdict(config), default=os.fspath)
     return json.loads(text, parse_constant=lambda word: word.replace("Infinity", "inf"))
 
 
 def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
-    """Makes a dataclass, and those that are its sections, of a JSON object; what is left out keeps its default.
+    """Makes a dataclass and its sections from a JSON object; missing options keep their defaults.
 
     A RunDirectoryError names the file and an option that is unknown, of another type or out of range.
     """
@@ -51,14 +51,14 @@ def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of Python and of the packages that results depend on, and a checksum of our own code."""
+    """Returns the versions of Python and of the packages that results depend on, and a checksum of this package."""
     known = {"python": platform.python_version(), "code": code_checksum()}
     return known | {name: version_of(name) for name in _PACKAGES}
 
 
 @functools.cache
 def code_checksum(root: Path = Path(__file__).parents[1]) -> str:
-    """Computes the checksum of the modules of this package, which change in a checkout without another version."""
+    """Computes a checksum of this package's modules, which change in a checkout while the version stays the same."""
     digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
         digest.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
@@ -67,7 +67,7 @@ def code_checksum(root: Path = Path(__file__).parents[1]) -> str:
 
 @functools.cache
 def version_of(package: str) -> str:
-    """Returns the version of an installed package, or "MISSING", as of a checkout on ``PYTHONPATH``."""
+    """Returns the version of a package, or "MISSING" if it is not installed, as a checkout on ``PYTHONPATH``."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -75,7 +75,7 @@ def version_of(package: str) -> str:
 
 
 def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
-    """Returns the names of the options, with their sections, in which two configurations of one kind differ."""
+    """Returns the names, with sections, of the options in which two configurations of one class differ."""
     changed = []
     for field in fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
@@ -87,9 +87,9 @@ def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
 
 
 def fill_in(asked: Config, known: Any) -> Config:
-    """Puts known options in place of those that are at their defaults, likewise in every section.
+    """Replaces options that have their default values by known ones, also in every section.
 
-    They are a dataclass, or by name, sections in mappings of their own; some may be missing.
+    ``known`` is a dataclass, or a mapping by name with a mapping for each section; options may be missing.
     """
     known = known if isinstance(known, Mapping) else vars(known)
     found = {}

@@ -10,31 +10,31 @@ from collections.abc import Iterator
 
 import torch
 
-# matrix products of a denoiser in training; None leaves them as its weights are
+# number type of a denoiser's matrix products in training; None: that of its weights
 DTYPES = {"float32": None, "bfloat16": torch.bfloat16}
 PRECISIONS = (*DTYPES, "auto")
 _MOST_THREADS = 1024
-_BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat16 matrices say of themselves
+_BFLOAT16 = ("amx_bf16", "avx512_bf16")  # flags of processors that multiply bfloat16 matrices
 
 
 def find_precision(precision: str, device: str | torch.device = "cpu") -> str:
-    """Says what "auto" means on a device: "bfloat16" where it has units for it, else "float32".
+    """Resolves "auto" for a device: "bfloat16" if it has units for it, else "float32".
 
-    A warning says where bfloat16, asked for by name, is emulated.
+    Warns if "bfloat16" was asked for by name and is emulated.
     """
     if precision == "float32":
         return precision
-    quick = has_bfloat16_units(device)
+    fast = has_bfloat16_units(device)
     if precision == "auto":
-        return "bfloat16" if quick else "float32"
-    if not quick:
-        told = f"precision 'bfloat16': {torch.device(device).type} has no units for it and emulates it"
-        warnings.warn(f"{told}, many times slower than 'float32'; 'auto' takes what is quick", stacklevel=2)
+        return "bfloat16" if fast else "float32"
+    if not fast:
+        message = f"precision 'bfloat16': {torch.device(device).type} has no units for it and emulates it"
+        warnings.warn(f"{message}, many times slower than 'float32'; 'auto' chooses the faster one", stacklevel=2)
     return precision
 
 
 def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
-    """Whether a device, ``"cpu"`` or ``"cuda"``, multiplies bfloat16 matrices itself."""
+    """Returns whether a device, ``"cpu"`` or ``"cuda"``, has hardware that multiplies bfloat16 matrices."""
     if torch.device(device).type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     features = torch.cpu.get_capabilities()
@@ -42,13 +42,13 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
 
 
 def default_threads() -> int:
-    """Threads of a training: what ``OMP_NUM_THREADS`` says, else 1, since two beside another program wait for it."""
+    """Returns the default number of threads: ``OMP_NUM_THREADS``, else 1, as two would wait for other programs."""
     return torch.get_num_threads() if os.environ.get("OMP_NUM_THREADS") else 1
 
 
 @contextlib.contextmanager
 def torch_as_before() -> Iterator[None]:
-    """Gives torch its threads and random numbers back at the end: the caller's program goes on with them."""
+    """Restores torch's number of threads and random state at the end of the block, for the calling program."""
     threads = torch.get_num_threads()
     devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []
     try:
@@ -59,7 +59,7 @@ def torch_as_before() -> Iterator[None]:
 
 
 def set_up_torch(threads: int | None, device: str) -> None:
-    """Sets the number of threads, None leaves it as it is; refuses a device that this machine does not have."""
+    """Sets the number of threads unless it is None; raises a ValueError if this machine lacks the device."""
     check_machine(threads, device)
     kind, _, index = device.partition(":")
     if kind == "cuda" and not torch.cuda.is_available():
@@ -71,7 +71,7 @@ def set_up_torch(threads: int | None, device: str) -> None:
 
 
 def check_machine(threads: int | None, device: str) -> None:
-    """Refuses a number of threads and a name of a device that no machine has."""
+    """Raises a ValueError for a number of threads or a device name that no machine has."""
     if threads is not None and not 1 <= threads <= _MOST_THREADS:
         raise ValueError(f"threads must be 1 to {_MOST_THREADS}, got {threads}")
     kind, colon, index = device.partition(":")

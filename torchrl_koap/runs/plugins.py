@@ -13,7 +13,7 @@ import tyro
 
 from torchrl_koap.lookup import absolute, import_code
 
-# a field of options: tuple of module names, on the command line `--plugin NAME`, as often as there are any
+# an option field: a tuple of module names; on the command line `--plugin NAME`, which may be repeated
 Plugins = Annotated[tuple[str, ...], tyro.conf.arg(name="plugin", metavar="MODULE"), tyro.conf.UseAppendAction]
 
 
@@ -22,10 +22,10 @@ class PluginError(ValueError):
 
 
 def load_plugins(names: Sequence[str]) -> None:
-    """Imports modules, dotted names or files ``*.py``, that register something then; later calls do nothing.
+    """Imports modules (dotted names or files ``*.py``), which register something then; later calls do nothing.
 
     The current directory is searched after the Python path, so that a file beside the data is found. A PluginError
-    names a module that is not found, and where it was looked for, or what went wrong in its import.
+    names a missing module and the folders searched, or the error of its import.
     """
     names = absolute_files(names)
     here = os.getcwd()
@@ -37,7 +37,7 @@ def load_plugins(names: Sequence[str]) -> None:
 
 
 def absolute_files(names: Sequence[str]) -> tuple[str, ...]:
-    """Plugins with files by their absolute paths, which are the same from every folder; module names as they are."""
+    """Returns plugins with absolute paths of files, which are valid in every folder; keeps module names."""
     if isinstance(names, str):
         raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")
     return tuple(absolute(str(name)) for name in names)

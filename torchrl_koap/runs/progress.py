@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Progress bars, whose errors never stop the work, and loggers beside ``metrics.csv``."""
+"""Progress bars, whose errors never stop a training, and loggers in addition to ``metrics.csv``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from torchrl_koap.lookup import lookup
 
-LOGGERS = ("csv", "wandb", "tensorboard")  # csv: metrics.csv, which there always is
+LOGGERS = ("csv", "wandb", "tensorboard")  # csv: metrics.csv, which is always written
 
 FILE_INTERVAL = 30.0  # s between the lines of a bar in a file
 _UP = "\x1b[A"  # moves the cursor a line up
@@ -27,7 +27,7 @@ _SHOWN: ContextVar[bool] = ContextVar("shown", default=True)
 
 
 class _Forgiving:
-    """A stream on which nobody depends: what cannot be written (a full device, a closed terminal) is left out."""
+    """A stream that ignores write errors (a full device, a closed terminal)."""
 
     def __init__(self, stream: TextIO):
         self._stream = stream
@@ -46,7 +46,7 @@ class _Forgiving:
 
 
 class _Lines(_Forgiving):
-    """A stream that gets a line whenever a bar is drawn, instead of a carriage return before it."""
+    """A stream that writes a line whenever a bar is drawn, instead of a carriage return."""
 
     def write(self, text: str) -> int:
         if line := text.replace(_UP, "").strip("\r\n "):
@@ -55,7 +55,7 @@ class _Lines(_Forgiving):
 
 
 def _is_on_disk(stream: TextIO) -> bool:
-    """Whether a stream is a file, in which all the states of a bar would be one endless line."""
+    """Returns whether a stream is a file on disk, in which carriage returns would give one endless line."""
     try:
         return isinstance(stream, io.TextIOWrapper) and stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
     except (OSError, ValueError):
@@ -63,9 +63,9 @@ def _is_on_disk(stream: TextIO) -> bool:
 
 
 def progress_bar(total: int | None, description: str, *, unit: str = "it", **options: Any) -> tqdm:
-    """A bar on stderr that counts to ``total``; where stderr cannot be written to, there is none.
+    """Makes a bar on stderr that counts to ``total``; it is not shown if stderr cannot be written to.
 
-    Where stderr is a file (the log of a cell, ``2> log.txt``), the bar is a line every half minute and at its end. The
+    If stderr is a file (the log of a cell, ``2> log.txt``), the bar is a line every half minute and at the end. The
     options are those of ``tqdm``.
     """
     disable = not _SHOWN.get() or sys.stderr is None
@@ -80,7 +80,7 @@ def progress_bar(total: int | None, description: str, *, unit: str = "it", **opt
 
 @contextlib.contextmanager
 def without_progress_bars() -> Iterator[None]:
-    """Inside the block no bar of the library is shown."""
+    """Hides the library's progress bars inside the block."""
     token = _SHOWN.set(False)
     try:
         yield
@@ -89,7 +89,7 @@ def without_progress_bars() -> Iterator[None]:
 
 
 def count_up_to(bar: tqdm) -> Callable[..., None]:
-    """A function that moves a bar to the number it is called with first, of as many as it is told."""
+    """Makes a function ``move(done, total)`` that moves a bar to ``done``."""
 
     def move(done: int, total: int | None = None, *rest: Any) -> None:
         bar.total = bar.total if total is None else total
@@ -99,20 +99,20 @@ def count_up_to(bar: tqdm) -> Callable[..., None]:
 
 
 def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
-    """What a training calls after every update: moves the bar, shows the losses."""
+    """Makes the function that a training calls after every update: it moves the bar and shows the losses."""
 
     def update(step: int, values: dict[str, float]) -> None:
         bar.update(step - bar.n)
         if values and step % 50 == 0:
             shown = {key: value for key, value in values.items() if "loss" in key or key == "held_out_score"}
             losses = {key.removeprefix("loss_"): f"{value:.4f}" for key, value in shown.items()}
-            bar.set_postfix(losses, refresh=False)  # shown when the bar is drawn next
+            bar.set_postfix(losses, refresh=False)  # the next drawing of the bar shows it
 
     return update
 
 
 def check_logger(name: str) -> None:
-    """Refuses a logger that is unknown or not installed, and names the nearest or the extra to install."""
+    """Raises a ValueError for a logger that is unknown (naming the nearest) or not installed (naming the extra)."""
     lookup(LOGGERS, name, "logger")
     if name != "csv" and importlib.util.find_spec(name) is None:
         raise ValueError(f"--logger {name} needs an extra: pip install 'torchrl_koap[{name}]'")
@@ -120,10 +120,10 @@ def check_logger(name: str) -> None:
 
 @contextlib.contextmanager
 def open_logger(name: str, out: Path) -> Iterator[Any | None]:
-    """Yields a logger of TorchRL that writes into the run directory, and closes it at the end of the block.
+    """Yields a TorchRL logger that writes into the run directory, and closes it at the end of the block.
 
-    For ``"csv"`` it is None. wandb stays offline unless ``WANDB_MODE`` says otherwise. The name was checked before
-    any work was done (:func:`check_logger`).
+    For ``"csv"`` it is None. wandb stays offline unless ``WANDB_MODE`` is set. The name must have passed
+    :func:`check_logger`.
     """
     if name == "csv":
         yield None

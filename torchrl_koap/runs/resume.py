@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Going on with an interrupted run: its options, and the checks that nothing else is asked for now."""
+"""Resumes an interrupted run: restores its options, and checks that they, data and version are unchanged."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import changed_options, fill_in, read_config
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, no_data
 
-# with which a run may be resumed differently; with other threads sums are rounded differently. Demonstrations may lie
-# elsewhere: their checksum says whether they are the same
+# options that may differ in a resumed run. Other numbers of threads round sums differently. The data set may have
+# moved: a checksum identifies it
 FREE = frozenset({"dataset", "out", "run.threads", "run.resume", "run.plugins", "run.logger"})
 _ONE_OF = ("fraction", "count", "episodes")
 
 
 def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
-    """Returns the options of a run, which may be new: of a resumed one what is not asked for otherwise is as it was."""
+    """Returns the options of a new or resumed run; a resumed one keeps its earlier options unless others are given."""
     begun = (run.path / "config.json").exists()
     if asked.run.resume and asked.dataset is None and not begun:
         raise RunDirectoryError(f"{run.path} holds no run to resume: it has no config.json")
@@ -36,7 +36,7 @@ def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
 
 
 def check_resume(run: RunDirectory, config: TrainConfig) -> None:
-    """Refuses a folder that holds another run than what is to be trained, or was not asked to be resumed."""
+    """Raises a RunDirectoryError if the folder holds a run with other options, or a run without ``resume``."""
     if not (run.path / "config.json").exists():
         run.refuse_data()
         names = ("planner.safetensors", "controller.safetensors", "checkpoints")
@@ -46,18 +46,18 @@ def check_resume(run: RunDirectory, config: TrainConfig) -> None:
     if not config.run.resume:
         raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it (run.resume)")
     saved = read_config(run)
-    # a folder that is gone was moved, probably together with this run: there is nothing to compare with
+    # a missing folder was probably moved together with this run: do not compare it
     source = saved.planner.source
     moved = {"planner.source"} if source is not None and not source.exists() else set()
     if changed := [name for name in changed_options(config, saved) if name not in FREE | moved]:
-        raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
+        raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}: it cannot be resumed")
 
 
 def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
-    """Refuses to go on with other demonstrations, or another version of this package, than a run was begun with.
+    """Raises a RunDirectoryError if demonstrations or version of this package differ from those a run started with.
 
-    Demonstrations are other ones, too, where the task that they hold says otherwise what the same numbers are.
-    ``content`` is what ``config.json`` is to hold, ``data`` and ``versions`` included.
+    Demonstrations also differ if their task describes the same columns differently. ``content`` is the future content
+    of ``config.json``, ``data`` and ``versions`` included.
     """
     if not (run.path / "config.json").exists():
         return
@@ -70,11 +70,11 @@ def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
             f"{run.path} was started with other demonstrations than {content['dataset']} holds now ({sizes}); bring the"
             " earlier ones back, or choose another --out"
         )
-    meant, means = earlier.get("task_definition") or {}, content.get("task_definition") or {}
-    if changed := [name for name in means if meant.get(name, means[name]) != means[name]]:
+    was, task = earlier.get("task_definition") or {}, content.get("task_definition") or {}
+    if changed := [name for name in task if was.get(name, task[name]) != task[name]]:
         raise RunDirectoryError(
-            f"{run.path} was started when {content['dataset']} said otherwise what its columns are"
-            f" ({', '.join(changed)}); convert it again as it was, or choose another --out"
+            f"{run.path} was started when {content['dataset']} described its columns differently"
+            f" ({', '.join(changed)}); convert it again as before, or choose another --out"
         )
     then, here = earlier.get("versions") or {}, content["versions"]
     if then.get("torchrl_koap", here["torchrl_koap"]) != here["torchrl_koap"]:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A run directory: plain files that are always complete, found by path or by the name of a trained policy."""
+"""A run directory: plain files that are never half written, found by path or by the name of a trained policy."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ from torchrl_koap.lookup import lookup
 
 PREFIX = "pretrained:"
 _NETWORKS = ("planner.safetensors", "controller.safetensors")
-# what a run is made of; evaluations, reports and checkpoints are made from it
+# files of a run, without evaluations, reports and checkpoints
 FILES = ("config.json", "summary.json", "metrics.csv", "demonstrations.safetensors", *_NETWORKS)
 
 
 class RunDirectoryError(ValueError):
-    """A folder that cannot be used as asked: of another run, or incomplete."""
+    """A folder that cannot be used as asked: it holds another run, or is incomplete."""
 
 
 class RunDirectory:
     """Reads and writes the files of one run.
 
-    ``config.json`` (all options), ``metrics.csv`` (one row per logged step, columns as they come), ``summary.json``,
-    ``eval.json``, weights and pictures. JSON is written aside and renamed, so that a full disk leaves the earlier file.
-    The folder need not exist yet.
+    ``config.json`` (all options), ``metrics.csv`` (one row per logged step), ``summary.json``, ``eval.json``, weights
+    and pictures. JSON is written to a temporary file and renamed, so that a full disk leaves the earlier file. The
+    folder need not exist yet.
     """
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Writes a JSON file in one go; numbers that are not finite, which JSON does not know, become null."""
+        """Writes a JSON file atomically; numbers that are not finite, which JSON lacks, become null."""
         with replacing_file(self.path / name) as aside:
             aside.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
     def read_json(self, name: str) -> dict[str, Any]:
-        """Reads a JSON file; a RunDirectoryError names one that is not there or damaged."""
+        """Reads a JSON file; a RunDirectoryError names a file that is missing or damaged."""
         path = self.path / name
         if not path.exists():
             missing = path if self.path.is_dir() else self.path
@@ -63,14 +63,14 @@ class RunDirectory:
             raise RunDirectoryError(f"{path} is damaged: {error.problems[0]}") from error
 
     def refuse_data(self) -> None:
-        """Raises a RunDirectoryError where the folder holds a data set, which has a folder of its own."""
+        """Raises a RunDirectoryError if the folder holds a data set."""
         if (stored := stored_folder(self.path)) is not None:
             raise RunDirectoryError(f"{stored} holds a data set, which needs a folder of its own; choose another --out")
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``: the values (losses, learning rate, speed) after a step of a phase.
 
-        A value that no row had before gets a column of its own.
+        A value with a new name adds a column.
         """
         path = self.path / "metrics.csv"
         row = {"phase": phase, "step": step, **values}
@@ -82,7 +82,7 @@ class RunDirectory:
         try:
             with path.open("a", newline="") as file:
                 csv.DictWriter(file, columns).writerow(row)
-        except OSError as error:  # of a full disk it does not say the file
+        except OSError as error:  # the error of a full disk does not name the file
             raise OSError(error.errno, f"{path} could not be written: {error.strerror}") from error
 
     def _columns(self) -> list[str]:
@@ -100,10 +100,10 @@ class RunDirectory:
             writer.writerows(rows)
 
     def read_metrics(self) -> list[dict[str, str]]:
-        """All complete rows of ``metrics.csv``; none if there is no such file.
+        """Returns all complete rows of ``metrics.csv``; none if there is no such file.
 
-        A row that was cut off when a process was killed or the disk was full is left out. A RunDirectoryError names a
-        complete row that is damaged.
+        A row cut off by a killed process or a full disk is left out. A RunDirectoryError names a complete row that is
+        damaged.
         """
         path = self.path / "metrics.csv"
         if not path.exists():
@@ -119,7 +119,7 @@ class RunDirectory:
         return rows
 
     def last_metrics(self, phase: str) -> dict[str, float]:
-        """The values of the last row of a phase and its number of ``updates``; none if there is none."""
+        """Returns the values of the last row of a phase and its number of ``updates``; empty without a row."""
         rows = [row for row in self.read_metrics() if row["phase"] == phase]
         if not rows:
             return {}
@@ -127,7 +127,7 @@ class RunDirectory:
         return values | {"updates": int(rows[-1]["step"])}
 
     def seconds(self) -> dict[str, float]:
-        """The time that the updates of each phase took, by its rows, those of interrupted calls included."""
+        """Returns the time of each phase's updates from its rows, those of interrupted calls included."""
         took, done = dict[str, float](), dict[str, int]()
         for row in self.read_metrics():
             phase, step = row["phase"], int(row["step"])
@@ -137,32 +137,32 @@ class RunDirectory:
         return took
 
     def rewind_metrics(self, phase: str, step: int) -> None:
-        """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there."""
+        """Drops the rows of ``phase`` after ``step``, and those of later phases, before a run resumes from there."""
         kept = takewhile(lambda row: row["phase"] != phase or int(row["step"]) <= step, self.read_metrics())
         if (self.path / "metrics.csv").exists():
             self._write_metrics(self._columns(), list(kept))
 
     @contextlib.contextmanager
     def locked(self, what: str, name: str = ".lock") -> Iterator[None]:
-        """Keeps others out of the folder as long as the block lasts; ``what`` works there, such as ``"koap train"``.
+        """Locks the folder during the block for ``what``, such as ``"koap train"``.
 
-        What a process that was killed had half written of a checkpoint is taken away first. It is a RunDirectoryError
-        if somebody works in the folder already.
+        Removes partial checkpoints of killed processes first. Raises a RunDirectoryError if another process works in
+        the folder.
         """
         with contextlib.ExitStack() as held:
             try:
                 held.enter_context(one_at_a_time(self.path / name, busy=f"another `{what}` is working in {self.path}"))
             except LockedError as error:
                 raise RunDirectoryError(error) from None
-            for rest in (self.path / "checkpoints").glob(".*.tmp"):  # nobody but the holder of the lock writes there
-                rest.unlink(missing_ok=True)
+            for partial in (self.path / "checkpoints").glob(".*.tmp"):  # only the holder of the lock writes there
+                partial.unlink(missing_ok=True)
             yield
 
 
 def _check_row(path: Path, row: Mapping[str, Any]) -> None:
     try:
         if not row["phase"] or int(row["step"]) < 0 or None in row:
-            raise ValueError("wanted a phase, a step, and a value or nothing for every other column")
+            raise ValueError("wanted a phase, a step >= 0, and a value or nothing for every other column")
         for name, value in row.items():
             if value and name not in ("phase", "step"):
                 float(value)
@@ -180,14 +180,14 @@ def _finite(value: Any) -> Any:
 
 
 def pretrained_folders() -> dict[str, Path]:
-    """Names and folders of the trained policies: those of the checkout, or below the present folder."""
+    """Returns names and folders of the trained policies, in the current folder or in the checkout."""
     roots = [Path("pretrained"), Path(__file__).resolve().parents[2] / "pretrained"]
     folders = [folder for root in roots if root.is_dir() for folder in sorted(root.iterdir())]
     return {folder.name: folder for folder in reversed(folders) if (folder / "config.json").exists()}
 
 
 def find_run(name: object) -> Path:
-    """The folder of a run: a path as it is, ``pretrained:NAME`` looked up; an unknown name suggests the nearest."""
+    """Returns the folder of a run: a path as given, or that of ``pretrained:NAME``; errors suggest the nearest name."""
     if not isinstance(name, (str, Path)):
         made = "train(TrainConfig(...)) writes one, fit() does not"
         raise TypeError(f"a run must be named by its folder, got {type(name).__name__}: {made}")
@@ -204,15 +204,15 @@ def find_run(name: object) -> Path:
 
 
 def no_data(where: str | None, run: str | Path | None) -> RunDirectoryError:
-    """Makes the error for demonstrations of a run that are not where it says."""
+    """Makes the error for demonstrations of a run that are missing at their recorded path."""
     return RunDirectoryError(
-        f"the data set {where!r} of {run} is not there (moved, or named relative to another working directory?): say"
-        " where it is with --dataset"
+        f"the data set {where!r} of {run} is not there (moved, or named relative to another working directory?): give"
+        " its folder with --dataset"
     )
 
 
 def copy_run(source: str | Path, target: str | Path) -> Path:
-    """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run."""
+    """Copies the files of a run, without those of evaluations, to a folder that is new or holds the same run."""
     source, target = Path(source), Path(target)
     config = RunDirectory(source).read_json("config.json")
     RunDirectory(target).refuse_data()
@@ -228,14 +228,14 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
 
 
 def writable_folder(run: str | Path, out: str | Path | None = None) -> Path:
-    """The folder that results about a run are written to: its own, or ``out``, to which what it is made of is copied.
+    """Returns the folder for results about a run: its own, or ``out``, to which the files of the run are copied.
 
-    A pretrained run without another folder is refused.
+    Raises a ValueError for a pretrained run without ``out``.
     """
     source = find_run(run)
     if out is not None:
         return copy_run(source, out)
     if str(run).startswith(PREFIX):
-        raise ValueError(f"nothing is written into {run}: name a folder of your own with --out")
+        raise ValueError(f"nothing is written into {run}: choose another folder with --out")
     check_folder(source)
     return source

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Weights as safetensors with a JSON header, and in 25 % of their size for publishing."""
+"""Weights as safetensors with a JSON header; published weights are int8 and have 25 % of the size."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from torch import Tensor, nn
 
 from torchrl_koap.files import replacing_file
 
-_SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors and of the other facts
-ROW_SCALE = ".row_scale"  # ending of the scales of a matrix that is stored as int8
+_SHA256 = "sha256"  # header entry: checksum of the tensors and the other facts
+ROW_SCALE = ".row_scale"  # suffix of the scales of a matrix that is stored as int8
 
 
 class CheckpointError(ValueError):
-    """A file of weights that cannot be used: damaged, of another task, or without its statistics."""
+    """A weights file that cannot be used: damaged, of another task, or without its statistics."""
 
 
 def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any]) -> None:
     """Loads weights, normaliser statistics included, into a module of the same architecture.
 
-    ``expected`` are facts that it must hold: the task, and the options that build the module. A CheckpointError says
-    what is missing, damaged, or of another task, other options or other shapes.
+    ``expected`` are the facts that the file must hold: the task, and the options that build the module. A
+    CheckpointError names what is missing, damaged, or of another task, other options or other shapes.
     """
     tensors, about = load_tensors(path)
     for name, value in expected.items():
@@ -38,7 +38,7 @@ def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any
 
 
 def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[str, nn.Module | None]) -> None:
-    """Hands several modules, those that are not None, their weights, of names ``"PART.ENTRY"`` in a file."""
+    """Loads the weights of several modules from tensors named ``"PART.ENTRY"``; skips parts that are None."""
     for part, module in parts.items():
         if module is not None:
             own = {name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")}
@@ -48,22 +48,22 @@ def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[s
 def _load(path: str | Path, module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     kinds = {value.dtype for value in tensors.values() if value.is_floating_point()}
     if len(kinds) == 1:
-        module.to(kinds.pop())  # as it was trained, whatever torch's default is
+        module.to(kinds.pop())  # the number type of the training, whatever torch's default is
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
         problems = " ".join(str(error).split("\n", 1)[-1].split())
         raise CheckpointError(f"{path} does not fit the model: {problems}") from error
-    for name, value in module.named_parameters():  # of a buffer that nobody has fitted NaN says just that
+    for name, value in module.named_parameters():  # not buffers: NaN marks those that were not fitted
         if not value.isfinite().all():
             raise CheckpointError(f"{path} is damaged: {name} is NaN or infinite")
 
 
 def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
-    """Writes tensors by name, and facts of plain JSON types, to one safetensors file, aside and renamed."""
+    """Writes tensors by name, and facts of plain JSON types, to one safetensors file, atomically."""
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing_file(path) as aside:
-        # one entry alone: of several the order in the file would be another one every time
+        # a single entry, as the order of several in the file would vary
         facts = dict(about or {})
         save_file(tensors, aside, metadata={"about": json.dumps(facts | {_SHA256: _digest(tensors, facts)})})
 
@@ -76,16 +76,16 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {"about": "{}"}
         if "about" not in metadata:
-            raise ValueError(f"its header has {', '.join(metadata)} instead of facts")
+            raise ValueError(f"its header has {', '.join(metadata)} instead of 'about'")
         about = json.loads(metadata["about"])
         if not isinstance(about, dict):
-            raise ValueError(f"its facts are no object but {type(about).__name__}")
+            raise ValueError(f"its header entry 'about' must be an object, got {type(about).__name__}")
         tensors = load_file(path)
     except (SafetensorError, ValueError, RecursionError, OSError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
     facts = {name: value for name, value in about.items() if name != _SHA256}
     if about.get(_SHA256) != _digest(tensors, facts) or json.dumps(about) != metadata["about"]:
-        raise CheckpointError(f"{path} is damaged: its content is not what was written (checksum)")
+        raise CheckpointError(f"{path} is damaged: its content does not match its checksum")
     return tensors, facts
 
 
@@ -94,7 +94,7 @@ def _digest(tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> str:
 
 
 def digest_of(named: Iterable[tuple[Any, Tensor]], start: bytes = b"") -> str:
-    """Computes the SHA-256 of some bytes and then of tensors, their names, types and shapes included."""
+    """Computes the SHA-256 of bytes followed by tensors with their names, types and shapes."""
     digest = hashlib.sha256(start)
     for name, tensor in named:
         value = tensor.detach().cpu().contiguous()
@@ -104,7 +104,7 @@ def digest_of(named: Iterable[tuple[Any, Tensor]], start: bytes = b"") -> str:
 
 
 def expand(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Multiplies matrices ``NAME`` (int8) by ``NAME.row_scale``, ``[rows, 1, ...]``; whatever else stays as it is."""
+    """Multiplies matrices ``NAME`` (int8) by ``NAME.row_scale``, ``[rows, 1, ...]``; keeps other tensors."""
     return {
         name: tensor.float() * tensors[name + ROW_SCALE] if name + ROW_SCALE in tensors else tensor
         for name, tensor in tensors.items()

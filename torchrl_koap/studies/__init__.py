@@ -3,6 +3,6 @@
 
 from torchrl_koap.lookup import exports
 
-# imported when first asked for: pictures need a reader of run directories, not TorchRL
+# imported on first access: pictures need run directories, but not TorchRL
 _OFFERS = {"cells": ("Cell",), "launchers": ("Machines",), "run": ("run_study",), "study": ("Study",)}
 __getattr__, __all__ = exports(__name__, _OFFERS)

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A cell of a study on disk: what was asked of it, written before it begins, and what it found, written last.
+"""A cell of a study on disk: its request, written before it begins, and its result, written last.
 
-``cell.json`` holds whole configurations, so a worker needs the folder alone: a process of this machine, of a cluster,
-or somebody by hand. ``result.json`` is written in one go, so a process may be killed at any moment.
+``cell.json`` holds whole configurations, so a worker needs only the folder, be it a process of this machine, of a
+cluster, or started by hand. ``result.json`` is written atomically, so a process may be killed at any moment.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from torchrl_koap.tasks.columns import thousandths
 from torchrl_koap.training import train
 
 ASKED, FOUND = "cell.json", "result.json"
-# evaluation seeds of a training seed lie so far from the next one's: rollouts that differ in nothing but the training
-# would count as 180 where they are hardly more than 60
+# distance of the evaluation seeds of consecutive training seeds. With the same noise for all training seeds, 180
+# rollouts would carry hardly more information than 60
 NOISE_STEP = 1000
 Result = tuple[dict[str, Any], dict[tuple[int, int], float]]
 """A row, and outcomes as :data:`~torchrl_koap.studies.paired_comparison.Outcome`."""
-_MAY_CHANGE = ("dataset", "out", "planner.source", "run.plugins")  # a folder may be moved, plugins may be added
+_MAY_CHANGE = ("dataset", "out", "planner.source", "run.plugins")  # folders may move, plugins may be added
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Cell:
         task (str): name of the task.
         method (str): name in :data:`~torchrl_koap.training.methods.METHODS`.
         labels (float): share of the units that keep their labels.
-        demonstrations (float): share of the demonstrations that is known at all.
-        seed (int): of label choice, initialisation and batches.
+        demonstrations (float): share of the demonstrations that is used at all.
+        seed (int): seed of label choice, initialisation and batches.
     """
 
     task: str
@@ -55,7 +55,7 @@ class Cell:
 
 
 def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | None) -> None:
-    """Writes what is asked of a cell, or of a shared planner, before its work begins; refuses another request."""
+    """Writes the request of a cell, or of a shared planner, before it begins; refuses a different earlier request."""
     run = RunDirectory(folder)
     if (folder / ASKED).exists():
         changed = changed_options(read_asked(folder)[0], config)
@@ -66,7 +66,7 @@ def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | Non
 
 
 def read_asked(folder: Path) -> tuple[TrainConfig, EvalConfig | None]:
-    """Reads what is asked of a cell; names a ``cell.json`` that is not there or damaged."""
+    """Reads the request of a cell; a RunDirectoryError names a ``cell.json`` that is missing or damaged."""
     content, path = RunDirectory(folder).read_json(ASKED), folder / ASKED
     if set(content) != {"train", "evaluation"}:
         raise RunDirectoryError(f"{path} is damaged: wanted the entries 'train' and 'evaluation'")
@@ -76,7 +76,7 @@ def read_asked(folder: Path) -> tuple[TrainConfig, EvalConfig | None]:
 
 
 def run_cell(folder: str | Path) -> None:
-    """Trains and evaluates a cell, or trains a shared planner, as :func:`prepare_cell` says, from where it was left."""
+    """Trains and evaluates a cell, or trains a shared planner, as :func:`prepare_cell` wrote; resumes earlier work."""
     folder = Path(folder)
     config, evaluation = read_asked(folder)
     config = replace(config, run=replace(config.run, resume=(folder / "config.json").exists()))
@@ -88,13 +88,13 @@ def run_cell(folder: str | Path) -> None:
     if not (folder / "summary.json").exists():
         train(config)
     summary, began = run.read_json("summary.json"), time.perf_counter()
-    result = evaluate(folder, replace(evaluation, dataset=config.dataset))  # where the data are now
+    result = evaluate(folder, replace(evaluation, dataset=config.dataset))  # the data may have moved
     seconds = {"train_seconds": sum(summary["train_seconds"].values()), "eval_seconds": time.perf_counter() - began}
     run.write_json(FOUND, {"row": _found_in(summary, result) | seconds, "outcomes": _outcomes_of(result)})
 
 
 def read_result(folder: str | Path) -> Result | None:
-    """Reads what a cell found, None if it is not finished; a damaged ``result.json`` is refused.
+    """Reads the result of a cell, None if it is not finished; a RunDirectoryError names a damaged ``result.json``.
 
     The row has columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`.
     """
@@ -117,7 +117,7 @@ def read_result(folder: str | Path) -> Result | None:
 def cell_row(root: Path, cell: Cell, *, label_unit: str, reason: str | None = None) -> Result:
     """Reads a cell of a study's folder as a row of ``cells.csv``, and its outcomes, which are empty unless it is done.
 
-    ``reason`` says why it failed, if it did.
+    ``reason`` is why it failed, if it did.
     """
     row = asdict(cell) | {"label_unit": label_unit, "run": cell.folder}
     try:
@@ -148,7 +148,7 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
 
 
 def _own_error(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Error of the actions in the unit of the first column, as it is shown, and that unit; if it was measured."""
+    """Returns the action error in the displayed unit of the first column, and that unit, if it was measured."""
     split = result["action_errors_on"]
     if split is None:
         return {}
@@ -158,9 +158,9 @@ def _own_error(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _outcomes_of(result: Mapping[str, Any]) -> list[list[float]]:
-    """Success of every episode with its context and seed; without an environment the error of every trajectory.
+    """Returns the success of every episode with context and seed; without an environment errors by trajectory.
 
-    An episode without a context is one of its own.
+    The seed of an episode without a context serves as its context.
     """
     if result.get("kind") == KIND:
         split = result["action_errors_on"]

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Many independent jobs, in processes of this machine or on a Ray cluster. A failed job does not stop the others.
+"""Runs many independent jobs, in processes of this machine or on a Ray cluster. A failed job does not stop the others.
 
-Imported first by the server that worker processes are copies of: :func:`end_with_parent` is its first act.
+The fork server of the worker processes imports this module first, which calls :func:`end_with_parent`.
 """
 
 from __future__ import annotations
@@ -24,47 +24,47 @@ from typing import Any, TextIO
 from torchrl_koap.lookup import lookup
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
-_LONGEST = 500  # characters of a reason
-_PATIENCE = 3  # seconds in which a process may give back what it holds of the system, such as semaphores
+_LONGEST = 500  # characters of a reason at most
+_PATIENCE = 3  # seconds in which a process may release system resources, such as semaphores
 LAUNCHERS = ("local", "ray")
 
 
 def end_with_parent() -> None:
-    """Kills this process when its parent ends, at whatever moment; systems other than Linux cannot be asked to."""
+    """Makes the system kill this process as soon as its parent ends; does nothing on systems other than Linux."""
     if not sys.platform.startswith("linux"):
         return
     parent = os.getppid()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it has ended in the meantime
+    if os.getppid() != parent:  # the parent ended before prctl took effect
         os._exit(1)
 
 
-if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # how such a server is started
-    # by itself it would notice the death of its parent only when it has imported everything else, seconds later
+if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # true in the fork server
+    # the server itself notices the end of its parent only after all its imports, seconds later
     end_with_parent()
 
 
 @dataclass(frozen=True)
 class Job:
-    """A folder that says what is to be done; what is printed is appended to its ``log.txt``."""
+    """A folder that describes a task; printed output is appended to its ``log.txt``."""
 
     folder: Path
-    needs: Path | None = None  # folder of the job that must have succeeded before
+    needs: Path | None = None  # folder of the job that must succeed first
 
 
 @dataclass(frozen=True)
 class Machines:
-    """Where the cells of a study are made.
+    """Where the cells of a study run.
 
     Attributes:
         workers: cells at a time (default: one per core; a cluster given by its address decides for itself).
         launcher: "local" or "ray" (extra `ray`; the folders must be visible to all machines).
-        address: of a Ray cluster (default: one on this machine).
+        address: address of a Ray cluster (default: a new one on this machine).
 
     Raises:
-        ValueError: for an unknown launcher, no workers, or an address that is of no use; for one that is not installed,
-            naming its extra.
+        ValueError: for an unknown launcher, no workers, or an address that launcher "local" does not use; for a
+            launcher that is not installed, naming its extra.
     """
 
     workers: int | None = None
@@ -76,7 +76,7 @@ class Machines:
         if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be >= 1, got {self.workers}")
         if self.launcher == "local" and self.address is not None:
-            raise ValueError("an address was given, but launcher 'local' works on this machine alone")
+            raise ValueError("an address was given, but launcher 'local' uses only this machine")
         if self.launcher == "ray" and importlib.util.find_spec("ray") is None:
             raise ValueError("launcher 'ray' needs an extra: pip install 'torchrl_koap[ray]'")
 
@@ -84,12 +84,12 @@ class Machines:
 def launch(
     function: Callable[[str], None], jobs: Sequence[Job], machines: Machines
 ) -> Generator[tuple[Job, str | None], None, None]:
-    """Calls a function in every job's folder, each in a process of its own; yields jobs as they end, and why they fail.
+    """Calls a function with every job's folder, in a process each; yields jobs as they end, with reasons of failures.
 
-    The function is one of a module, of a folder. Jobs that come first are started first; one whose need, a job before
-    it, failed is not run and fails too. Closing the iterator stops what is running.
+    The function must be a module's, as processes import it. Jobs start in the given order. A job that needs a failed
+    one is not run and fails too. Closing the iterator stops running jobs.
     """
-    # a job of a cluster may not use all cores of its machine
+    # on a cluster, this process may be restricted to some cores of its machine
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if machines.launcher == "ray":
         return _schedule(list(jobs), RayPool(function, machines.workers or cores, machines.address))
@@ -124,7 +124,7 @@ def _schedule(waiting: list[Job], pool: Any) -> Generator[tuple[Job, str | None]
 
 
 def run_logged(function: Callable[[str], None], folder: str) -> str | None:
-    """Calls a function of a folder with everything it prints going to its log; returns why it failed, if it did."""
+    """Calls a function with a folder and logs everything it prints; returns why it failed, or None."""
     try:
         with _open_log(folder) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
             try:
@@ -132,30 +132,30 @@ def run_logged(function: Callable[[str], None], folder: str) -> str | None:
             except Exception:
                 traceback.print_exc(file=file)
                 raise
-    except Exception as error:  # also where there is no place for a log
+    except Exception as error:  # also if the log cannot be opened
         return _in_words(error)
     return None
 
 
 def _open_log(folder: str) -> TextIO:
     Path(folder).mkdir(parents=True, exist_ok=True)
-    return Path(folder, "log.txt").open("a", buffering=1)  # by lines: a job that is killed has said what it did
+    return Path(folder, "log.txt").open("a", buffering=1)  # line by line, so that a killed job leaves its output
 
 
 def _in_words(error: Exception) -> str:
-    """Type and first line; cut, as a pipe holds 64 KB and nobody reads it before the process has ended."""
+    """Returns type and first line, cut: a pipe holds 64 KB, and is read only after the process has ended."""
     lines = str(error).strip().splitlines() or [""]
     return f"{type(error).__name__}: {lines[0][:_LONGEST]}".removesuffix(": ")
 
 
 class LocalPool:
-    """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second."""
+    """Processes forked from a server that has imported everything: a job starts in a fraction of a second."""
 
     def __init__(self, function: Callable[[str], None], workers: int):
         self.function, self.workers = function, workers
         self.context = multiprocessing.get_context("forkserver")
         self.context.set_forkserver_preload(["torchrl_koap.studies.launchers", function.__module__])
-        earlier = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is this process's to handle
+        earlier = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # only this process handles Ctrl-C
         try:
             forkserver.ensure_running()
         finally:
@@ -178,14 +178,14 @@ class LocalPool:
             process.join()
             try:
                 reason = reader.recv() if reader.poll() else _death(process.exitcode)
-            except (EOFError, OSError):  # a pipe at its end is ready to be read as well
+            except (EOFError, OSError):  # poll() is also true for a closed pipe
                 reason = _death(process.exitcode)
             reader.close()
             ended.append((job, reason))
         return ended
 
     def stop(self) -> None:
-        """Ends what is running, and kills what does not end."""
+        """Terminates running jobs, and kills those that do not end in time."""
         for _, process, _ in self.running.values():
             process.terminate()
         for _, process, _ in self.running.values():
@@ -199,15 +199,15 @@ def _death(exit_code: int) -> str:
     if exit_code == -signal.SIGKILL:
         return "killed by the system (signal 9): probably out of memory; try fewer --workers"
     what = f"exit code {exit_code}" if exit_code >= 0 else f"signal {-exit_code}, {signal.strsignal(-exit_code)}"
-    return f"its process ended without a word ({what})"
+    return f"its process ended without an error message ({what})"
 
 
 def _child(writer: Any, function: Callable[[str], None], folder: str) -> None:
-    # ends with a killed parent: else the next `koap curve` in the folder would find it still writing
+    # must end with a killed parent: else it would still write when the next `koap curve` starts in the folder
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent handles Ctrl-C
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    with contextlib.suppress(OSError), _open_log(folder) as file:  # what is not Python prints past sys.stdout
+    with contextlib.suppress(OSError), _open_log(folder) as file:  # C libraries do not print to sys.stdout
         for descriptor in (1, 2):
             os.dup2(file.fileno(), descriptor)
     writer.send(run_logged(function, folder))
@@ -220,9 +220,9 @@ def _die_with_parent() -> None:
 
 
 class RayPool:
-    """Tasks of a Ray cluster; a task that dies is not tried again.
+    """Tasks of a Ray cluster; a task that dies is not retried.
 
-    A cluster that runs, given by its address, decides by itself how many there are at a time.
+    A running cluster, given by its address, decides by itself how many tasks run at a time.
     """
 
     def __init__(self, function: Callable[[str], None], workers: int, address: str | None):
@@ -231,7 +231,7 @@ class RayPool:
         self.ray, self.function = ray, function
         self.owned = not ray.is_initialized()
         if self.owned:
-            # "local", as None means a cluster that happens to run already, which takes no sizes
+            # not None, which would connect to a running cluster, whose size cannot be set
             size = {} if address is not None else {"num_cpus": workers, "include_dashboard": False}
             with _keeping_signals():
                 ray.init(address=address or "local", log_to_driver=False, **size)
@@ -249,13 +249,13 @@ class RayPool:
         job = self.running.pop(reference)
         try:
             return [(job, self.ray.get(reference))]
-        except self.ray.exceptions.RayTaskError as error:  # what a task raised is wrapped
+        except self.ray.exceptions.RayTaskError as error:  # wraps the error of the task
             return [(job, _in_words(error.cause))]
         except self.ray.exceptions.RayError as error:
             return [(job, _in_words(error))]
 
     def stop(self) -> None:
-        """Ends what is running, and the cluster if it was started here."""
+        """Cancels running jobs, and stops the cluster if it was started here."""
         for reference in self.running:
             self.ray.cancel(reference, force=True)
         self.running.clear()
@@ -265,7 +265,7 @@ class RayPool:
 
 @contextlib.contextmanager
 def _keeping_signals() -> Iterator[None]:
-    """Behind the block signals mean what they did before; Ray would end the process without a word on SIGTERM."""
+    """Restores signal handlers after the block: Ray's handler of SIGTERM would end the process without a message."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Is one method better than another? Paired comparison of their successes on the same evaluation contexts.
+"""Is one method better than another? Compares their successes in pairs, on the same evaluation contexts.
 
 Two methods that were evaluated on the same contexts with the same seeds are compared context by context: hard contexts
-are hard for both, and what is common to both falls out of the difference.
+are hard for both, and the difference cancels what is common to both.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ COMPARISON_COLUMNS = (
     *("task", "label_unit", "demonstrations", "labels", "reference", "method"),
     *("difference", "low", "high", "p", "p_holm", "contexts", "seeds", "n"),
 )
-REFERENCE = "koap"  # that all other methods are compared with
+REFERENCE = "koap"  # all other methods are compared with it
 _FLIPS = 10_000
 _RESAMPLES = 4_000
 _CHUNK = 500
@@ -40,32 +40,32 @@ class Comparison:
     low: float  # ends of its 95 % interval
     high: float
     p: float  # two-sided, of the hypothesis of no difference
-    contexts: int  # that both have
-    seeds: int  # training seeds that both have
-    n: int  # pairs of rollouts behind it
+    contexts: int  # common to both
+    seeds: int  # training seeds common to both
+    n: int  # compared pairs of rollouts
 
 
 def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, errors: bool = False) -> Comparison | None:
-    r"""Compares two methods on what both have: equal training seed, context and evaluation seed.
+    r"""Compares two methods on the rollouts of equal training seed, context and evaluation seed.
 
-    With :math:`d_{sc}` the difference of the successes for training seed s in context c, averaged over rollouts of that
-    context, the estimate is the mean over contexts of :math:`\bar d_c`, itself the mean over training seeds.
+    Let :math:`d_{sc}` be the difference of the successes for training seed s in context c, averaged over rollouts of
+    that context, and :math:`\bar d_c` its mean over training seeds. The estimate is the mean of :math:`\bar d_c`.
 
-    The interval resamples contexts *and* training seeds, since a reader wants to know what the next training would
-    give. Of S seeds S - 1 are drawn: a resample of all S would understate the variance of their mean by a factor
-    (S - 1) / S. With one seed it holds for that one training only. Where every difference is the same, the interval is
-    widened by the rule of three, 3 / contexts: what contexts that were not seen could hide.
+    The interval resamples contexts *and* training seeds, as it should cover a further training. Of S seeds, S - 1 are
+    drawn: a resample of all S would understate the variance of their mean by a factor (S - 1) / S. With one seed, the
+    interval holds for that training only. If all differences are equal, the interval is widened by the rule of three,
+    3 / contexts, for contexts that were not seen.
 
-    The p-value flips signs of :math:`\bar d_c`: for these trained networks, could the advantage be chance of the
-    contexts? It says nothing about other training seeds, so it may be small while the interval holds 0.
+    The p-value flips signs of :math:`\bar d_c`. It tests whether the choice of contexts explains the advantage of
+    these trained networks. It ignores other training seeds, so it may be small while the interval contains 0.
 
-    Simulated with 60 contexts: where training seeds shift a method's logit of success by a standard deviation of 0.5,
-    95 % intervals hold the truth in 94 to 97 % of cases for 2, 3 or 5 seeds (63 % for a single one), and where seeds do
-    not matter in more than 99 %. The p-value is below 0.05 in 3 to 6 % of cases without a difference where seeds do not
-    matter, but in 27 to 32 % where they do: then the interval is what to go by.
+    Simulated with 60 contexts: if training seeds shift a method's logit of success by a standard deviation of 0.5,
+    95 % intervals contain the truth in 94 to 97 % of cases for 2, 3 or 5 seeds (63 % for a single one); if seeds do
+    not matter, in more than 99 %. Without a true difference, the p-value is below 0.05 in 3 to 6 % of cases if seeds do
+    not matter, but in 27 to 32 % if they do: then rely on the interval.
 
-    Either method gives outcomes by training seed. Where these are ``errors``, which have no bounds, a single trajectory
-    has no interval (NaN). None is returned if the two share nothing; the same arguments always give the same numbers.
+    Both methods have outcomes by training seed. With ``errors``, which are unbounded, a single trajectory has no
+    interval (NaN). Returns None if the two share nothing. The same arguments always give the same numbers.
     """
     shared = {seed: first[seed].keys() & second[seed].keys() for seed in first.keys() & second.keys()}
     seeds = sorted(seed for seed, keys in shared.items() if keys)
@@ -84,7 +84,7 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
     low, high = _interval(difference, there)
     if errors:
         low, high = (low, high) if len(contexts) > 1 else (math.nan, math.nan)
-    elif low == high:  # nothing varied: resampling cannot say more, but other contexts could
+    elif low == high:  # nothing varied, but unseen contexts could: rule of three
         reach = min(3 / len(contexts), 1.0)
         low, high = max(low - reach, -1.0), min(high + reach, 1.0)
     return Comparison(
@@ -99,11 +99,11 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
 
 
 def _interval(difference: np.ndarray, there: np.ndarray) -> tuple[float, float]:
-    """The 95 % interval between percentiles of the mean difference when seeds and contexts are drawn anew."""
+    """Returns the 95 % percentile interval of the mean difference under resampling of seeds and contexts."""
     generator = np.random.default_rng(0)
     seeds, contexts = difference.shape
     values = []
-    for _ in range(_RESAMPLES // _CHUNK):  # in parts: many contexts would fill the memory
+    for _ in range(_RESAMPLES // _CHUNK):  # in chunks, as many contexts would fill the memory
         seed_weight = generator.multinomial(max(seeds - 1, 1), np.full(seeds, 1 / seeds), _CHUNK)
         context_weight = generator.multinomial(contexts, np.full(contexts, 1 / contexts), _CHUNK)
         number = seed_weight @ there.astype(float)  # [draws, contexts]
@@ -116,21 +116,21 @@ def _interval(difference: np.ndarray, there: np.ndarray) -> tuple[float, float]:
 
 
 def sign_flip_p(differences: Sequence[float]) -> float:
-    """Two-sided p-value of a mean of 0, from flipping the signs of independent differences, one per context.
+    """Returns the two-sided p-value of a mean of 0, by flipping signs of independent differences, one per context.
 
-    Up to 13 of them all flips are counted; beyond, 10,000 drawn ones, the same in every call, and the observed one
-    among them, so that the p-value is never below 2 / 10,001.
+    For up to 13 differences all flips are counted, else 10,000 random ones (the same in every call) and the observed
+    one, so that the p-value is never below 2 / 10,001.
     """
     values = np.asarray(differences, dtype=float)
     values = values[values != 0]
-    if len(values) < 2:  # a single one may as well be turned round
+    if len(values) < 2:  # either sign of a single difference is equally likely
         return 1.0
     options = {"permutation_type": "samples", "n_resamples": _FLIPS, "vectorized": True, "random_state": 0}
     return float(permutation_test((values,), np.mean, **options).pvalue)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's correction: p-values adjusted so that the chance of any false alarm stays below the level; None stays."""
+    """Adjusts p-values by Holm's method, which bounds the chance of any false positive by the level; keeps None."""
     order = sorted((index for index, p in enumerate(p_values) if p is not None), key=lambda index: p_values[index])
     adjusted: list[float | None] = [None] * len(p_values)
     largest = 0.0
@@ -143,9 +143,9 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> list[dict[str, Any]]:
     """Compares KOAP with every other method at every share of labels, by the outcomes of each cell's ``run``.
 
-    A row of :data:`COMPARISON_COLUMNS` per other method and share is returned. ``difference`` is KOAP's success minus
-    the other's (or error, trajectory by trajectory in place of contexts); ``p_holm`` is corrected over all rows; what
-    cannot be compared is None. Cells that are not done take no part.
+    Returns a row of :data:`COMPARISON_COLUMNS` per other method and share. ``difference`` is KOAP's success minus the
+    other's (or errors, with trajectories as contexts). ``p_holm`` is corrected over all rows. Entries that cannot be
+    compared are None. Cells that are not done are ignored.
     """
     compared: list[dict[str, Any]] = []
     for place, methods in group_cells(rows).items():

@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Both tables of the paper as data, 165 cells, and measured cells in their layout beside them.
+"""Both tables of the paper as data, 165 cells, next to measured cells in the same layout.
 
-A cell is a mean success and what the paper prints after its ``+-``, presumably the standard deviation over seeds. The
-paper's Stacking, which counts one box, is :data:`~torchrl_koap.tasks.TASKS`' ``stacking_unobserved_joints`` (its state)
-and, with the joints observed, ``stacking_1``. What the paper does not have is None here, never an estimate.
+A cell is a mean success and the number after the paper's ``+-``, presumably the standard deviation over seeds. The
+paper's Stacking, which counts one box, is ``stacking_unobserved_joints`` (its state) of
+:data:`~torchrl_koap.tasks.TASKS` and, with the joints observed, ``stacking_1``. Cells that the paper lacks are None.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def _content() -> dict[str, Any]:
 
 
 def paper_cells(table: int) -> list[PaperCell]:
-    """All cells of table 1 (methods) or 2 (variants); a task that stands for one of the paper's has them as well."""
+    """Returns all cells of table 1 (methods) or 2 (variants), for every task that stands for one of the paper's."""
     return [
         PaperCell(task, method, level, shares[level - 1] / 100, round(success / 100, 4), round(spread / 100, 4))
         for name, methods in _content()["tables"][str(table)].items()
@@ -61,18 +61,18 @@ def paper_cells(table: int) -> list[PaperCell]:
 
 
 def paper_cell(task: str, method: str, level: int) -> PaperCell | None:
-    """A cell of the paper, None if it has no such one; of both tables the first; level 1 has the fewest labels."""
+    """Returns a cell of the paper's table 1, else 2, or None; level 1 has the fewest labels."""
     return _by_place().get((task, method, level))
 
 
 @functools.cache
 def _by_place() -> dict[tuple[str, str, int], PaperCell]:
-    cells = [cell for table in (2, 1) for cell in paper_cells(table)]  # table 1 goes before
+    cells = [cell for table in (2, 1) for cell in paper_cells(table)]  # table 1 overrides table 2
     return {(cell.task, cell.method, cell.level): cell for cell in cells}
 
 
 def paper_points(task: str) -> dict[str, list[tuple[float, float]]]:
-    """The cells of a task in both tables, each once: by method shares of the labels and successes in 0..1."""
+    """Returns the cells of a task in both tables, each once: label shares and successes in 0..1 by method."""
     points: dict[str, list[tuple[float, float]]] = {}
     for cell in _by_place().values():
         if cell.task == task:
@@ -98,7 +98,7 @@ class Entry:
 
     @property
     def text(self) -> str:
-        """Measured success and its interval in percent and, in brackets, the paper's mean."""
+        """Measured success and its interval in percent and, in brackets, the paper's success and spread."""
         if self.success is None:
             here = "failed" if self.measured is not None and self.measured.failed else "not run"
         else:
@@ -109,9 +109,9 @@ class Entry:
 
 
 def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
-    """Cells of all tasks, methods and levels that occur among some rows, those that were not run included.
+    """Returns entries for all tasks, methods and levels that occur in rows, cells that were not run included.
 
-    Cells of tasks that nobody registered, and at shares that are no label level, are left out.
+    Cells of tasks that are not registered, and at shares that are not a label level, are left out.
     """
     found: dict[tuple[str, int, str], Summary] = {}
     for item in summarise(rows):
@@ -129,7 +129,7 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
 
 
 def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
-    """The table as text: a row per task and level, a column per method."""
+    """Returns the table as text: a row per task and level, a column per method."""
     lines: dict[tuple[str, int], dict[str, str]] = {}
     for entry in entries:
         line = lines.setdefault(
@@ -140,16 +140,16 @@ def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
 
 
 def above_the_paper(entries: Sequence[Entry], method: str = "koap") -> tuple[int, int]:
-    """In how many cells a method succeeds more often than the paper's, of how many that both have."""
+    """Counts the cells in which a method succeeds more often than the paper's, and the cells that both have."""
     both = [entry for entry in entries if entry.method == method and entry.paper and entry.success is not None]
     return sum(entry.success > entry.paper.success for entry in both), len(both)
 
 
 def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, float, float, float]]]:
-    """Success averaged over the tasks at every level, by method: level, mean and the ends of its 95 % interval.
+    """Averages success over the tasks at every level, by method: level, mean and the ends of its 95 % interval.
 
-    A method has a point where every task has a cell of it that is done, so that all points are of the same tasks. Its
-    interval combines the Wilson intervals of the cells by the squares of their halves (Newcombe's method).
+    A method has a point only if its cell is done for every task, so that all points average the same tasks. The
+    interval combines the Wilson intervals of the cells: squares of their halves add up (Newcombe's method).
     """
     lines: dict[str, list[tuple[int, float, float, float]]] = {}
     number = len({entry.task for entry in entries})
@@ -167,7 +167,7 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
 
 
 def draw_average(entries: Sequence[Entry], path: str | Path) -> None:
-    """Draws success averaged over tasks against the label level; tasks' default methods together have a line too."""
+    """Draws success averaged over tasks against the label level, measured and of the paper."""
     averages = average_over_tasks(entries)
     paper: dict[str, list[tuple[int, float]]] = {}
     for method, points in averages.items():
@@ -181,8 +181,8 @@ def draw_average(entries: Sequence[Entry], path: str | Path) -> None:
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Writes ``paper_table.md`` and the picture of success averaged over several tasks into a folder.
 
-    Returned are the table's ``rows``, a ``sentence`` on KOAP and the paper's, and the path of the ``picture``, None
-    without anything to average. If no cell lies at a label level nothing is written.
+    Returns the table's ``rows``, a ``sentence`` that compares KOAP with the paper's, and the path of the ``picture``,
+    None if there is nothing to average. Writes nothing if no cell is at a label level.
     """
     folder, entries = Path(folder), paper_entries(rows)
     table = layout_rows(entries)

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Pictures of a study: a measure against the labels, a line per method; success averaged over tasks.
 
-Colours stay apart for colour-blind readers; markers and dashes tell the lines apart without any colour.
+Colours are safe for colour-blind readers; markers and dashes distinguish the lines without colour.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#5
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 _DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
 _HOLLOW = "\nhollow, dashed: the paper, whose demonstrations are others"  # in titles
-_BANDS = 3  # more bands than these hide each other: whiskers instead
-_ASIDE = 0.025  # inches between those of two methods
+_BANDS = 3  # more lines have whiskers, as more bands hide each other
+_ASIDE = 0.025  # inches between the whiskers of two methods
 
 
 @dataclass
 class _Line:
-    """A named line of points ``(x, y, low, high)``, the paper's ``(x, y)`` beside it, and how it is drawn."""
+    """A named line of points ``(x, y, low, high)``, the paper's points ``(x, y)``, and its style."""
 
     name: str
     style: Mapping[str, Any]
@@ -56,7 +56,7 @@ class _Line:
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour, marker and linestyle of every method, by its place; no two of the first 27 look alike."""
+    """Returns colour, marker and linestyle of every method, by its place; the first 27 all differ."""
     return {
         method: {
             "color": _COLORS[index % len(_COLORS)],
@@ -80,10 +80,10 @@ def plot_measure(
 ) -> None:
     """Draws a measure of every method with its ends, a panel per entry of ``by``.
 
-    The measure is one of :data:`MEASURES`, in a ``unit``; the horizontal axes are of :data:`AXES`, labels counted in
-    ``label_unit``. Along ``"demonstrations"`` there is a line per method and share of labels that was run with several
-    of them. The ``paper`` has by method shares of the labels and successes: hollow and dashed, along ``"labels"``
-    alone. ``methods`` are all of them in the order that gives the colours.
+    The measure is one of :data:`MEASURES`, in ``unit``; the horizontal axes are of :data:`AXES`, labels counted in
+    ``label_unit``. The panel ``"demonstrations"`` has a line per method and share of labels that was run with several
+    shares of demonstrations. ``paper`` has label shares and successes by method, drawn hollow and dashed in the panel
+    ``"labels"``. ``methods`` are all methods, in the order of their colours.
     """
     head, title, factor = MEASURES[measure]
     panels = {name: _lines(summaries, name, measure, factor, methods) for name in by}
@@ -103,7 +103,7 @@ def plot_measure(
         set_title(axes, title if place == 0 else "")
         if measure.endswith("error"):
             _scale_errors(axes, lines)
-            if measure == "relative_action_error":  # of a controller that always gives the mean action
+            if measure == "relative_action_error":  # 1: a controller that always gives the mean action
                 axes.axhline(1, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
         else:
             _scale_shares(axes, 100 if measure == "success" else 1)
@@ -120,7 +120,7 @@ def plot_average(
 ) -> None:
     """Draws success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
 
-    By method ``averages`` has level, mean and the ends of its interval, the ``paper`` level and mean, all in 0..1.
+    By method, ``averages`` has level, mean and the ends of its interval, ``paper`` level and mean; successes in 0..1.
     """
     lines, styles = [], method_styles(list(averages))
     for method, points in averages.items():
@@ -141,15 +141,15 @@ def plot_average(
 
 
 def _draw_lines(axes: Axes, lines: Sequence[_Line]) -> None:
-    """Draws bands, or whiskers beside each other where there are many lines or each has one point."""
+    """Draws bands, or whiskers next to each other for many lines or lines of one point."""
     whiskers = len(lines) > _BANDS or all(len(line.points) == 1 for line in lines)
     for index, line in enumerate(lines):
         (x, y, low, high), order = zip(*line.points, strict=True), 3 + (len(lines) - index) / 100
         color = line.style["color"]
-        # moved on the page, not along the axis: the same distance at every scale
+        # shifted in inches, not in data units: the same distance at every scale
         aside = _ASIDE * (index - (len(lines) - 1) / 2) if whiskers else 0
         where = axes.transData + ScaledTranslation(aside, 0, axes.figure.dpi_scale_trans)
-        if whiskers or len(x) == 1:  # a band needs two places
+        if whiskers or len(x) == 1:  # a band needs two points
             axes.vlines(x, low, high, color=color, linewidth=0.9, alpha=0.55, zorder=order - 1, transform=where)
         else:
             axes.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0, zorder=order - 1)
@@ -167,7 +167,7 @@ def _name_lines(figure: Figure, lines: Sequence[_Line]) -> None:
 def _lines(
     summaries: Sequence[Summary], by: str, measure: str, factor: float, methods: Sequence[str] | None
 ) -> list[_Line]:
-    """A line per method; along the demonstrations, where several shares are labelled, one per method and share."""
+    """Returns a line per method; by demonstrations, with several label shares, one per method and share."""
     methods = list(methods or dict.fromkeys(item.method for item in summaries))
     shares = sorted({item.labels for item in summaries})
     several = by == "demonstrations" and len(shares) > 1
@@ -177,7 +177,7 @@ def _lines(
         if place is None or found is None:
             continue
         name, style, share = item.method, styles[item.method], shares.index(item.labels)
-        if several:  # colour tells the method, marker and dash the share
+        if several:  # colours stand for methods, markers and dashes for shares
             name = f"{name}, {percent(item.labels)}"
             style = style | {"marker": _MARKERS[share % len(_MARKERS)], "linestyle": _DASHES[share % len(_DASHES)]}
         values = (factor * value for value in (found.mean, found.low, found.high))
@@ -195,7 +195,7 @@ def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
     axes.set_yscale("log")
     ends = [end for line in lines for *_, low, high in line.points for end in (low, high)]
     low, high = min(ends), max(ends)
-    wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend
+    wide = max(1.15, (2.2 * low / high) ** 0.5)  # the axis spans a factor of two at least: noise must not look large
     axes.set_ylim(low / wide, high * wide)
     span = high / low * wide**2
     axes.yaxis.set_major_locator(LogLocator(subs=range(1, 10) if span < 5 else (1, 2, 5) if span < 100 else (1,)))
@@ -204,7 +204,7 @@ def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
 
 
 def _log_x(axes: Axes, lines: Sequence[_Line], *, ticks: bool) -> None:
-    """Logarithmic axis that ends at the data; ``ticks`` at the places themselves, where there is room."""
+    """Makes the axis logarithmic, with limits at the data and, for ``ticks``, ticks at the points that have room."""
     places = sorted({value for line in lines for value in [*line.positions, *(place for place, _ in line.paper)]})
     low, high = places[0], places[-1]
     margin = max(1.12, (high / low) ** 0.06) if len(places) > 1 else 2.0

@@ -29,8 +29,8 @@ _CAPTIONS = {
     "mode_entropy": (
         "Modes against the labels",
         "Entropy of the modes of successful rollouts, 1 if all are equally frequent: mean over seeds with a success,"
-        " with the best and the worst seed. With few successes it says little. Success alone can be had by playing"
-        " one demonstration again, wherever episodes start alike; then the entropy is 0.",
+        " with the best and the worst seed. It is unreliable with few successes. If episodes start alike, replaying"
+        " one demonstration can succeed; then the entropy is 0.",
     ),
     "action_error": (
         "Action error against the labels",
@@ -40,19 +40,19 @@ _CAPTIONS = {
     ),
     "relative_action_error": (
         "Action error against the labels",
-        "Mean over seeds, with the best and the worst seed. There is no environment to succeed in, so actions decoded"
-        " from recorded states are compared with recorded ones: on hidden labels where the data have"
-        " some (read for this only), else on those seen, a labelled trajectory left out at a time. 1 (dashed): no"
-        " better than always giving the mean action. Columns of every unit count alike.",
+        "Mean over seeds, with the best and the worst seed. There is no environment, so actions decoded from recorded"
+        " states are compared with recorded ones: on hidden labels if the data have some (read for this only), else on"
+        " seen labels, leaving out one labelled trajectory at a time. 1 (dashed): no better than always giving the"
+        " mean action. Columns of every unit count alike.",
     ),
     "demonstrations": (
         "Success against the demonstrations used",
         "How much demonstrations without labels improve success: the same share of labels, but only part of all"
-        " demonstrations known at all.",
+        " demonstrations used.",
     ),
 }
 _MIXED = (
-    ' Points of one line are of different recordings here: see "action errors on" in the table. Compare methods at one'
+    ' Points of one line are of different recordings: see "action errors on" in the table. Compare methods at one'
     " share of labels, not shares of labels."
 )
 
@@ -67,7 +67,7 @@ def write_study_report(
 ) -> Path:
     """Writes ``table.md``, ``comparisons.csv``, pictures and ``index.html`` into the folder of a study.
 
-    Where windows are labelled, as in the paper, its figures stand beside those that were measured.
+    If windows are labelled, as in the paper, its figures are shown next to the measured ones.
 
     Rows are cells of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`, outcomes those of
     :func:`~torchrl_koap.studies.paired_comparison.compare_cells`; the page shows the options of the study.
@@ -98,7 +98,7 @@ def write_study_report(
 
 
 def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Two sentences on the cells, and what their methods are."""
+    """Returns two sentences on the cells, and the titles of their methods."""
     count = Counter(row["status"] for row in rows)
     names = {name: list(dict.fromkeys(row.get(name) for row in rows)) for name in ("task", "method", "seed")}
     unit = list(dict.fromkeys(plural_of(row.get("label_unit") or "") for row in rows))
@@ -116,7 +116,7 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) -> list[dict[str, Any]]:
-    """Draws the pictures of every task and unit of the labels; what the page needs to show them."""
+    """Draws the pictures of every task and label unit; returns what the page needs to show them."""
     groups = list(dict.fromkeys((item.task, item.label_unit) for item in summaries))
     figures = []
     for task, label_unit in groups:
@@ -150,7 +150,7 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
 def _figure(
     folder: Path, name: str, kind: str, items: Sequence[Summary], more: str = "", **options: Any
 ) -> dict[str, Any]:
-    """Draws a picture; what the page needs to show it."""
+    """Draws a picture; returns what the page needs to show it."""
     source, (head, caption) = f"{FOLDER}/{name}_{kind}.png", _CAPTIONS[kind]
     plot_measure(items, folder / source, "success" if kind == "demonstrations" else kind, **options)
     wide = kind == "success"  # two panels need the width of the page
@@ -172,7 +172,7 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], *, offline: bool) ->
         | {
             "labels": percent(row["labels"]),
             f"{REFERENCE} against": row["method"],
-            head: "nothing in common" if row["difference"] is None else text(row["difference"]),
+            head: "no common rollouts" if row["difference"] is None else text(row["difference"]),
             "95 % interval": "–" if row["low"] is None else f"{text(row['low'])} to {text(row['high'])}",
             "p": _p_text(row["p"]),
             "p (Holm)": _p_text(row["p_holm"]),

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Runs the missing cells of a study, resumable at any moment, and writes its table and report."""
+"""Runs the missing cells of a study, which may be interrupted at any moment, and writes its table and report."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import fingerprint
 
 _FILE = "study.json"
-# what a later call may add to; all else must be as it was
+# options to which a later call may add; all others must stay the same
 _LISTS = ("tasks", "datasets", "planners", "methods", "labels", "levels", "demonstrations")
 _MAY_CHANGE = (*_LISTS, "seeds", "first_seed_only", "out", "run.plugins")
 
 
 @dataclass(frozen=True)
 class StudyResult:
-    """What a study found."""
+    """Results of a study."""
 
     rows: list[dict[str, Any]]  # cells as in cells.csv
-    counts: Mapping[str, int]  # how many of them are done, failed and missing
+    counts: Mapping[str, int]  # numbers of cells that are done, failed and missing
     report: Path  # the page
 
 
@@ -47,16 +47,16 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
     """Runs the missing cells of a study and writes its report; ``koap curve`` calls this.
 
     Args:
-        study (Study): what to compare on what, and where to write it.
-        machines (Machines, optional): where the cells are made.
+        study (Study): what to compare, and where to write it.
+        machines (Machines, optional): where the cells run.
 
     Returns:
-        StudyResult: its cells, how many are done, failed and missing, and where the report is.
+        StudyResult: its cells, the numbers of cells that are done, failed and missing, and the path of the report.
 
     Raises:
-        ValueError: for unknown names, shares out of range or that select nothing; before any work.
+        ValueError: before any work, for unknown names, and shares that are out of range or select nothing.
         RunDirectoryError: if the folder holds something else, a study with other settings or demonstrations, or one
-            that is being worked on.
+            on which another process works.
         PluginError: if a plugin cannot be imported.
 
     Examples:
@@ -82,7 +82,7 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         facts[name]["task_definition"] = given and study.task(name).definition()
         check_data(_begun(study, name), facts[name])
     with root.locked("koap curve", "lock"):
-        _check_folder(study)  # another one may have finished here in the meantime
+        _check_folder(study)  # another process may have finished here since the first check
         for name in study.tasks:
             _record(study, cells, name)
         whole = _together(study)
@@ -103,12 +103,12 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
 
 
 def _begun(study: Study, task: str) -> RunDirectory:
-    """Where is kept with which demonstrations, and versions of packages, the cells of a task were begun."""
+    """Returns the folder that records the demonstrations and package versions that a task's cells started with."""
     return RunDirectory(study.out / "begun_with" / task)
 
 
 def _read_study(folder: Path) -> Study | None:
-    """Reads what an earlier call in a folder asked for, None if there was none."""
+    """Reads the request of an earlier call in a folder, None if there was none."""
     run = RunDirectory(folder)
     if not (run.path / _FILE).exists():
         return None
@@ -116,50 +116,50 @@ def _read_study(folder: Path) -> Study | None:
 
 
 def _together(study: Study) -> Study:
-    """A complete study and what earlier calls in its folder asked for besides."""
+    """Returns the union of a complete study and the requests of earlier calls in its folder."""
     earlier = _read_study(study.out)
     if earlier is None:
         return study
     lists: dict[str, Any] = {name: union(vars(earlier)[name], vars(study)[name]) for name in _LISTS}
     others = [text for text in earlier.datasets if text.partition("=")[0] not in study.tasks]
-    lists["datasets"] = union(others, study.datasets)  # where each is now
+    lists["datasets"] = union(others, study.datasets)  # present folders: a data set may have moved
     first_seed_only = tuple(level for level in study.first_seed_only if level in earlier.first_seed_only)
     return replace(study, **lists, seeds=max(study.seeds, earlier.seeds), first_seed_only=first_seed_only)
 
 
 def _check_folder(study: Study) -> None:
-    """Refuses a folder that holds something else, or a study with other settings, and names what differs."""
+    """Raises a RunDirectoryError if the folder holds something else, or a study with other settings, and names them."""
     path, earlier = study.out, _read_study(study.out)
     if earlier is None:
-        # what a study leaves that was killed before it came to write its options
+        # a study that is killed before it writes its options leaves these
         own = ("lock", "demonstrations", f".{_FILE}.")
         if path.exists() and not all(entry.name.startswith(own) for entry in path.iterdir()):
-            raise RunDirectoryError(f"{path} is not empty and no folder of `koap curve`; choose another --out")
+            raise RunDirectoryError(f"{path} is not empty and not a folder of `koap curve`; choose another --out")
         return
     changed = changed_options(earlier, study)
-    told = [f"{name} ({attrgetter(name)(earlier)})" for name in changed if name not in _MAY_CHANGE]
+    different = [f"{name} ({attrgetter(name)(earlier)})" for name in changed if name not in _MAY_CHANGE]
     both = {*earlier.tasks} & {*study.tasks}
-    # whether a data set that was named holds the same, wherever it lies, says its checksum
+    # a checksum, not the path, decides whether a named data set is the same
     if any((earlier.given_dataset(task) is None) != (study.given_dataset(task) is None) for task in both):
-        told.append(f"datasets ({', '.join(earlier.datasets)})")
+        different.append(f"datasets ({', '.join(earlier.datasets)})")
     if any(earlier.given_planner(task) != study.given_planner(task) for task in both):
-        told.append(f"planners ({', '.join(earlier.planners)})")
-    if told:
-        raise RunDirectoryError(f"{path} holds a study with another {', '.join(told)}; choose another --out")
+        different.append(f"planners ({', '.join(earlier.planners)})")
+    if different:
+        raise RunDirectoryError(f"{path} holds a study with another {', '.join(different)}; choose another --out")
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of all sections that say something."""
+    """Returns the options of all sections that are neither None nor empty."""
     known = {name: _given(value) if isinstance(value, Mapping) else value for name, value in options.items()}
     return {name: value for name, value in known.items() if value not in (None, [], {})}
 
 
 def _first_look(study: Study, task: Task) -> TensorDictBase | None:
-    """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
+    """Returns recorded demonstrations, else dummy ones of the future number; None if their lengths matter."""
     if study.has_data(task.name):
         return open_dataset(study.dataset_folder(task.name), task=task)[0]
     if task.env is None:
-        raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name --datasets")
+        raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: give --datasets")
     if study.label_unit != "trajectory":
         return None
     number = study.record or task.defaults.demonstrations
@@ -179,10 +179,10 @@ def _record(study: Study, cells: Sequence[Cell], name: str) -> None:
 
 
 def _check_labels(study: Study, cells: Sequence[Cell], task: str, data: TensorDictBase | None) -> None:
-    """Refuses before any work what would fail in a cell: labels that select nothing, shares below the labelled."""
+    """Raises, before any work, a ValueError for labels that select nothing or shares smaller than the labelled part."""
     if data is None:  # recorded later
         return
-    # windows of another seed lie in another number of trajectories
+    # check every seed: its windows may lie in another number of trajectories
     wanted = {(cell.labels, cell.demonstrations, cell.seed): cell for cell in cells if cell.task == task}
     for cell in wanted.values():
         labelled, _ = study.train_config(cell).labels.budget(cell.seed).apply(data)
@@ -197,7 +197,7 @@ def _write_rows(study: Study, results: Mapping[Cell, Result]) -> list[dict[str, 
 
 
 def _work(study: Study, cells: Sequence[Cell], results: dict[Cell, Result], machines: Machines) -> None:
-    """Does the cells that are not done, and the planners that they share before; reads each once, when it has ended."""
+    """Runs shared planners, then the cells that are not done; reads the result of each once, when it has ended."""
     first: list[Job] = []
     jobs: dict[Path, Job] = {}
     for cell in cells:
@@ -208,14 +208,14 @@ def _work(study: Study, cells: Sequence[Cell], results: dict[Cell, Result], mach
             needs = planner
             if planner not in {job.folder for job in first}:
                 first.append(Job(planner))
-                with suppress(OSError):  # where that cannot be written its own process will say why
+                with suppress(OSError):  # if this cannot be written, the job itself reports why
                     prepare_cell(planner, study.planner_config(cell), None)
         folder = study.out / cell.folder
         jobs[folder] = Job(folder, needs)
         with suppress(OSError):
             prepare_cell(folder, study.train_config(cell), study.eval_config(cell))
     places = {study.out / cell.folder: cell for cell in cells}
-    alone = [job for job in jobs.values() if job.needs is None]  # they need not wait for a planner
+    alone = [job for job in jobs.values() if job.needs is None]  # these do not wait for a planner
     ordered = [*first, *alone, *(job for job in jobs.values() if job.needs is not None)]
     with progress_bar(len(ordered), "cells", unit="cell", smoothing=0.1) as bar:
         with closing(launch(run_cell, ordered, machines)) as ended:

@@ -28,7 +28,7 @@ from torchrl_koap.training.trained import Trained, build_networks
 from torchrl_koap.vision.encoder import cameras_of
 
 PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
-# options of a Study by name, those of its sections in mappings of their own
+# options of a Study by name, with a mapping for each section
 USUAL: dict[str, Any] = {
     "methods": (
         *("koap", "koap_untrained", "koap_labelled_only", "linear_steps", "linear", "dd", "vae", "lapo", "dp"),
@@ -65,7 +65,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "labels": (0.01,),
         "demonstrations": (0.1, 0.25, 0.5, 1.0),
     },
-    # a table that can be read, not one to be cited
+    # for a first look: too few rollouts and seeds to be cited
     "quick": _TABLE_1
     | {
         "levels": (1,),
@@ -76,11 +76,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "evaluation": {"episodes": 10},
     },
 }
-# options of the configurations below that a study decides itself, and how
+# options of the sections that a study sets itself, and the reason
 _ONE_THREAD = "a cell has one thread; --workers says how many run at a time"
 DECIDED = {
     "run.seed": "cells have the seeds 0, 1, ..., as many as --seeds says",
-    "run.resume": "it goes on by itself",
+    "run.resume": "it always resumes",
     "run.threads": _ONE_THREAD,
     "planner.source": "name runs with --planners",
     "evaluation.out": "a cell is evaluated in its own folder",
@@ -96,10 +96,10 @@ class Study:
     """Measure success against the number of labels: tasks x methods x shares of labels x seeds.
 
     Attributes:
-        out: folder of the study; the same command goes on where it was interrupted, and may add tasks, methods, shares
-            or seeds.
+        out: folder of the study; the same command resumes an interrupted study, and may add tasks, methods, shares or
+            seeds.
         preset: a comparison of the paper, "table1" (methods), "table2" (variants), "demonstrations" (planner and
-            controller know a share of them) or "quick" (a small table1); it fills in what is not given.
+            controller use a share of them) or "quick" (a small table1); it fills in options that are not given.
         tasks: names of tasks (default: that of the data set, else "avoiding").
         datasets: folder of the demonstrations of a single task, or TASK=FOLDER for each (default: scripted ones are
             recorded in the folder, once for all cells).
@@ -107,9 +107,9 @@ class Study:
         methods: names in torchrl_koap.training.methods.METHODS.
         labels: shares of the units that keep their labels; 1 is all of them, not one as for `koap train`.
         levels: label levels of the paper for every task (1: fewest labels) instead of shares.
-        first_seed_only: levels that are trained with seed 0 alone (default: those of the preset).
+        first_seed_only: levels that are trained with seed 0 only (default: those of the preset).
         label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
-        demonstrations: shares of the demonstrations that planner and controller know at all (default: 1).
+        demonstrations: shares of the demonstrations that planner and controller use at all (default: 1).
         seeds: number of seeds of label choice and training (default: 3).
         planners: finished run, or pretrained:NAME, whose planner all cells of a task share, or TASK=RUN for each
             (default: one is trained). It must be trained on the same data; this is not checked.
@@ -140,31 +140,31 @@ class Study:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self):
-        object.__setattr__(self, "out", Path(self.out))  # so that a string will do in Python
+        object.__setattr__(self, "out", Path(self.out))  # accepts a string in Python
 
     def given_dataset(self, task: str) -> str | None:
-        """The data set that was named for a task."""
+        """Returns the data set that was named for a task, or None."""
         return _of_task(self.datasets, task)
 
     def given_planner(self, task: str) -> str | None:
-        """The run that was named for a task, whose planner is shared."""
+        """Returns the run that was named for a task, whose planner is shared, or None."""
         return _of_task(self.planners, task)
 
     def task(self, name: str) -> Task:
-        """The task of a name: registered, or the one that its data set holds."""
+        """Returns a task by name: the registered one, or that of its data set."""
         dataset = self.given_dataset(name)
         return get_task(name) if dataset is None else find_task_of(dataset, name)
 
     def dataset_folder(self, task: str) -> Path:
-        """The folder of a task's demonstrations."""
+        """Returns the folder of a task's demonstrations."""
         return Path(self.given_dataset(task) or self.out / "demonstrations" / task)
 
     def has_data(self, task: str) -> bool:
-        """Whether the demonstrations of a task were named, or are recorded already."""
+        """Returns whether the demonstrations of a task were named, or are recorded already."""
         return self.given_dataset(task) is not None or (self.dataset_folder(task) / "ted").exists()
 
     def planner_folder(self, cell: Cell) -> Path | None:
-        """The run whose planner a cell takes over, None for a method without one."""
+        """Returns the run whose planner a cell uses, None for a method without one."""
         if not get_method(cell.method).plans:
             return None
         return Path(
@@ -172,7 +172,7 @@ class Study:
         )
 
     def cells(self) -> list[Cell]:
-        """Lists the cells of a complete study in the order asked for; repeated names count once."""
+        """Lists the cells of a complete study in the given order; repeated names count once."""
         for name in self.methods:
             get_method(name)
         for name, shares in (("labels", self.labels), ("demonstrations", self.demonstrations)):
@@ -189,7 +189,7 @@ class Study:
         ]
 
     def _labels_of(self, task: Task, seed: int) -> tuple[float, ...]:
-        """Shares of the labels that are measured with a seed: those asked for, and those of the levels."""
+        """Returns the shares of labels for a seed: the given ones, and those of the levels."""
         shares = task.label_levels
         for level in self.levels:
             if not 1 <= level <= len(shares):
@@ -199,7 +199,7 @@ class Study:
         return union(self.labels, [shares[level - 1] for level in levels])
 
     def planner_config(self, cell: Cell) -> TrainConfig:
-        """How the planner that a cell shares is trained; it knows no label."""
+        """Returns the options for training the planner that a cell shares, which sees no labels."""
         return TrainConfig(
             out=self.planner_folder(cell),
             dataset=str(self.dataset_folder(cell.task)),
@@ -210,7 +210,7 @@ class Study:
         )
 
     def train_config(self, cell: Cell) -> TrainConfig:
-        """How a cell is trained; the defaults of method and task are filled in by training."""
+        """Returns the options for training a cell; training fills in the defaults of method and task."""
         folder = self.planner_folder(cell)
         return TrainConfig(
             out=self.out / cell.folder,
@@ -225,22 +225,22 @@ class Study:
         )
 
     def eval_config(self, cell: Cell) -> EvalConfig:
-        """How a cell is rolled out: cells with the next training seed meet other noise, in the same contexts."""
+        """Returns the options for evaluating a cell: training seeds have the same contexts, but different noise."""
         seed = self.evaluation.seed + NOISE_STEP * cell.seed
         return replace(self.evaluation, seed=seed, threads=1, plugins=self.run.plugins)
 
 
 def _of_task(values: Sequence[str], task: str) -> str | None:
-    """What ``TASK=VALUE`` among some values says for a task."""
+    """Returns VALUE of the first ``TASK=VALUE`` for a task, or None."""
     return next((text.partition("=")[2] for text in values if text.startswith(f"{task}=")), None)
 
 
 def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
-    """Fills in what preset and library know, and the plugins of earlier calls in the folder; paths become absolute."""
+    """Fills in the defaults of preset and library, adds ``plugins`` of earlier calls, and makes paths absolute."""
     plugins = union(plugins, study.run.plugins)
     load_plugins(plugins)
     usual = USUAL | ({} if study.preset is None else lookup(PRESETS, study.preset, "preset"))
-    if study.labels or study.levels:  # neither comes on top of the other
+    if study.labels or study.levels:  # given ones replace the usual ones of both kinds
         usual |= {"labels": (), "levels": ()}
     asked, study = study.planner, fill_in(study, usual)
     study = replace(
@@ -254,15 +254,15 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     runs = [f"{task}={find_run(run).absolute()}" for task, run in _by_task("planners", study.planners, study.tasks)]
     study = replace(study, datasets=tuple(datasets), planners=tuple(runs))
     for name in study.tasks:
-        study.task(name)  # there must be one
+        study.task(name)  # raises for an unknown task
     trains = any(study.given_planner(task) is None for task in study.tasks)
     if asked != PlannerConfig() and not trains and all(get_method(name).plans for name in study.methods):
-        raise ValueError("planner options are not for a study that trains no planner: all are given with --planners")
+        raise ValueError("planner options have no effect: all planners are given with --planners, none is trained")
     return study
 
 
 def _tasks_of(datasets: Sequence[str]) -> tuple[str, ...]:
-    """The tasks that data sets name, else those that they are of."""
+    """Returns the tasks named with the data sets, else those that the data sets hold."""
     named = tuple(text.partition("=")[0] for text in datasets if "=" in text)
     if named or not datasets:
         return named or (DEFAULT_TASK,)
@@ -270,28 +270,28 @@ def _tasks_of(datasets: Sequence[str]) -> tuple[str, ...]:
 
 
 def _by_task(name: str, values: Sequence[str], tasks: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Task and path of every ``TASK=PATH``; a path alone is that of a single task, which has one."""
+    """Yields task and path of every ``TASK=PATH``; the only value for a single task may be just a path."""
     seen: set[str] = set()
     for text in values:
         task, equals, path = text.partition("=")
         if not equals and len(tasks) == len(values) == 1:
             task, path = tasks[0], text
         if not task or not path:
-            raise ValueError(f"{name} must be TASK=FOLDER where there are several tasks or values, got {text!r}")
+            raise ValueError(f"{name} must be TASK=FOLDER if there are several tasks or values, got {text!r}")
         lookup(tasks, task, f"task of {name}:")
         if task in seen:
-            raise ValueError(f"{name} names task {task!r} twice: one folder for each task")
+            raise ValueError(f"{name} names task {task!r} twice: give one folder per task")
         seen.add(task)
         yield task, path
 
 
 def union(one: Sequence[Any], other: Sequence[Any]) -> tuple[Any, ...]:
-    """The entries of one sequence, then those of the other, each once."""
+    """Returns the entries of one sequence, then those of the other, each once."""
     return tuple(dict.fromkeys([*one, *other]))
 
 
 def check_study(study: Study) -> list[Cell]:
-    """Refuses what cannot be done of a complete study without looking at any data, and returns its cells."""
+    """Checks a complete study without reading data and returns its cells; a ValueError says what cannot be done."""
     for name, number in (("seeds", study.seeds), ("record", study.record)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be >= 1, got {number}")
@@ -302,7 +302,7 @@ def check_study(study: Study) -> list[Cell]:
         config = getattr(study, section)
         if getattr(config, field) != getattr(type(config)(), field):
             raise ValueError(f"{name} is not for a study: {why}")
-    for task in study.tasks:  # what evaluation would refuse, when everything is trained
+    for task in study.tasks:  # evaluation would refuse these only after all training
         choose_contexts(study.task(task), study.evaluation)
         if study.evaluation.env is not None:
             find_environment(study.task(task), study.evaluation, cameras_of(study.given_dataset(task)))
@@ -314,7 +314,7 @@ def check_study(study: Study) -> list[Cell]:
 
 
 def _check_networks(study: Study, cell: Cell) -> None:
-    """Refuses a method whose networks, or policy, cannot be built for a task, or for the planner to be shared."""
+    """Raises a ValueError if networks or policy of a method cannot be built for a task or the shared planner."""
     task, config = study.task(cell.task), study.train_config(cell)
     if config.planner.source is not None and study.given_planner(cell.task) is None:  # not trained yet
         config = replace(config, planner=study.planner)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The cells of a study as a file, pooled over training seeds, and as a table; cells that are not done stay counted."""
+"""The cells of a study as a file, pooled over training seeds, and as a table; includes cells that are not done."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Place = tuple[str, str, float, float]
 
 @dataclass(frozen=True)
 class Measure:
-    """A mean with its ends: of ``"success"`` the Wilson 95 % interval, of all others the least and greatest seed."""
+    """A mean with its ends: the Wilson 95 % interval for ``"success"``, else the least and greatest seed."""
 
     mean: float
     low: float
@@ -51,9 +51,8 @@ class Measure:
 class Summary:
     """All seeds of a method at one share of labels.
 
-    ``labels`` and ``demonstrations`` are shares; ``done``, ``failed`` and ``missing`` the seeds whose cell is that.
-    ``measures`` are ``"success"``, ``"seed_success"`` (worst and best seed) and those columns of numbers that some cell
-    has.
+    ``labels`` and ``demonstrations`` are shares; ``done``, ``failed`` and ``missing`` are seeds by the status of their
+    cells. ``measures`` are ``"success"``, ``"seed_success"`` (worst and best seed) and the numeric columns of any cell.
     """
 
     task: str
@@ -67,23 +66,23 @@ class Summary:
     successes: int
     episodes: int
     measures: Mapping[str, Measure]
-    action_errors_on: tuple[str, ...] = ()  # the labels that action errors without an environment are of
+    action_errors_on: tuple[str, ...] = ()  # the labels on which action errors were measured without an environment
     action_error_units: tuple[str, ...] = ()
 
     @property
     def offline(self) -> bool:
-        """Whether cells are done and none was rolled out: a task without an environment."""
+        """Whether cells are done but none was rolled out, for a task without an environment."""
         return bool(self.done) and not self.episodes
 
     def mean(self, name: str) -> float | None:
-        """The mean of a measure, or ``labels`` or ``demonstrations``; None where no cell has it."""
+        """Returns the mean of a measure, or ``labels`` or ``demonstrations``; None if no cell has it."""
         if name in ("labels", "demonstrations"):
             return self.labels if name == "labels" else self.demonstrations
         return self.measures[name].mean if name in self.measures else None
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes rows as csv, aside first; what a row lacks, and what is not a finite number, stays empty."""
+    """Writes rows as csv, atomically; values that are missing or not finite stay empty."""
     with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
@@ -92,24 +91,24 @@ def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, An
 
 def _written(value: Any) -> Any:
     if isinstance(value, str):
-        return " ".join(value.split())  # a reason of several lines becomes one
+        return " ".join(value.split())  # joins the lines of a reason
     return "" if value is None or (isinstance(value, float) and not math.isfinite(value)) else value
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
     """Pools the seeds of every method and share of labels; methods and tasks keep their order, shares ascend.
 
-    The Wilson interval takes every episode for independent. The same contexts recur for every seed, so it is too narrow
-    where seeds differ more than chance: look at the range of the seeds beside it.
+    The Wilson interval assumes independent episodes. But the same contexts recur for every seed, so it is too narrow if
+    seeds differ by more than chance: compare it with the range of the seeds.
 
-    Cells have at least task, method, labels, seed and status; one that occurs twice is an error.
+    Cells have at least task, method, labels, seed and status. Raises a ValueError for a cell that occurs twice.
     """
     places = group_cells(rows).items()
     return [_summary(*place, method, cells) for place, methods in places for method, cells in methods.items()]
 
 
 def group_cells(rows: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, dict[int, Mapping[str, Any]]]]:
-    """Sorts cells by place, method and seed, in the order of :func:`summarise`; one that occurs twice is an error."""
+    """Groups cells by place, method and seed, in the order of :func:`summarise`; a ValueError for a repeated cell."""
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
 
     def setting_of(row: Mapping[str, Any]) -> Place:
@@ -158,7 +157,7 @@ def _summary(task: str, unit: str, demonstrations: float, labels: float, method:
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
-    """The table as text, a row per method and share of labels; columns without any value are left out."""
+    """Returns the table as text, a row per method and share of labels, without columns that have no value."""
     units = {item.label_unit for item in summaries}
     labels = f"labels ({plural_of(*units)})" if len(units) == 1 and "" not in units else "labels"
     error = ", ".join(sorted({unit for item in summaries for unit in item.action_error_units}))
@@ -209,7 +208,7 @@ def _success(item: Summary) -> dict[str, str]:
 
 
 def result_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """What a terminal shows of a study: success, or the action error, of a method at a share of labels."""
+    """Returns what the terminal shows of a study: success, or action error, by method and share of labels."""
     found = {}
     for item in summarise(rows):
         success, error = item.measures.get("success"), item.mean("relative_action_error")
@@ -222,7 +221,7 @@ def result_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
-    """Rows of text with the same keys as a markdown table."""
+    """Returns rows of text with the same keys as a markdown table."""
     if not table:
         return "no cells\n"
     lines = [
@@ -233,7 +232,7 @@ def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The pooled table of all cells in markdown, and below it every cell that is not done with its reason."""
+    """Returns the pooled table of all cells in markdown, followed by every cell that is not done with its reason."""
     text, left = as_markdown(table_rows(summarise(rows))), not_done(rows)
     if left:
         verb = "is" if len(left) == 1 else "are"
@@ -242,7 +241,7 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def not_done(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A line per cell that is not done, with the reason of its failure."""
+    """Returns a line per cell that is not done, with the reason of its failure."""
     left = [row for row in rows if row["status"] != "done"]
     reasons = [" ".join((row.get("reason") or "").split()) for row in left]
     return [
@@ -252,12 +251,12 @@ def not_done(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def cell_name(row: Mapping[str, Any]) -> str:
-    """A cell in words: ``avoiding, koap, 2 % labels, seed 1``."""
+    """Returns a cell in words: ``avoiding, koap, 2 % labels, seed 1``."""
     demonstrations = row.get("demonstrations")
     used = "" if demonstrations in (None, 1.0) else f"{percent(demonstrations)} of the demonstrations, "
     return f"{row['task']}, {row['method']}, {percent(row['labels'])} labels, {used}seed {row['seed']}"
 
 
 def percent(share: float, digits: int | None = None) -> str:
-    """A share in percent, with as few digits as it has if ``digits`` is not given."""
+    """Formats a share in percent, with ``digits`` decimals, or with as few as it needs if None."""
     return f"{100 * share:.6g} %" if digits is None else f"{100 * share:.{digits}f} %"

@@ -41,9 +41,7 @@ def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.op
     if not isinstance(known, list):
         raise CheckpointError(f"{path} is not a training state")
     if type(about.get("step")) is not int or about["step"] < 0:
-        raise CheckpointError(
-            f"{path} is damaged: its step must be a whole number >= 0, got {about.get('step')!r}"
-        )
+        raise CheckpointError(f"{path} is damaged: its step must be a whole number >= 0, got {about.get('step')!r}")
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     moments = {
         index: {"step": torch.tensor(0.0), "exp_avg": parameter, "exp_avg_sq": parameter}
