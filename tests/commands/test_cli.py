@@ -119,7 +119,7 @@ def test_as_a_program():
     command = [str(program)] if program.exists() else [sys.executable, "-m", "torchrl_koap.commands.cli"]
     wrong = subprocess.run([*command, "eval", "run", "--seed="], capture_output=True, text=True)
     assert wrong.returncode == 1 and wrong.stdout == ""
-    empty = "--seed is followed by an empty word: wanted a value; is a variable of the shell not set?"
+    empty = "--seed is followed by an empty word: wanted a value; is a shell variable not set?"
     assert wrong.stderr == f"koap: {empty} ({HINT})\n"
 
 

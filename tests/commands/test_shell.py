@@ -41,7 +41,7 @@ def test_signals_are_like_ctrl_c(number, status, monkeypatch, capsys):
 def test_only_a_command_that_goes_on_when_called_again_says_so(command, monkeypatch, capsys):
     monkeypatch.setattr(cli, "_run", Mock(side_effect=KeyboardInterrupt))
     assert cli.main([command, "x"]) == 130
-    goes_on = "" if command in ("eval", "convert") else f"; `koap {command}` goes on when called again"
+    goes_on = "" if command in ("eval", "convert") else f"; `koap {command}` resumes when called again"
     assert capsys.readouterr().err == f"koap: interrupted{goes_on}\n"
 
 
@@ -103,7 +103,7 @@ def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0)
 @pytest.mark.faults
 @pytest.mark.parametrize(
     ("settings", "says"),
-    [({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is no backend"), ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO")],
+    [({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is not a"), ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO")],
 )
 def test_settings_with_which_nothing_can_be_imported(settings, says):
     status, said = ended("doctor", settings=settings)

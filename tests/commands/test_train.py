@@ -72,9 +72,9 @@ def test_an_interrupted_training_says_how_to_go_on(copied_run, monkeypatch, caps
         return capsys.readouterr().err
 
     resume = f"koap: interrupted; `koap train --out {copied_run} --resume` "
-    assert said(copied_run) == f"{resume}goes on from its last checkpoint\n"
+    assert said(copied_run) == f"{resume}resumes at its last checkpoint\n"
     shutil.rmtree(copied_run / "checkpoints")
-    assert said(copied_run) == f"{resume}begins again, there is no checkpoint yet\n"
+    assert said(copied_run) == f"{resume}starts again, as there is no checkpoint yet\n"
     assert said(copied_run / "new") == "koap: interrupted; nothing is trained yet: train again\n"
 
 

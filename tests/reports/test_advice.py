@@ -64,9 +64,9 @@ def test_what_is_proposed(numbers, wanted):
 @pytest.mark.parametrize(
     ("shares", "words"),
     [
-        ((0.6, 0.95, 0.5), "the planner is what fails"),
-        ((0.95, 0.5, 0.4), "the controller is what fails"),
-        ((0.95, 0.95, 0.4), "leave what the planner was trained on"),
+        ((0.6, 0.95, 0.5), "the planner fails"),
+        ((0.95, 0.5, 0.4), "the controller fails"),
+        ((0.95, 0.95, 0.4), "leave the planner's training data"),
     ],
 )
 def test_the_part_that_fails_is_named(shares, words):
@@ -78,7 +78,7 @@ def test_a_controller_that_stays_near_recorded_tool_paths_is_not_what_fails():
     """Where things are pushed, recorded actions do not answer to where they went: its success says little."""
     inspection = inspected(0.95, 0.3, 0.4) | {"recordings_left": {"count": 3, "episodes": 60}}
     (item,) = found(evaluation=rates(0.4), inspection=inspection)
-    assert "leave what the planner was trained on" in item.finding
+    assert "leave the planner's training data" in item.finding
 
 
 def test_more_labels_are_not_proposed_where_the_planner_fails():
@@ -90,7 +90,7 @@ def test_more_labels_are_not_proposed_where_the_planner_fails():
 
 def test_a_ridge_that_errs_less_is_pointed_out():
     (item,) = found(config={"method": "koap"}, evaluation=actions(0.32, 0.31))
-    assert item.finding == "actions of koap err 0.32 times as much as their mean would, a plain ridge's 0.31 times"
+    assert item.finding == "the action error of koap is 0.32 times the mean action's, a plain ridge's 0.31 times"
     assert not found(config={"method": "linear"}, evaluation=actions(0.3, 0.3))
     call = shlex.split(item.command.format(data="arm"))
     study = parse(Subcommand, call[1:]).config

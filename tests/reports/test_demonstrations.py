@@ -40,7 +40,7 @@ def test_columns_over_time_where_there_is_no_environment():
     assert titles(figure) == [f"{name} (rad)" for name in names[:12]]
     second = drawn_lines(figure.axes[2])[1]
     np.testing.assert_allclose(second, np.stack([np.arange(20) / 10, data["state"][20:, 2]], 1))
-    assert figure.get_suptitle().endswith("in 1 of them; columns that are not drawn: 2")
+    assert figure.get_suptitle().endswith("in 1 of them; 2 columns are not drawn")
 
 
 def test_missing_positions():

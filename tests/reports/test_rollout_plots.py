@@ -184,5 +184,5 @@ def test_plans_over_time_where_nobody_knows_a_plane():
     np.testing.assert_allclose(planned, np.stack([np.arange(1, 15), state[0, 1:15, 1]], 1))
     assert "columns that actions are about" in all_pictures()["plans.png"].caption_for(run)
     for draw in (draw_rollouts, animate_rollouts):
-        with pytest.raises(NothingToDraw, match="nobody knows which columns lie in a plane"):
+        with pytest.raises(NothingToDraw, match="it is not known which columns are planar"):
             draw(hand, run)

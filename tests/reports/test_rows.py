@@ -35,7 +35,7 @@ def test_a_training_in_five_rows():
 @pytest.mark.parametrize(
     ("updates", "kept", "said"),
     [
-        (300, 100, "by itself before update 500; plans stopped improving at update 100"),
+        (300, 100, "early, before update 500; plans stopped improving at update 100"),
         (500, 350, "with its last update; plans stopped improving at update 350"),
         (500, 450, "with its last update; still improving: train again with --steps 1000"),
     ],

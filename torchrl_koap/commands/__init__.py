@@ -1,2 +1,2 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""One file per sub-command of ``koap``: a dataclass of options and the function that carries them out."""
+"""The sub-commands of ``koap``: each is a dataclass of options that does its work when called."""

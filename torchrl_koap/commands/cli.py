@@ -1,8 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The command line ``koap``: whatever goes wrong, one line on stderr says what, and the exit status says so too.
+"""The command line ``koap``: reports every failure in one line on stderr and in the exit status.
 
-The commands themselves are imported when they are needed, so that a signal or a wrong setting while that happens is
-met here as well.
+Commands are imported only when needed, so that signals and wrong settings during their import are also handled here.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ from torchrl_koap.commands.shell import (
     written_output,
 )
 
-# errors that speak for themselves; anything else is a fault of ours and keeps its traceback
+# errors whose messages suffice; any other is a bug of this package and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
 HINT = "KOAP_TRACEBACK=1 shows where"
-_SHORT = 8  # entries of a list that is printed whole
-_MAY_BE_EMPTY = ("--action-units", "--state-units")  # the unit of a number without one
+_SHORT = 8  # entries at most of a list that is printed whole
+_MAY_BE_EMPTY = ("--action-units", "--state-units")  # "" is the unit of a dimensionless number
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a sub-command; returns the exit status.
 
-    It is 1 for a job that could not be done, or not all of it, and 128 and the signal's number for one that was
-    interrupted (130 after Ctrl-C), each with one line that says why. A wrong call leaves with 2. ``KOAP_TRACEBACK=1``
-    shows where an error is from. The words are those of the process by default.
+    It is 1 after a failure, also a partial one, and 128 plus the signal's number after an interrupt (130 after Ctrl-C),
+    each with one line that says why. A wrong call exits with 2. ``KOAP_TRACEBACK=1`` shows where an error comes from.
+    ``arguments`` default to those of the process.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     open_closed_streams()
@@ -57,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(message)
         return status
     except Exception as error:
-        # the simulator's own error for a machine that has too little memory or no graphics derives from nothing else
+        # MuJoCo's own error, for too little memory or no graphics, derives directly from Exception
         expected = isinstance(error, EXPECTED) or type(error).__module__.partition(".")[0] == "mujoco"
         if os.environ.get("KOAP_TRACEBACK") or not expected:
             raise
@@ -81,7 +80,7 @@ def _run(arguments: Sequence[str]) -> int:
     options.check_options(command)
     with without_progress_bars() if command.quiet else nullcontext():
         result = command()
-    failed = result.pop("failed", "") if isinstance(result, dict) else ""  # said once, and whatever is quiet
+    failed = result.pop("failed", "") if isinstance(result, dict) else ""  # printed once, even with --quiet
     if not command.quiet:
         with written_output():
             _show(result)
@@ -91,9 +90,9 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _parsed(options: Any, kind: Any, arguments: Sequence[str]) -> Any:
-    """The command; what one of our own checks refuses is raised as it is, what tyro refuses leaves with 2."""
+    """Returns the command; errors of this package's checks are raised unchanged, those of tyro exit with 2."""
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # its words for what our own checks say
+        with contextlib.redirect_stderr(io.StringIO()):  # tyro would print errors of our own checks, too
             return options.parse(kind, arguments, console_outputs=False)
     except SystemExit as left:
         error = left.__context__
@@ -115,23 +114,21 @@ def _is_ours(error: BaseException) -> bool:
 
 
 def _check_words(arguments: Sequence[str]) -> None:
-    """Refuses empty words: an unset variable of the shell would silently mean the present folder."""
+    """Refuses empty words: an unset shell variable would silently mean the current folder."""
     option = arguments[0] if arguments else ""
     for word in arguments:
         if word.startswith("--"):
             option = word.partition("=")[0]
         if (word == "" or word == f"{option}=") and option not in _MAY_BE_EMPTY:
-            raise ValueError(
-                f"{option} is followed by an empty word: wanted a value; is a variable of the shell not set?"
-            )
+            raise ValueError(f"{option} is followed by an empty word: wanted a value; is a shell variable not set?")
 
 
 def _commands() -> tuple[Any, ...]:
-    """What takes seconds to import."""
+    """Imports and returns the modules that take seconds to import."""
     if sys.flags.optimize > 1:
         raise RuntimeError(
             "Python runs with -OO (or PYTHONOPTIMIZE=2), which removes docstrings that torch and the options of"
-            " `koap` are made of; use -O or nothing"
+            " `koap` need; use -O or nothing"
         )
     loaded = "torchrl_koap.commands.subcommands" in sys.modules
     with nullcontext() if loaded else handling_signals(leave):
@@ -143,13 +140,13 @@ def _commands() -> tuple[Any, ...]:
         except ValueError as error:
             backend = os.environ.get("MPLBACKEND")
             if backend and backend in str(error):
-                raise ValueError(f"MPLBACKEND={backend} is no backend of matplotlib; unset it") from error
+                raise ValueError(f"MPLBACKEND={backend} is not a matplotlib backend; unset it") from error
             raise
     return options, subcommands, without_progress_bars
 
 
 def _one_line(error: BaseException) -> str:
-    """The message of an error, the problems it lists one after the other."""
+    """Returns the message of an error in one line, with listed problems joined by "; "."""
     message = str(error.args[0] if isinstance(error, KeyError) and error.args else error)
     lines = [line.strip().removeprefix("- ") for line in message.splitlines() if line.strip()]
     said = "; ".join(lines).replace(":;", ":")
@@ -159,7 +156,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _complain(message: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # a full device, a closed one
+    with contextlib.suppress(OSError, ValueError):  # a full device, a closed stream
         sys.stderr.write(f"koap: {message}\n")
         sys.stderr.flush()
 
@@ -175,7 +172,7 @@ def _show(result: Any) -> None:
 
 
 def _lines(name: str, value: Any) -> Iterator[tuple[str, str]]:
-    """A line per value; a mapping of plain values is one line, a nested one a line for each of its entries."""
+    """Yields a line per value; a mapping of plain values gives one line, a nested one a line per entry."""
     if isinstance(value, Mapping) and any(isinstance(entry, Mapping) for entry in value.values()):
         for key, entry in value.items():
             yield from _lines(f"{name} {key}", entry)
@@ -186,7 +183,7 @@ def _lines(name: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def _words(value: Any) -> str:
-    """A value as words; of a long list the first few entries and how many there are."""
+    """Formats a value; of a long list the first three entries and the number of all."""
     if isinstance(value, list):
         shown = " ".join(map(_words, value if len(value) <= _SHORT else value[:3]))
         return shown if len(value) <= _SHORT else f"{shown} ... ({len(value)} values)"

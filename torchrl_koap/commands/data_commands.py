@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap demos``, ``koap convert`` and ``koap validate``: data are recorded, brought in, and looked at."""
+"""``koap demos``, ``koap convert`` and ``koap validate``: record, convert and check demonstrations."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _ONE_FOR_ALL = ("action_kind", "action_units", "state_units")
 class Demos(Command):
     """Record scripted demonstrations.
 
-    The same command goes on with an interrupted recording (OUT/unfinished).
+    The same command resumes an interrupted recording (OUT/unfinished).
 
     Example: `koap demos --task avoiding --out demos`
 
@@ -52,10 +52,10 @@ class Demos(Command):
         episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
         seed: seed of the experts' variation.
         threads: simulator threads.
-        disturbance: share of the demonstrations in which the expert is disturbed now and then (pushes, slips, late
-            turns, a height that drifts); those from which it recovers are kept, and OUT/ted/about.json says how often
-            it did (default: that of the task).
-        embodiment: for tasks recorded by a camera: "robot" (with actions) or "hand" (frames alone); OUT is then a
+        disturbance: share of the demonstrations in which the expert is disturbed at times (pushes, slips, late turns, a
+            drifting height); those from which it recovers are kept, and OUT/ted/about.json counts them (default: that
+            of the task).
+        embodiment: for tasks recorded by a camera: "robot" (with actions) or "hand" (frames only); OUT is then a
             LeRobot data set with pictures, for `koap embed`.
         plugins: modules that register tasks; imported before anything else.
     """
@@ -70,19 +70,19 @@ class Demos(Command):
     plugins: Plugins = ()
 
     def __call__(self) -> RecordingReport | VideoReport:
-        """Records and writes; returns what it took."""
+        """Records and writes demonstrations; returns a report."""
         load_plugins(self.plugins)
         task = get_task(self.task)
         if task.env is None or task.expert is None:
             lacks = "environment" if task.env is None else "scripted expert"
-            raise ValueError(f"task {task.name!r} has no {lacks}: there is nothing to record demonstrations with")
+            raise ValueError(f"task {task.name!r} has no {lacks}: demonstrations cannot be recorded")
         episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
         embodiments = expert_of(task).embodiments
         if self.embodiment is not None and not embodiments:
-            raise ValueError(f"--embodiment was given, but task {task.name!r} has one embodiment alone")
+            raise ValueError(f"--embodiment was given, but task {task.name!r} has only one embodiment")
         if embodiments:
             return self._film(task, episodes, embodiments)
-        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # refusals come without a bar
+        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # no bar before an error
             return record_to_folder(
                 self.out,
                 task,
@@ -95,10 +95,10 @@ class Demos(Command):
 
     def _film(self, task: Task, episodes: int, embodiments: Sequence[str]) -> VideoReport:
         if self.embodiment is None:
-            raise ValueError(f"say who demonstrates: --embodiment {' or '.join(embodiments)}")
+            raise ValueError(f"task {task.name!r} needs --embodiment {' or '.join(embodiments)}")
         lookup(embodiments, self.embodiment, "embodiment")
         if self.disturbance:
-            raise ValueError("--disturbance was given, but demonstrations before a camera are not disturbed")
+            raise ValueError("--disturbance was given, but demonstrations with a camera cannot be disturbed")
         with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:
             return record_videos(self.out, self.embodiment, episodes, self.seed, count_up_to(bar), task=task)
 
@@ -175,7 +175,7 @@ class Convert(Command):
             again = " (and convert that with the roles of its columns)" if self.resample is not None else ""
             raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
         check_new(self.out)
-        with warnings.catch_warnings(record=not self.quiet) as unlikely:  # shown at once where no table follows
+        with warnings.catch_warnings(record=not self.quiet) as unlikely:  # with --quiet, no table shows them later
             warnings.simplefilter("always")
             recordings = self._read()
             folder = save_demonstrations(self.out, recordings, **self._given(_DESCRIBING))
@@ -188,7 +188,7 @@ class Convert(Command):
             **_contents(recordings),
             "controller reads": ", ".join(task.state_names[column] for column in task.robot),
             "action kind": ", ".join(self.action_kind) or "delta (default)",
-            "labels look": describe_likely(likely_kinds(data, task)) or "like no kind: too few",
+            "labels look": describe_likely(likely_kinds(data, task)) or "like no kind: too few labels",
             "constant in each trajectory": ", ".join(goal_columns(recordings)) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "a plan covers": plan_coverage(data, task.control_hz)[0],
@@ -213,11 +213,11 @@ class Convert(Command):
         return recordings
 
     def _reading(self) -> tuple[str, ...]:
-        """Options of the reader, which has to know what actions are if they are resampled."""
+        """Returns the options of the reader, with ``action_kind`` if actions are resampled."""
         return _READING if self.resample is None else (*_READING, "action_kind")
 
     def _given(self, options: Sequence[str]) -> dict[str, Any]:
-        """Those of the options that were given; one value that is for all columns is no sequence."""
+        """Returns the options that were given; a single value for all columns is unpacked."""
         given = {name: value for name, value in vars(self).items() if name in options and value not in (None, ())}
         return {name: value[0] if name in _ONE_FOR_ALL and len(value) == 1 else value for name, value in given.items()}
 
@@ -232,7 +232,7 @@ class Validate(Command):
 
     Attributes:
         dataset: folder written by `koap demos`, `koap convert` or save_demonstrations, or of D3IL's raw pickles.
-        task: name of the task (default: that of the data set, if it says so; else "avoiding").
+        task: name of the task (default: that of the data set, if it names one; else "avoiding").
         plugins: modules that register tasks; imported before anything else.
     """
 
@@ -286,8 +286,8 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
 
 def _numbered(found: list[str], data: TensorDictBase) -> dict[str, str]:
     if len(data["episode"].unique()) == 1:
-        said = "there is one trajectory alone: if it holds several episodes, say where they end"
-        found = [f"{said} (a column 'episode_index' or 'timeouts')", *found]
+        hint = "there is only one trajectory: if it holds several episodes, mark their ends"
+        found = [f"{hint} (a column 'episode_index' or 'timeouts')", *found]
     if not data["has_action"].any():
         found = ["no recording has actions: a planner can be trained, a policy cannot", *found]
     return {f"warning {number}": warning for number, warning in enumerate(found, 1)}

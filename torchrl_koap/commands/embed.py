@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap embed``: data with camera frames as a data set of embeddings."""
+"""``koap embed``: turns data with camera frames into a data set of embeddings."""
 
 from __future__ import annotations
 
@@ -26,21 +26,20 @@ class Embed(Command):
 
     The result is for `koap train`. Nothing is downloaded.
 
-    The same command goes on with an interrupted embedding.
+    The same command resumes an interrupted embedding.
 
     Example: `koap embed arm --camera top --camera wrist --out arm_seen`
 
     Attributes:
-        sources: folders that `koap convert` wrote (with --task any recordings), in the order in which the data set has
-            them.
+        sources: folders that `koap convert` wrote (with --task any recordings), in the order of the data set.
         out: folder to write: OUT/ted with the data, OUT/cameras with the principal components.
-        camera: which cameras (default: all).
+        camera: cameras to embed (default: all).
         components: principal components per camera, fitted to the frames (a task with embeddings has its own number).
         network: "package.module:name" or "file.py:name" of a network of your own (default: EfficientNet-Lite0 of the
             extra "vision").
         task: a task with embeddings among its columns, such as "scooping" (default: that of the first source).
-        projection: file of principal components to take instead (default: those of the task that come with the
-            package, else they are fitted).
+        projection: file of principal components to use (default: those of the task that come with the package, else
+            they are fitted).
         plugins: modules that register tasks; imported before anything else.
     """
 
@@ -60,7 +59,7 @@ class Embed(Command):
         asked = None if self.task is None else get_task(self.task)
         file = self.projection
         if file is None and asked is not None:
-            with contextlib.suppress(ValueError):  # most tasks have none: it is fitted
+            with contextlib.suppress(ValueError):  # most tasks have no projection: it is fitted
                 file = projection_of(asked.name)
         projection = None if file is None else Projection.load(file)
         recordings, task = read_sources(self.sources, asked)

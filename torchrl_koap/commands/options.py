@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all commands have in common: their base class, how options are read and explained, what none can mean."""
+"""Common parts of all commands: their base class, how options are read and explained, and checks of their values."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
 from torchrl_koap.studies.study import DECIDED, Study
 
-LARGEST = 2**53  # beyond it a number is not even counted exactly
+LARGEST = 2**53  # larger whole numbers are not exact as floats
 _MAY_BE_INFINITE = ("limits",)
-AMOUNTS = ("--labels", "--labels.fraction", "--labels.count", "--labels.episodes")  # of which one is given
+AMOUNTS = ("--labels", "--labels.fraction", "--labels.count", "--labels.episodes")  # only one may be given
 Config = TypeVar("Config")
 # the fields of a configuration are options of the command itself: `--steps`, not `--config.steps`
 Options = Annotated[Config, tyro.conf.arg(name="")]
@@ -57,15 +57,15 @@ FIRST = {
     "seed": (int, "seed of label choice, initialisation and batches (default: 0)."),
     "device": (str, "cpu or cuda (default: cpu)."),
     "threads": (int, "torch threads (default: OMP_NUM_THREADS where it is set, else 1)."),
-    "resume": (bool, "go on with an interrupted run."),
-    "config": (Path, "JSON file of options, in the sections of `--help-all`; options of the call win."),
+    "resume": (bool, "resume an interrupted run."),
+    "config": (Path, "JSON file of options, in the sections of `--help-all`; options of the call override it."),
 }
 _PLACEHOLDERS = {int: "N", float: "NUMBER", str: "NAME", Path: "PATH"}
 
 
 @dataclass(kw_only=True)
 class Command:
-    """A command of ``koap``: its fields are options, calling it does the work and returns what is printed.
+    """A command of ``koap``: its fields are options, calling it does the work and returns the output to print.
 
     Attributes:
         quiet: no progress bars, and no table at the end.
@@ -75,7 +75,7 @@ class Command:
 
 
 def check_options(options: Any) -> None:
-    """Refuses numbers that are NaN, infinite (but for limits) or beyond 2^53, and an ``out`` that takes no files."""
+    """Refuses numbers that are NaN, infinite (except limits) or beyond 2^53, and an ``out`` that is not writable."""
     for field in fields(options):
         value, option = getattr(options, field.name), f"--{field.name.replace('_', '-')}"
         if is_dataclass(value):
@@ -97,8 +97,8 @@ def check_options(options: Any) -> None:
 def expand(words: Sequence[str]) -> list[str]:
     """Replaces ``--labels NUMBER`` by the option of its kind, and ``--config FILE`` by the options in the file.
 
-    ``--labels 0.02`` becomes ``--labels.fraction 0.02``. A file that is not there or holds other things than options,
-    and ``--labels`` without a number, are refused.
+    ``--labels 0.02`` becomes ``--labels.fraction 0.02``. Raises a ValueError for a file that is missing or holds
+    anything but options, and for ``--labels`` without a number.
     """
     found: list[str] = []
     from_file: list[str] = []
@@ -158,10 +158,10 @@ def _flat(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
 
 
 def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
-    """Makes a command, of a dataclass or a union of them that the first word chooses from, of the words of a call.
+    """Makes a command from the words of a call; ``kind`` is a dataclass, or a union of which the first word chooses.
 
-    ``--help`` among them prints its options and leaves with 0, a wrong call leaves with 2. ``how`` is what else
-    :func:`tyro.cli` takes.
+    ``--help`` among the words prints the options and exits with 0; a wrong call exits with 2. ``how`` are further
+    arguments of :func:`tyro.cli`.
     """
     arguments, short, left_out = list(arguments), dict[Any, str](), set[Any]()
     if arguments[:1] == ["train"] and {"-h", "--help"} & set(arguments):
@@ -183,12 +183,12 @@ def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
 
 
 def training_call(dataset: Path, name: str) -> str:
-    """Says how a data set is trained on, as words for a shell; the run has the name of the task."""
+    """Returns the shell command that trains on a data set; the run has the name of the task."""
     return shlex.join(["koap", "train", "--dataset", str(dataset), "--out", f"runs/{name}"])
 
 
 def check_call(kind: Any, arguments: Sequence[str]) -> None:
-    """Checks that a call names a command and options that its help lists, with numbers where it says so."""
+    """Checks that a call names a command and options that its help lists, with numbers where the help wants them."""
     command = next(iter(arguments), "-")
     if command.startswith("-"):
         return
@@ -204,7 +204,7 @@ def check_call(kind: Any, arguments: Sequence[str]) -> None:
         name, equals, value = word.partition("=")
         if name.startswith("--"):
             name, known, what = name.replace("_", "-"), [*wanted, *more], f"option of koap {command}:"
-            inside = [each for each in wanted if each.endswith(f".{name[2:]}")]  # in a section
+            inside = [each for each in wanted if each.endswith(f".{name[2:]}")]  # the same name in a section
             if name not in known and inside:
                 raise ValueError(f"unknown {what} {name!r}; did you mean {' or '.join(map(repr, inside))}?")
             option = lookup(known, name, what)
@@ -235,10 +235,10 @@ def _first_page() -> type:
 def _described(
     short: Mapping[Any, str], left_out: Container[Any], inside: list[Any], info: StructTypeInfo
 ) -> StructConstructorSpec | None:
-    """What tyro makes of a dataclass, with plain placeholders and short names, and without some of its fields."""
+    """Returns tyro's specification of a dataclass, with plain placeholders and short names, without some fields."""
     if inside or not is_dataclass(info.type):
         return None
-    inside.append(info)  # the question goes to tyro's own rules
+    inside.append(info)  # makes the nested call return None, so that tyro applies its own rules
     spec: Any = ConstructorRegistry.get_struct_spec(info)
     inside.clear()
     shown = [each for each in spec.fields if (info.type, each.name) not in left_out]
@@ -259,7 +259,7 @@ def _option(spec: StructFieldSpec, short: str | None) -> StructFieldSpec:
 
 
 def _placeholder(kind: Any, name: str | None) -> str | None:
-    """N, NAME, ... or the given name; with dots where several follow."""
+    """Returns N, NAME, ... or the given name; with dots if several values follow."""
     inner = [part for part in get_args(kind) if part is not type(None)]
     if get_origin(kind) is tuple:
         return f"{_placeholder(inner[0], name)} ..."

@@ -49,18 +49,18 @@ class Train(Command):
         try:
             train(self.config, command=shlex.join(["koap", *sys.argv[1:]]))
         except KeyboardInterrupt as interrupt:
-            interrupt.args = (_how_to_go_on(self.config.out),)
+            interrupt.args = (_how_to_resume(self.config.out),)
             raise
         return {**as_text(training_rows(RunFacts.read(out))), "run": out, "next": f"koap eval {shlex.quote(out)}"}
 
 
-def _how_to_go_on(out: Path) -> str:
-    """What to do after a training was interrupted."""
+def _how_to_resume(out: Path) -> str:
+    """Returns what to do after a training was interrupted."""
     if not (out / "config.json").exists():
         return "nothing is trained yet: train again"
     kept = any((out / "checkpoints").glob("*.safetensors"))
-    begins = "goes on from its last checkpoint" if kept else "begins again, there is no checkpoint yet"
-    return f"`koap train --out {shlex.quote(str(out))} --resume` {begins}"
+    effect = "resumes at its last checkpoint" if kept else "starts again, as there is no checkpoint yet"
+    return f"`koap train --out {shlex.quote(str(out))} --resume` {effect}"
 
 
 @dataclass(kw_only=True)
@@ -76,7 +76,7 @@ class Eval(Command):
         config: all options of the rollouts.
         report: draw the pictures and write the report.
         animate: make an animation of the rollouts for the report.
-        logger: where scores go besides the run directory: wandb (offline unless WANDB_MODE says otherwise) or
+        logger: where scores go in addition to the run directory: wandb (offline unless WANDB_MODE is set) or
             tensorboard; each needs its extra.
     """
 
@@ -123,7 +123,7 @@ class Inspect(Command):
         draw_pictures(folder, names=("inspect.png", "latent.png"))
         if (folder / "index.html").exists():
             write_report(folder, draw=False)
-        # the findings tell of the latent space; a policy that does not follow plans leaves no distances to them
+        # findings summarise the latent space; a policy that follows no plans has no distances to them
         shown = {name: value for name, value in result.items() if name != "latent" and value != {}}
         return shown | {"all numbers": str(folder / "inspect.json")}
 
@@ -158,7 +158,7 @@ class Suggest(Command):
 
 @dataclass(kw_only=True)
 class Latency(Command):
-    """Count the steps of a control loop in real time that come too late.
+    """Count the late steps of a control loop in real time.
 
     Example: `koap latency runs/arm`
 
@@ -184,7 +184,7 @@ class Latency(Command):
 class Export(Command):
     """Write a policy for torch.export, ONNX, AOTInductor or LeRobot.
 
-    It is compared with the original (1e-5); policy.json says how to call it.
+    It is compared with the original (1e-5); policy.json describes how to call it.
 
     Example: `koap export runs/arm --format onnx`
 
@@ -193,7 +193,7 @@ class Export(Command):
         out: folder to write (default: RUN/exported).
         format: "torch" (torch.export), "onnx" (ONNX Runtime), "aoti" (AOTInductor, needs a C++ compiler) or "lerobot"
             (a folder for lerobot-eval and lerobot-record).
-        plugins: modules that register task or method, or hold a camera's network, where they are now.
+        plugins: modules that register task or method, or define a camera's network, at their present paths.
     """
 
     run: tyro.conf.Positional[str]
@@ -236,14 +236,14 @@ class Curve(Command):
 
     Attributes:
         config: all options.
-        machines: where the cells are made.
+        machines: where the cells run.
     """
 
     config: Options[Study]
     machines: Options[Machines] = field(default_factory=Machines)
 
     def __call__(self) -> dict[str, Any]:
-        """Does what is missing of the study and writes its report."""
+        """Runs the missing cells of the study and writes its report."""
         result = run_study(self.config, self.machines)
         cells = ", ".join(f"{count} {status}" for status, count in result.counts.items())
         failed = {"failed": some(not_done(result.rows))} if result.counts["failed"] else {}
@@ -265,7 +265,7 @@ class Bench(Curve):
     table: int
 
     def __call__(self) -> dict[str, Any]:
-        """Does what is missing of the table and writes its report."""
+        """Runs the missing cells of the table and writes its report."""
         if self.table not in (1, 2):
             raise ValueError(f"table must be 1 or 2, got {self.table}")
         return Curve(config=replace(self.config, preset=f"table{self.table}"), machines=self.machines)()

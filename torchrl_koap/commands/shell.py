@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a shell does to a command: signals (all are taken like Ctrl-C), closed streams, full devices, no columns."""
+"""Handles effects of the shell: signals (all like Ctrl-C), closed streams, full devices, a terminal without columns."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-# SIGHUP: the terminal was closed; other systems than Unix do not know it
+# SIGHUP: the terminal was closed; exists only on Unix
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-_LEAST_COLUMNS = 40  # the help of a terminal with a single column never ends
-_GO_ON = ("demos", "embed", "curve", "bench")  # commands that go on when called again
+_LEAST_COLUMNS = 40  # formatting the help for a single column never ends
+_RESUMING = ("demos", "embed", "curve", "bench")  # commands that resume when called again
 
 
 class ReadEnough(Exception):
-    """The reader of the output has gone."""
+    """The reader of the output has closed the pipe."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal that asked this process to end; ``number`` says which."""
+    """A signal, of the given ``number``, that asks this process to end."""
 
     def __init__(self, number: int):
         self.number = number
@@ -32,20 +32,20 @@ class Interrupted(KeyboardInterrupt):
 
 
 def describe_interrupt(error: KeyboardInterrupt, command: str = "") -> tuple[str, int]:
-    """Returns what to say of an interrupt of a command, and the exit status that shells expect of it.
+    """Returns the message for an interrupted command, and the exit status that shells expect.
 
-    Its argument, if it has one, says how to go on.
+    The argument of the error, if any, says how to resume.
     """
     number = error.number if isinstance(error, Interrupted) else signal.SIGINT
     by = "" if number == signal.SIGINT else f" by {signal.Signals(number).name}"
-    how = error.args or ([f"`koap {command}` goes on when called again"] if command in _GO_ON else [])
+    how = error.args or ([f"`koap {command}` resumes when called again"] if command in _RESUMING else [])
     return "; ".join([f"interrupted{by}", *how]), 128 + number
 
 
 @contextlib.contextmanager
 def handling_signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     """Calls a handler for the signals that end a process inside the block; ignored ones (``nohup``) stay ignored."""
-    if threading.current_thread() is not threading.main_thread():  # Python lets nobody else
+    if threading.current_thread() is not threading.main_thread():  # only the main thread can set handlers
         yield
         return
     earlier = {number: signal.getsignal(number) for number in ENDING}
@@ -61,7 +61,7 @@ def handling_signals(handler: Callable[[int, FrameType | None], None]) -> Iterat
 
 @contextlib.contextmanager
 def written_output() -> Iterator[None]:
-    """Makes sure that what is printed inside has arrived when the block ends; raises an error if it has not."""
+    """Flushes stdout at the end of the block; raises an error if the output could not be written."""
     try:
         try:
             yield
@@ -75,14 +75,14 @@ def written_output() -> Iterator[None]:
 
 
 def widen_terminal() -> None:
-    """Gives the terminal a few columns at least."""
+    """Sets the width of a very narrow terminal to 40 columns."""
     if shutil.get_terminal_size().columns < _LEAST_COLUMNS:
         os.environ["COLUMNS"] = str(_LEAST_COLUMNS)
 
 
 @contextlib.contextmanager
 def one_line_warnings() -> Iterator[None]:
-    """Shows a warning inside the block as one line, without its place in the code."""
+    """Shows warnings inside the block as one line, without their place in the code."""
     earlier = warnings.formatwarning
     warnings.formatwarning = lambda message, *place: f"warning: {message}\n"
     try:
@@ -92,9 +92,9 @@ def one_line_warnings() -> Iterator[None]:
 
 
 def open_closed_streams() -> None:
-    """Sends stdin, stdout and stderr nowhere if the process was started without them (``2>&-``).
+    """Opens stdin, stdout and stderr as the null device if the process was started without them (``2>&-``).
 
-    The next file that is opened would otherwise get their number, and what a library prints would land in it.
+    Otherwise the next opened file would get their descriptor, and libraries would print into it.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -109,7 +109,7 @@ def open_closed_streams() -> None:
 
 
 def discard_output() -> None:
-    """Sends what is left for stdout nowhere: the interpreter would complain about it once more when it ends."""
+    """Redirects stdout to the null device: else the interpreter would report the write error again at exit."""
     if sys.stdout is sys.__stdout__:
         with contextlib.suppress(OSError, ValueError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -118,12 +118,12 @@ def discard_output() -> None:
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Raises :class:`Interrupted`, which is met like Ctrl-C."""
+    """Raises :class:`Interrupted`, which is handled like Ctrl-C."""
     raise Interrupted(number)
 
 
 def leave(number: int, frame: FrameType | None) -> None:
-    """Ends the process with one line: half imported modules can do nothing more."""
+    """Ends the process at once with one line, as half imported modules cannot handle an exception."""
     message, status = describe_interrupt(Interrupted(number))
     with contextlib.suppress(OSError):
         os.write(2, f"koap: {message}\n".encode())

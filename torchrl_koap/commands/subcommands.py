@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""All commands of ``koap``, called as their classes in lower case; importing them takes seconds."""
+"""All commands of ``koap``, named like their classes in lower case; importing them takes seconds."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ Subcommand: Any = Union[tuple(chain(*GROUPS.values()))]  # noqa: UP007 - of a tu
 
 
 def described(command: type) -> tuple[str, str]:
-    """Returns what a command does, and an example of its use: the first and the last paragraph of its docstring."""
+    """Returns summary and example of a command: the first and the last paragraph of its docstring."""
     text = (inspect.getdoc(command) or "").split("\n\nAttributes:")[0].split("\n\n")
     return " ".join(text[0].split()), text[-1].removeprefix("Example: ").strip("`")
 
 
 def overview() -> str:
-    """Returns what ``koap --help`` prints: every command with an example, in groups."""
+    """Returns the text of ``koap --help``: every command with an example, in groups."""
     lines = [
         "usage: koap COMMAND [options]",
         "",

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What to try next, from the numbers of a run, each piece of advice with its reason in figures.
+"""Advice on what to try next, from the numbers of a run, each piece with its reason in figures.
 
-A rule speaks where its numbers are there and point somewhere, and is silent otherwise. What it proposes is a command
-that tells more or a change that was measured to matter (``docs/results``); that it helps in this case is not known.
+A rule gives advice only if its numbers exist and are conclusive. It proposes a command that finds out more, or a change
+that was measured to matter (``docs/results``); whether it helps in this case is not known.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 from torchrl_koap.evaluation.findings import EXPERIMENTS, GOOD
 from torchrl_koap.reports.run_facts import RunFacts, number
 
-APART = 0.2  # success rates that differ by more than chance of a few dozen rollouts
-WIDE = 0.25  # width of a 95 % interval that hardly tells two methods apart
-FEW_MODES = 0.7  # of the entropy that a uniform choice would have
+APART = 0.2  # difference of success rates that exceeds chance with a few dozen rollouts
+WIDE = 0.25  # width of a 95 % interval that hardly distinguishes two methods
+FEW_MODES = 0.7  # share of the entropy of a uniform choice
 FEW_LABELS = 300  # labelled transitions
 CONTROLS = ("koap_untrained", "linear_steps", "linear")
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What the numbers say, what may help or tell more, and a command line, if any, with ``{run}`` or ``{data}``."""
+    """A finding, a proposal, and a command line, if any, with ``{run}`` or ``{data}`` to be filled in."""
 
     finding: str
     proposal: str
@@ -34,13 +34,12 @@ def advice(run: RunFacts) -> Iterator[Advice]:
     success, policy = run.success(), number(run.summary, "planner_parameters") == 0  # a policy has no planner
     planner, controller, both = (run.experiment(name) for name in EXPERIMENTS)
     if run.evaluation.get("env") and not run.evaluation.get("success_key") and not success:
-        success = None  # nobody says what it is: a walker's or another endless task
+        success = None  # not defined, as for a walker or another endless task
     method, fails = run.config.get("method"), success is not None and success < GOOD
     planner_fails = planner is not None and planner < GOOD
     if planner_fails:
         yield Advice(
-            f"plans that come true reach the goal in {_percent(planner)} only: the planner is what fails, not the"
-            " labels",
+            f"exactly executed plans reach the goal in {_percent(planner)} only: the planner fails, not the labels",
             "more updates (--steps), more demonstrations, or a wide MLP (--planner.network mlp); more labels will not"
             " help",
         )
@@ -48,25 +47,25 @@ def advice(run: RunFacts) -> Iterator[Advice]:
         seen = f"plans alone reach the goal in {_percent(planner)}, the closed loop in {_percent(both)}"
         if controller is not None and controller < GOOD:
             yield Advice(
-                f"{seen}, recorded futures are followed in {_percent(controller)}: the controller is what fails",
+                f"{seen}, recorded futures are followed in {_percent(controller)}: the controller fails",
                 "more labels, those that teach the decoder most first",
                 "koap suggest {run} --count 5",
             )
         else:
             yield Advice(
-                f"{seen}; recorded futures are followed well: executed states leave what the planner was trained on",
+                f"{seen}; recorded futures are followed well: executed states leave the planner's training data",
                 "train the planner with larger disturbances (`recovery` of the task, twice the present one)",
             )
-    if fails and both is None and not policy:  # nobody has looked where
-        apart = ("let each of them work alone", "koap inspect {run}")
-        if run.evaluation.get("env"):  # which cannot start where a recording did
+    if fails and both is None and not policy:  # koap inspect was not run
+        apart = ("test each of them alone", "koap inspect {run}")
+        if run.evaluation.get("env"):  # it cannot start from recorded states
             apart = ("compare their errors on recordings", "koap eval {run} --out {run}_recorded")
         yield Advice(f"success is {_percent(success)}; whether planner or controller fails is not known", *apart)
     labels = number(run.summary, "labels", "labelled_transitions")
     if fails and not planner_fails and labels is not None and labels < FEW_LABELS and str(method).startswith("koap"):
         yield Advice(
             f"{labels:,.0f} transitions are labelled",
-            "a few more labels may do, where they teach the decoder most",
+            "a few more labels may suffice, where they teach the decoder most",
             "koap suggest {run} --count 5",
         )
     entropy, even = run.evaluated("mode_entropy"), run.expected_entropy
@@ -89,7 +88,7 @@ def advice(run: RunFacts) -> Iterator[Advice]:
     own, ridge = (number(run.action_errors, split, name) for name in ("relative", "ridge_relative"))
     if own is not None and ridge is not None and own >= ridge and method not in CONTROLS:
         yield Advice(
-            f"actions of {method} err {own:.3g} times as much as their mean would, a plain ridge's {ridge:.3g} times",
+            f"the action error of {method} is {own:.3g} times the mean action's, a plain ridge's {ridge:.3g} times",
             "the ridge is simpler; compare both in closed loop before keeping either",
             "koap curve --datasets {data} --methods koap koap_untrained linear_steps linear --out curves/compare",
         )

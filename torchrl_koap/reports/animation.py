@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Moving pictures: all rollouts at once from above, and one rollout as the simulator's camera sees it."""
+"""Animations: all rollouts at once from above, and one rollout seen by the simulator's camera."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ SIZE = 400, 300  # pixels of a film
 def _caption(run: RunFacts) -> str:
     objects = " Squares are the objects, pale lines their paths; black marks are tools that ran out of time."
     return (
-        "Every dot is one rollout, the thin grey line ahead of it is its present plan. Plans that swing from picture to"
-        " picture mean a planner that cannot make up its mind between modes."
+        "Every dot is one rollout, the thin grey line ahead of it is its present plan. If plans swing from frame to"
+        " frame, the planner switches between modes."
     ) + (objects if run.task is not None and run.task.bodies else "")
 
 
@@ -39,11 +39,11 @@ def _caption(run: RunFacts) -> str:
 def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     """Shows all rollouts from above in real time; plans, if there are any, are thin lines ahead of the dots.
 
-    The bodies of tasks that have them are squares in their colours with a thin path; tools then leave no path. Entries
+    In tasks with bodies, these are squares in their colours with a thin path, and tools leave no path. Entries
     as for :func:`~torchrl_koap.reports.rollout_plots.draw_plans`.
     """
     if run.offline:
-        raise NothingToDraw("nobody knows which columns lie in a plane")
+        raise NothingToDraw("it is not known which columns are planar positions")
     longest = max(map(len, read_episodes(rollouts)[0]), default=0)
     if not longest:
         raise NothingToDraw("there are no rollouts")
@@ -54,7 +54,7 @@ def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
 
 
 def _frames(rollouts: Mapping[str, Any], run: RunFacts, steps: list[int]) -> Iterator[np.ndarray]:
-    """Draws the scene once, adds each new piece of path to it, and lays dots and plans over it for one frame."""
+    """Draws the scene once, adds each new piece of path, and draws dots and plans on top for each frame."""
     paths, mode, outcome = read_episodes(rollouts)
     moving, colors = body_paths(rollouts), episode_colors(mode, outcome, run.modes)
     bodies = bodies_of(run.task, moving[0].shape[1]) if moving else ()
@@ -120,7 +120,7 @@ def _latest_plan(plan: np.ndarray, plan_step: np.ndarray, step: int) -> np.ndarr
     made = np.flatnonzero((plan_step >= 0) & (plan_step <= step))
     if not len(made):
         return np.zeros((0, 2))
-    points = plan[made[-1], max(step - int(plan_step[made[-1]]), 0) :]  # what lies behind has been executed
+    points = plan[made[-1], max(step - int(plan_step[made[-1]]), 0) :]  # without the executed part
     return points[np.isfinite(points).all(1)]
 
 
@@ -128,17 +128,17 @@ def _latest_plan(plan: np.ndarray, plan_step: np.ndarray, step: int) -> np.ndarr
     "film.gif",
     source="rollouts.safetensors",
     title="One rollout as the camera sees it",
-    caption="Recorded commands, played again in the simulator: the first success, or the first rollout if there is"
-    " none. Long ones pass faster than they did.",
+    caption="Recorded commands, replayed in the simulator: the first success, or the first rollout if there is none."
+    " Long rollouts are shown faster than real time.",
     order=30,
 )
 def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
-    """Plays the actions of the first successful rollout, or of the first one, again in the simulator and films them.
+    """Replays the actions of the first successful rollout, or of the first one, in the simulator and films them.
 
-    The simulator repeats itself exactly, so the film shows what happened, as long as the context is the recorded one to
-    the last digit (float64), or the environment of Gymnasium begins by its seed. Entries: ``action`` ``[E, T, act]``
-    (NaN after the end), ``outcome`` ``[E]``, and ``context`` ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw
-    (rad). Where the scene has no camera, or no OpenGL library can be used, :class:`NotFilmed` says so.
+    The simulator is deterministic: the film shows what happened if the context is the recorded one to the last digit
+    (float64), or the Gymnasium environment is reset with the same seed. Entries: ``action`` ``[E, T, act]`` (NaN after
+    the end), ``outcome`` ``[E]``, and ``context`` ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw (rad). Raises
+    :class:`NotFilmed` if the scene has no camera, or no OpenGL library can be used.
     """
     task, made = run.task, run.evaluation
     if "action" not in rollouts or not (made.get("env") or (task is not None and task.env is not None)):
@@ -156,7 +156,7 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     context = None
     if task.bodies:
         if "context" not in rollouts:
-            raise ValueError(f"task {task.name!r} starts differently every time: a film needs the 'context'")
+            raise ValueError(f"task {task.name!r} has varying starts: a film needs the entry 'context'")
         context = entry(rollouts, "context", [None, len(task.bodies), 3])[index].astype(np.float64)[None]
     try:
         return Film(list(_film_frames(actions.astype(np.float64), task, context, stride)), 2 / task.control_hz)
@@ -165,8 +165,8 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
 
 
 def _gymnasium_frames(made: Mapping[str, Any], index: int, actions: np.ndarray, stride: int) -> list[np.ndarray]:
-    """The same in the environment of Gymnasium of an ``eval.json``."""
-    import gymnasium  # it and the simulator take seconds
+    """Films the actions in the Gymnasium environment of an ``eval.json``."""
+    import gymnasium  # takes seconds, with the simulator
 
     from torchrl_koap.envs.gymnasium_batch import GymnasiumEpisode
     from torchrl_koap.evaluation.config import environment_arguments
@@ -181,7 +181,7 @@ def _gymnasium_frames(made: Mapping[str, Any], index: int, actions: np.ndarray, 
                     frames.append(np.asarray(env.render(), np.uint8))
                 episode.step(action)
             frames.append(np.asarray(env.render(), np.uint8))
-    except Exception as error:  # of an environment of somebody else
+    except Exception as error:  # any error of an external environment
         raise NotFilmed(f"environment {made['env']!r} was not filmed: {error!r}") from error
     if any(frame.ndim != 3 or frame.shape != frames[0].shape for frame in frames):
         raise NotFilmed(f"environment {made['env']!r} draws no picture [height, width, 3]")
@@ -189,8 +189,8 @@ def _gymnasium_frames(made: Mapping[str, Any], index: int, actions: np.ndarray, 
 
 
 def _film_frames(actions: np.ndarray, task: Task, context: np.ndarray | None, stride: int) -> Iterator[np.ndarray]:
-    """The start, every so many steps, and the end."""
-    import torch  # it and the simulator take seconds
+    """Films the start, every ``stride`` steps, and the end."""
+    import torch  # takes seconds, with the simulator
 
     from torchrl_koap.envs.mujoco.rendering import Renderer
     from torchrl_koap.envs.registry import make_env

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Picture of the demonstrations, and of which steps are labelled: from above, or column by column over time."""
+"""Draws the demonstrations and their labelled steps: from above, or column by column over time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_koap.reports.scenes import bodies_of, body_handles, draw_bodies, dr
 from torchrl_koap.reports.style import BLUE, GREY, entry, set_title, tidy, with_unit
 from torchrl_koap.tasks import Task
 
-_MOST_COLUMNS = 12  # panels of single state columns
+_MOST_COLUMNS = 12  # panels of single state columns at most
 _HANDLES = (
     Line2D([], [], color=BLUE, linewidth=1.7, label="with action label"),
     Line2D([], [], color=GREY, linewidth=0.9, label="states only"),
@@ -46,11 +46,11 @@ def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Fig
     episode = entry(demonstrations, "episode", [None])
     labelled = entry(demonstrations, "labelled", [len(episode)]).astype(bool)
     borders = np.flatnonzero(np.diff(episode) != 0) + 1
-    along = np.flatnonzero(labelled[:-1] & (episode[1:] == episode[:-1]))  # steps whose next state is of the same one
+    along = np.flatnonzero(labelled[:-1] & (episode[1:] == episode[:-1]))  # steps with a next state in their episode
     share = f"{labelled.mean():.1%}" if len(labelled) else "none"
     number, touched = len(borders) + 1, len(np.unique(episode[labelled]))
     head = f"{number} demonstrations; labels on {int(labelled.sum()):,} of {len(labelled):,} transitions ({share})"
-    if run.task is not None and run.offline:  # no environment says what lies in a plane
+    if run.task is not None and run.offline:  # planar positions are known only for tasks with an environment
         state = entry(demonstrations, "state", [len(episode), run.task.state_dim])
         return _draw_over_time(state, borders, along, run.task, f"{head} in {touched} of them")
     position = entry(demonstrations, "position", [len(episode), 2])
@@ -63,7 +63,7 @@ def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Fig
         panel.label_outer()
         handles = body_handles([body for body in bodies_of(run.task, objects[0].shape[1]) if not body.still], [True])
         panel.legend(handles=handles, frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1, 1))
-        set_title(panel, "objects: paths and where they end\n")
+        set_title(panel, "objects: paths and ends\n")
     draw_scene(axes, run.task)
     _draw_lines(axes, position, borders, along, (0.7, 1.7))
     keep_inside(axes, [position])
@@ -91,7 +91,7 @@ def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, t
         if index + across >= len(drawn):
             axes.set_xlabel("time (s)")
         tidy(axes)
-    rest = f"; columns that are not drawn: {len(columns) - len(drawn)}" if len(drawn) < len(columns) else ""
+    rest = f"; {len(columns) - len(drawn)} columns are not drawn" if len(drawn) < len(columns) else ""
     figure.suptitle(head + rest, fontsize=9.5, x=0.01, ha="left")
     figure.legend(handles=_HANDLES, fontsize=8.5, loc="outside lower center", ncols=2, frameon=False)
     return figure
@@ -100,7 +100,7 @@ def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, t
 def _draw_lines(
     axes: Axes, points: np.ndarray, borders: np.ndarray, along: np.ndarray, widths: tuple[float, float]
 ) -> None:
-    """Grey paths, and blue segments where steps are labelled."""
+    """Draws grey paths, and blue segments where steps are labelled."""
     grey, blue = widths
     axes.add_collection(LineCollection(np.split(points, borders), colors=GREY, linewidths=grey, alpha=0.8, zorder=2))
     labelled = np.stack([points[along], points[along + 1]], 1)

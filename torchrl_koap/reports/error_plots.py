@@ -53,7 +53,7 @@ _SPLITS = {
     "outside_budget": "labels outside the budget, for evaluation only",
     "left_out": "each labelled recording in turn left out of the fit",
 }
-_MANY = 6  # from here on names of columns are turned
+_MANY = 6  # column names are rotated if there are more
 
 
 @picture(
@@ -61,23 +61,23 @@ _MANY = 6  # from here on names of columns are turned
     source="metrics.csv",
     title="Losses",
     caption="Logarithmic scale. Pale: logged values; line: running mean; number: its last value. The dot"
-    " marks the weights that were kept. A planner's loss has no absolute scale: read the rollouts instead, or the plan"
-    " score, which falls as plans come near to recordings.",
+    " marks the weights that were kept. A planner's loss has no absolute scale: judge it by rollouts, or by the plan"
+    " score, which falls as plans approach recordings.",
     order=100,
 )
 def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
     """Draws loss curves, a panel per term, logarithmic; raw values pale, a running mean on top.
 
-    Rows have ``step`` and any number of ``loss_*``, empty where a term does not belong to the row.
+    Rows have ``step`` and any number of ``loss_*``, empty if a term does not belong to the row.
     """
     if not rows:
-        raise ValueError("no row has been logged yet")
+        raise ValueError("metrics.csv has no rows yet")
     names = [name for name in TERMS if name in rows[0]]
     names += sorted(name for name in rows[0] if (name or "").startswith("loss_") and name not in TERMS)
     step, columns = _column(rows, "step"), {name: _column(rows, name) for name in names}
     columns = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     if not columns:
-        raise ValueError(f"metrics hold no value of any loss_* column, got the columns {', '.join(map(str, rows[0]))}")
+        raise ValueError(f"metrics.csv has no value in a loss_* column, got columns {', '.join(map(str, rows[0]))}")
 
     figure, drawn = panels(len(columns), 2, (4.2, 2.7))
     for axes, (name, values) in zip(drawn, columns.items(), strict=True):
@@ -98,13 +98,13 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
             axes.plot(x, smooth, color=BLUE, linewidth=1.6, marker="o" if len(x) == 1 else "")
             axes.set_yscale("log")
             low, high = np.nanmin(y), np.nanmax(y)
-            widen = max(1.0, 4 * low / high) ** 0.5  # a flat curve looks flat
+            widen = max(1.0, 4 * low / high) ** 0.5  # so that a flat curve looks flat
             axes.set_ylim(low / widen / 1.15, high * widen * 1.15)
             axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
             axes.annotate(note, (1, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize=9, color=BLUE)
         else:
             fitted = name == "loss_action" and "decoder_fit" in run.summary
-            why = "it is fitted in closed form\nafter the last update" if fitted else "no label entered this loss"
+            why = "it is fitted in closed form\nafter the last update" if fitted else "this loss used no label"
             axes.text(0.5, 0.5, f"0 throughout: {why}", transform=axes.transAxes, ha="center", color=MUTED)
             axes.set_yticks([])
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=_ROUND))
@@ -117,7 +117,7 @@ def _column(rows: Sequence[Mapping[str, str]], name: str) -> np.ndarray:
 
 
 def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
-    """Returns the mean of the values ``[N]`` at most ``reach`` places away without NaN; NaN where there is none."""
+    """Returns the mean of values ``[N]`` within ``reach`` places, ignoring NaN; NaN where there is none."""
     there = np.isfinite(values)
     sums = [np.convolve(part, np.ones(2 * reach + 1)) for part in (np.where(there, values, 0.0), there)]
     total, count = (part[reach : reach + len(values)] for part in sums)
@@ -128,14 +128,14 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     "actions.png",
     source="actions.safetensors",
     title="Predicted against recorded actions",
-    caption="Uses all actions, for evaluation only: those of demonstrations outside the label budget, which trained and"
-    " selected nothing. Points on the diagonal are exact. A slope below 1 means that actions are too small.",
+    caption="Uses all actions of demonstrations outside the label budget, for evaluation only: nothing was trained or"
+    " selected with them. Points on the diagonal are exact. A slope below 1 means that actions are too small.",
     order=90,
 )
 def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws ``predicted`` against ``true`` actions ``[N, d]``, a panel per column, in thousandths of their units.
 
-    They are of demonstrations outside the budget, read for evaluation only; the title says so.
+    They are of demonstrations outside the budget, read for evaluation only, as the title says.
     """
     true = entry(data, "true", [None, None])
     predicted, width = entry(data, "predicted", true.shape), true.shape[1]
@@ -187,7 +187,7 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
     offline=True,
 )
 def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws errors of sampled plans over the horizon beside those of baselines that need no learning."""
+    """Draws errors of sampled plans over the horizon, and those of baselines that need no learning."""
     plan = mapping(result.get("plan_errors"))
     if "unit" not in plan:
         raise NothingToDraw("no plan was evaluated on recorded data")
@@ -218,16 +218,15 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     "action_errors.png",
     source="eval.json",
     title="Errors of the actions",
-    caption="Root mean square error of the actions that are predicted from recorded states, as a share of that of"
-    " always giving the mean action (dashed; of absolute actions the mean distance to their target columns). Lower is"
-    " better. Below each action stands the controller's error in its unit. A red bar, if there is one, is an action in"
-    " which the controller is no better than the mean. On the robot the controller reads planned states, and its errors"
-    " are larger.",
+    caption="Root mean square error of the actions predicted from recorded states, relative to that of always giving"
+    " the mean action (dashed; for absolute actions the mean distance to their target columns). Lower is better. The"
+    " number below each action is the controller's error in its unit. Red bars are actions for which the controller is"
+    " no better than the mean. On the robot the controller reads planned states, and its errors are larger.",
     order=16,
     offline=True,
 )
 def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws errors of decoded actions by column, and those of a ridge, as shares of always the mean action's."""
+    """Draws errors of decoded actions and of a ridge by column, relative to those of the mean action."""
     parts = [(name, part) for name, part in mapping(result.get("action_errors")).items() if "column" in part]
     if not parts:
         raise NothingToDraw("no action was evaluated on recorded data")

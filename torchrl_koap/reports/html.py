@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pages from templates: numbers and keys in words, and the one environment that escapes everything that comes in.
+"""Fills page templates: formats numbers and keys; the only template environment, which escapes all input.
 
-A page is one file beside its pictures: style and script are inside, nothing is fetched from elsewhere.
+A page is one file next to its pictures, with style and script inside; it loads nothing from elsewhere.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _WORDS = {"labels_read_outside_budget": "labels read outside the budget, for eva
 
 
 def show(value: Any, key: str = "") -> str:
-    """Returns a single value of a JSON file as text, by its key, which may be a seed's; the template escapes it."""
+    """Formats a single value of a JSON file by its key (seeds without commas); the template escapes it."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -48,13 +48,13 @@ def label(key: Any) -> str:
 
 
 def columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns every key of some mappings, in the order in which they first occur."""
+    """Returns the keys of all rows, in the order of their first occurrence."""
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
 @cache
 def templates() -> Environment:
-    """Returns the templates of this package; names that are not handed in are errors, everything else is escaped."""
+    """Returns the template environment of this package; missing names are errors, all input is escaped."""
     environment = Environment(
         loader=PackageLoader("torchrl_koap.reports"),
         autoescape=lambda name: name is None or name.endswith(".html"),
@@ -68,7 +68,7 @@ def templates() -> Environment:
 
 
 def write_page(template: str, path: str | Path, **content: Any) -> Path:
-    """Fills a template of ``reports/templates`` with what it names, writes the page aside first, returns its file."""
+    """Fills a template of ``reports/templates`` with ``content``, writes the page atomically, returns its path."""
     path, page = Path(path), templates().get_template(template).render(**content)
     with replacing_file(path) as aside:
         aside.write_text(page, encoding="utf-8")

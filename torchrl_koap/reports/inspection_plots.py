@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pictures of what a controller has learnt: its spectrum, its latent space, and which part of the run fails."""
+"""Draws what a controller has learnt: its spectrum, its latent space, and which part of the run fails."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, WARNING, put_legend, tidy
 from torchrl_koap.tasks import Task
 
-ON_THE_CIRCLE = 1e-3  # eigenvalues whose magnitude is nearer to 1 lie on the unit circle
+ON_THE_CIRCLE = 1e-3  # eigenvalues with a magnitude this near to 1 count as on the unit circle
 _SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
 _EXPERIMENTS = {
     "planner_alone": "planner alone\n(plans that come true)",
     "controller_alone": "controller alone\n(recorded states)",
     "both": "both\n(closed loop)",
 }
-_DIVERGED = 1e6  # in the unit shown; a prediction further off is left out of the picture
+_DIVERGED = 1e6  # in the displayed unit; larger errors are not drawn
 _MODELS = {
     "koopman": ("latent dynamics", BLUE),
     "reconstruction": ("lifted and mapped back", PALE_BLUE),
@@ -44,10 +44,10 @@ _MODELS = {
     order=60,
 )
 def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws eigenvalues, errors per horizon, and how much of the true actions lies in the latent ones."""
+    """Draws eigenvalues, errors per horizon, and how well latent actions explain true ones."""
     latent = result.get("latent", {})
     if "multi_step" not in latent or run.task is None:
-        raise NothingToDraw("no latent space was looked into")
+        raise NothingToDraw("no latent space was inspected")
     outside = latent[OUTSIDE_THE_BUDGET]
     panels = ["spectrum", "errors"] + ["probe"] * ("note" not in outside)
     figure = Figure(figsize=(4.6 * len(panels) + 0.8, 4.1), layout="constrained")
@@ -69,12 +69,12 @@ def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
     "inspect.png",
     source="inspect.json",
     title="Which part fails",
-    caption="Success of the planner when its plans come true, of the controller on recorded states, and of both in"
-    " closed loop; distances of executed states to plans.",
+    caption="Success of the planner if its plans are executed exactly, of the controller on recorded states, and of"
+    " both in closed loop; distances of executed states to plans.",
     order=70,
 )
 def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws success of planner, controller and both, and how far execution is from plans in each part of the state."""
+    """Draws success of planner, controller and both, and distances of executed states from plans by state part."""
     if "both" not in result:
         raise NothingToDraw("the experiments in the simulator were left out")
     figure = Figure(figsize=(9.8, 4.1), layout="constrained")
@@ -88,7 +88,7 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     left.set_xticks(range(len(made)), numbers, fontsize=8)
     left.set_ylim(0, 105)
     left.set_ylabel("success (%)")
-    tidy(left, "Who reaches the goal (95 % intervals)")
+    tidy(left, "Success of the parts (95 % intervals)")
     for key, color, offset, label in (
         ("plan_to_execution", ORANGE, 0.18, "from the plan"),
         ("recording_to_execution", MUTED, -0.18, "from the recording, when that is the plan"),
@@ -101,12 +101,12 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     right.set_xlabel("root mean square distance after the last step of a plan\n(units of the states)")
     if names:
         put_legend(right, below=0.24)
-    tidy(right, "How far execution is")
+    tidy(right, "Distance of execution")
     return figure
 
 
 def _draw_plane(axes: Axes, values: np.ndarray) -> None:
-    """Eigenvalues in the complex plane; an inset magnifies them where they crowd."""
+    """Draws eigenvalues in the complex plane; an inset magnifies them if they are close together."""
     angle = np.linspace(0, 2 * np.pi, 2000)
     size = np.abs(values)
     side = np.where(size > 1 + ON_THE_CIRCLE, "outside", np.where(size < 1 - ON_THE_CIRCLE, "inside", "on"))
@@ -120,7 +120,7 @@ def _draw_plane(axes: Axes, values: np.ndarray) -> None:
     panels = [axes]
     centre = np.array([values.real.min() + values.real.max(), values.imag.min() + values.imag.max()]) / 2
     spread = max(np.ptp(values.real), np.ptp(values.imag), 0.002)
-    if spread < 0.4 and values.real.min() > 0.25:  # the empty half has room for a closer look
+    if spread < 0.4 and values.real.min() > 0.25:  # the inset covers the empty left half
         inset = axes.inset_axes((0.17, 0.54, 0.36, 0.36))
         inset.set(xlim=centre[0] + 0.6 * spread * np.array([-1, 1]), ylim=centre[1] + 0.6 * spread * np.array([-1, 1]))
         inset.tick_params(labelsize=6.5, color=FAINT, labelcolor=MUTED)

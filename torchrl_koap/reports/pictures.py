@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The register of a run's pictures: what each is drawn from, what it shows, and which function draws it.
+"""The registry of a run's pictures: their sources, their texts, and the functions that draw them.
 
 A picture is one decorated function, here or in any other package::
 
@@ -10,7 +10,7 @@ A picture is one decorated function, here or in any other package::
         return figure
 
 The function is called with the content of its source file and the :class:`~torchrl_koap.reports.run_facts.RunFacts`. It
-returns a figure (or a :class:`Film`), which the register writes aside first: an earlier picture is replaced whole.
+returns a figure (or a :class:`Film`), which the registry writes atomically in place of an earlier one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torchrl_koap.files import read_json, replacing_file
 from torchrl_koap.reports.run_facts import RunFacts
 
 FOLDER = "plots"
-HOLD_SECONDS = 1.5  # of the last frame of a film
+HOLD_SECONDS = 1.5  # duration of the last frame of a film
 _BUILT_IN = ("rollout_plots", "demonstrations", "error_plots", "animation", "inspection_plots")
 EVAL = "koap eval {run} --episodes 60 --seed 100"
 TRAIN = "koap train --out {run}"
@@ -46,18 +46,18 @@ _COMMANDS = {
 
 @dataclass(frozen=True)
 class Film:
-    """Images ``[height, width, 3]``, uint8, of equal size, each shown for some seconds, the last one for longer."""
+    """Images ``[height, width, 3]``, uint8, of equal size, each shown for ``seconds``, the last one longer."""
 
     frames: Iterable[np.ndarray]
     seconds: float
 
 
 class NothingToDraw(ValueError):
-    """The source holds nothing that this picture could show; an earlier picture is removed."""
+    """The source holds nothing for this picture to show; an earlier picture is removed."""
 
 
 class NotFilmed(RuntimeError):
-    """No OpenGL library can be used here; everything else can be drawn."""
+    """The film cannot be made here, such as without an OpenGL library; other pictures can be drawn."""
 
 
 Draw = Callable[[Any, RunFacts], Figure | Film]
@@ -65,20 +65,20 @@ Draw = Callable[[Any, RunFacts], Figure | Film]
 
 @dataclass(frozen=True)
 class Picture:
-    """Holds one picture of a run: its words, its source and the function that draws it."""
+    """A picture of a run: its texts, its source and the function that draws it."""
 
     name: str  # file name inside ``plots/``
-    source: str  # file of the run directory it is drawn from
+    source: str  # file of the run directory from which it is drawn
     title: str  # its heading in the report
-    caption: str | Callable[[RunFacts], str]  # what it shows and how to read it, or a function of the run that says so
-    draw: Draw  # from the content of the source and the run to a figure or film
-    order: int = 1000  # pictures stand in the report in this order
-    empty: str = ""  # what the report says where the source holds nothing to draw; nothing if it is empty
-    offline: bool = False  # it is of tasks without an environment alone, which are evaluated on recorded data
+    caption: str | Callable[[RunFacts], str]  # what it shows and how to read it, or a function of the run for this
+    draw: Draw  # ``draw(content of the source, run)`` gives a figure or film
+    order: int = 1000  # the report shows pictures in this order
+    empty: str = ""  # text in the report if the source holds nothing to draw; "": the picture is left out
+    offline: bool = False  # only for tasks without an environment, which are evaluated on recorded data
 
     @property
     def made_by(self) -> str:
-        """The command that leaves the source; ``{run}`` stands for the directory."""
+        """The command that writes the source; ``{run}`` stands for the directory."""
         return _COMMANDS.get(self.source, TRAIN)
 
     def caption_for(self, run: RunFacts) -> str:
@@ -86,7 +86,7 @@ class Picture:
         return self.caption if isinstance(self.caption, str) else self.caption(run)
 
     def write(self, run: RunFacts) -> None:
-        """Draws the picture of a run, whose directory holds the source."""
+        """Draws the picture of a run whose directory holds the source."""
         drawn = self.draw(_load(run.folder / self.source), run)
         save = save_figure if isinstance(drawn, Figure) else save_film
         save(drawn, run.folder / FOLDER / self.name)
@@ -96,10 +96,10 @@ _PICTURES: dict[str, Picture] = {}
 
 
 def picture(name: str, **facts: Any) -> Callable[[Draw], Draw]:
-    """Registers the decorated function as the one that draws a picture; ``facts`` are the other entries of `Picture`.
+    """Registers the decorated function as the one that draws a picture; ``facts`` are the other fields of `Picture`.
 
-    Of the source, ``.safetensors`` comes as a dictionary of arrays, ``.json`` as what it holds, ``.csv`` as a list of
-    rows. The function stays as it is. A name that is taken is refused.
+    The function receives a ``.safetensors`` source as a dictionary of arrays, ``.json`` as its content, ``.csv`` as a
+    list of rows. It is returned unchanged. Raises a ValueError if the name is taken.
     """
 
     def register(draw: Draw) -> Draw:
@@ -123,10 +123,10 @@ def all_pictures() -> dict[str, Picture]:
 def draw_pictures(
     folder: str | Path, *, names: Collection[str] | None = None, animation: bool = True
 ) -> dict[str, str]:
-    """Draws every picture, or those named, into ``plots/`` whose source is there; one that fails stops no other.
+    """Draws every picture whose source exists, or the ``names`` among them, into ``plots/``; continues after failures.
 
-    Moving ones take some seconds more (``animation``). Returned is a message per picture that could not be drawn; one
-    whose source is absent, or holds nothing to draw, is no error.
+    Animations take some seconds more (``animation``). Returns a message per picture that could not be drawn. It is not
+    an error if a source is absent or holds nothing to draw.
     """
     run = RunFacts.read(folder)
     problems = {}
@@ -144,7 +144,7 @@ def draw_pictures(
             except (ValueError, KeyError, OSError, TypeError, AttributeError, SafetensorError) as error:
                 problems[item.name] = f"{item.source}: {error}"
         elif source.exists() and path.exists() and path.stat().st_mtime < source.stat().st_mtime:
-            path.unlink()  # a film of an earlier evaluation beside the figures of this one
+            path.unlink()  # this film is of an earlier evaluation
     return problems
 
 
@@ -158,7 +158,7 @@ def save_film(film: Film, path: str | Path) -> None:
     """Writes a film as gif."""
     frames = list(film.frames)
     with replacing_file(path) as aside:
-        # one palette for all, without dithering: what stands still does not flicker and costs nothing
+        # one palette for all frames, without dithering: still parts neither flicker nor cost bytes
         some = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
         palette = some.quantize(224, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)  # keeps rare colours
         images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

@@ -47,7 +47,7 @@ from torchrl_koap.reports.style import (
 from torchrl_koap.tasks import Modes
 from torchrl_koap.tasks.columns import thousandths
 
-_LISTED = 10  # modes of a single choice that have wide bars with their names below
+_LISTED = 10  # up to this many modes of a single choice, bars are wide and have names below
 
 
 @picture(
@@ -66,7 +66,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     """
     modes, number = run.modes, run.modes.number
     if number < 2:
-        raise NothingToDraw("there is no choice")
+        raise NothingToDraw("the task has no modes")
     mode = entry(rollouts, "mode", [None]).astype(int)
     mode = mode[entry(rollouts, "outcome", [len(mode)]) == SUCCESS]
     lost = int(((mode < 0) | (mode >= number)).sum())
@@ -93,7 +93,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         axes.set_xticks(places, [name.split()[-1] for name in names] * (number // len(names)))
         for group in range(number // len(names)):
             middle = places[group * len(names) : (group + 1) * len(names)].mean()
-            text = Modes(modes.choices[:-1]).name_of(group).replace(", ", " / ")  # of all choices but the last
+            text = Modes(modes.choices[:-1]).name_of(group).replace(", ", " / ")  # all choices except the last
             axes.annotate(text, (middle, 0), (0, -22), textcoords="offset points", ha="center", size=8.5, color=INK)
         axes.set_xlabel(" / ".join(name for name, _ in heads) + f", and above it {last}", labelpad=19)
     else:
@@ -108,7 +108,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 
 
 def recorded_modes(demonstrations: Path, modes: Modes) -> np.ndarray:
-    """Returns the modes of the demonstrations that are decided; none where paths do not tell them.
+    """Returns the decided modes of the demonstrations; none if the task does not derive modes from paths.
 
     The file holds ``position`` ``[N, 2]`` (m) and ``episode`` ``[N]``.
     """
@@ -124,9 +124,9 @@ def recorded_modes(demonstrations: Path, modes: Modes) -> np.ndarray:
 
 
 def mode_colors(modes: Modes) -> np.ndarray:
-    """Returns an sRGB colour in 0..1 for each mode: hue tells the last choice apart, lightness all before it.
+    """Returns an sRGB colour in 0..1 for each mode: hue stands for the last choice, lightness for all before it.
 
-    Choices that are called by colours have their hues.
+    Choices that are named after colours have their hues.
     """
     if modes.number < 2:
         return np.array([to_rgb(BLUE)])
@@ -139,14 +139,14 @@ def mode_colors(modes: Modes) -> np.ndarray:
         hue = np.tile((0.6 - np.arange(hues) * min(0.27, 1 / hues)) % 1, shades)
     if shades > 1:
         lightness = np.repeat(np.linspace(0.42, 1.3, shades), hues)
-    else:  # neighbours among many hues need another lightness too
+    else:  # neighbours among many hues must also differ in lightness
         lightness = np.where(np.arange(hues) % 2, 0.8 if hues <= 8 else 1.15, 0.8)
     pure = hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.8), np.minimum(lightness, 0.95)], 1))
     return 1 - (1 - pure) * np.clip(2 - lightness, 0, 1)[:, None]
 
 
 def episode_colors(mode: np.ndarray, outcome: np.ndarray, modes: Modes) -> list[Any]:
-    """Returns the colour of each episode by mode and outcome ``[E]``: failures are black, undecided ones (-1) grey."""
+    """Returns the colour of each episode by mode and outcome ``[E]``: failures are black, undecided successes grey."""
     known = dict(enumerate(mode_colors(modes)))
     return [known.get(int(one), GREY) if kind == SUCCESS else INK for one, kind in zip(mode, outcome, strict=True)]
 
@@ -162,16 +162,16 @@ def _rollouts_caption(run: RunFacts) -> str:
 
 @picture("rollouts.png", source="rollouts.safetensors", title="Executed rollouts", caption=_rollouts_caption, order=10)
 def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws executed paths over the scene, coloured by mode; failures are black and marked where they end.
+    """Draws executed paths over the scene, coloured by mode; failures are black with a mark at the end.
 
-    A second panel shows the bodies of tasks that have them: where they start, their paths, where they end.
+    For tasks with bodies, a second panel shows their starts, paths and ends.
 
     Entries: ``position`` ``[E, T, 2]`` (m, NaN after the end), ``length``, ``mode`` (-1 none) and ``outcome`` (0 out of
     time, 1 success, 2 collision) ``[E]``; optionally ``object_position`` ``[E, T, bodies, 2]`` (m) and ``context``
     ``[E, bodies, 3]`` (x, y in m, yaw in rad).
     """
     if run.offline:
-        raise NothingToDraw("nobody knows which columns lie in a plane")
+        raise NothingToDraw("it is not known which columns are planar positions")
     paths, mode, outcome = read_episodes(rollouts)
     bodies, colors = body_paths(rollouts), episode_colors(mode, outcome, run.modes)
     good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
@@ -212,15 +212,15 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 def _plans_caption(run: RunFacts) -> str:
     if run.offline:
         return (
-            "Wide line: what was executed, grey in a failure. Thin lines: every plan of that episode, from the step"
-            " after it was made. Shown are the columns that actions are about, six at most. Failures come first."
+            "Wide line: executed states, grey in a failure. Thin lines: every plan of that episode, from the step"
+            " after it was made. Shown are at most six columns that actions move. Failures come first."
         )
     objects = " Outlines and thin coloured lines are the objects of that episode: starts and paths."
     return (
         "Wide pale band: the executed path. Thin lines: every plan of that episode; dots: where each was made. A plan"
         " that leaves the band at once was not followed (the controller errs); plans that fan out at their ends were"
-        " followed, then replaced (the planner revises). Distances are to the nearest point of the path, whatever the"
-        " time; what was planned beyond its end does not count. Failures come first."
+        " followed, then replaced (the planner revises). Distances are to the nearest point of the path at any time;"
+        " planned points beyond its end do not count. Failures come first."
     ) + (objects if run.task is not None and run.task.bodies else "")
 
 
@@ -233,7 +233,7 @@ def _plans_caption(run: RunFacts) -> str:
     empty="the rollouts hold no plans of positions",
 )
 def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws every plan of a few episodes over the path that was executed.
+    """Draws every plan of a few episodes over the executed path.
 
     Shown are up to two failures, then successes of as many different modes as possible, six in all. Entries as for
     :func:`draw_rollouts`, with ``plan`` ``[E, P, H, 2]`` (m, NaN padded) and ``plan_step`` ``[E, P]``, the control step
@@ -278,7 +278,7 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 
 
 def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
-    """Draws the columns that actions are about, a panel each, of up to three episodes: executed, and every plan."""
+    """Draws executed states and every plan of up to three episodes, a panel per column that actions move."""
     assert run.task is not None
     length, outcome = (entry(rollouts, name, [None]).astype(int) for name in ("length", "outcome"))
     columns = entry(rollouts, "column", [None]).astype(int)
@@ -308,9 +308,9 @@ def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 
 
 def choose_episodes(mode: np.ndarray, outcome: np.ndarray, count: int) -> list[int]:
-    """Chooses the episodes worth showing: two failures, then a success of a new mode each, then what is left.
+    """Chooses episodes to show: two failures, then a success of each mode, then others.
 
-    Modes (-1: none) and outcomes are those of every episode, int ``[E]``; at most ``count`` rows of them are returned.
+    Modes (-1: none) and outcomes are those of every episode, int ``[E]``. Returns the indices of at most ``count``.
     """
     bad = np.flatnonzero(outcome != SUCCESS).tolist()
     chosen, spare = bad[: min(2, count)], bad[2:]
@@ -324,7 +324,7 @@ def choose_episodes(mode: np.ndarray, outcome: np.ndarray, count: int) -> list[i
 
 
 def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns the distances of planned points ``[H, 2]`` from the executed path ``[L, 2]``, whatever the time (m).
+    """Returns the distances (m) of planned points ``[H, 2]`` from the executed path ``[L, 2]`` at any time.
 
     Points planned beyond the path's end are left out: nothing was executed there.
     """

@@ -11,31 +11,31 @@ from torchrl_koap.reports.run_facts import RunFacts, mapping, number
 from torchrl_koap.tasks.columns import thousandths
 
 _ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
-# the run's own model first, then what it is to be compared with
+# the run's own model first, then baselines
 _PLANS = {"planner": "", "standing_still": "standing still", "constant_velocity": "constant velocity"}
 _ACTIONS = {"controller": "", "ridge": "ridge regression", "mean_action": "always the mean action"}
 _LABELS = {"outside_budget": "outside the budget", "left_out": "of recordings left out of the fit"}
-_LATE = 0.8  # share of the updates from which on the best plans say that more may be better
+_LATE = 0.8  # if weights after this share of the updates are best, more updates may help
 _NOT_MEASURED = "not measured"
 
 
 @dataclass(frozen=True)
 class Row:
-    """A result and what it is to be compared with."""
+    """A result and its context."""
 
-    name: str  # what was measured
+    name: str  # the measured quantity
     value: str  # the result, with its unit
     note: str = ""  # what to compare it with, and how it was measured
-    bar: tuple[float, ...] | None = None  # share and ends of its interval in percent, if it is a share
+    bar: tuple[float, ...] | None = None  # for a share: it and the ends of its interval in percent
 
 
 def as_text(rows: Iterable[Row]) -> dict[str, str]:
-    """Returns rows as a terminal shows them: value and note by name."""
+    """Returns rows for the terminal: value and note by name."""
     return {row.name: "; ".join(filter(None, (row.value, row.note))) for row in rows}
 
 
 def training_rows(run: RunFacts) -> list[Row]:
-    """Returns what a training read, how its parts were trained, and why the planner's training ended."""
+    """Returns the labels that a training read, how its parts were trained, and why the planner's training ended."""
     return [row for row in (_labels(run), *_planner(run), _controller(run)) if row is not None]
 
 
@@ -59,7 +59,7 @@ def _labels(run: RunFacts) -> Row | None:
 
 
 def _planner(run: RunFacts) -> list[Row]:
-    """How the planner was trained, and why that ended; nothing for a method that has none."""
+    """Returns how the planner was trained, and why training ended; nothing for a method without a planner."""
     asked = mapping(run.config.get("planner"))
     if not asked or not number(run.summary, "planner_parameters"):
         return []
@@ -78,7 +78,7 @@ def _planner(run: RunFacts) -> list[Row]:
 
 def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
     if most is not None and updates < most:
-        return f"by itself before update {most:,.0f}", f"plans stopped improving at update {kept:,.0f}"
+        return f"early, before update {most:,.0f}", f"plans stopped improving at update {kept:,.0f}"
     if kept < _LATE * updates:
         return "with its last update", f"plans stopped improving at update {kept:,.0f}"
     return "with its last update", f"still improving: train again with --steps {2 * updates:.0f}"
@@ -95,7 +95,7 @@ def _controller(run: RunFacts) -> Row | None:
 
 def _seconds(run: RunFacts, part: str) -> str:
     seconds = number(run.summary, "train_seconds", part)
-    return "" if seconds is None or seconds < 1 else f" in {seconds:.0f} s"  # a finished part takes none when resumed
+    return "" if seconds is None or seconds < 1 else f" in {seconds:.0f} s"  # 0 if it was finished before a resume
 
 
 def _plan_errors(run: RunFacts) -> list[Row]:
@@ -118,7 +118,7 @@ def _action_errors(run: RunFacts) -> list[Row]:
 
 
 def _error_row(name: str, row: Mapping[str, Any], errors: Mapping[str, float], kind: str, *more: str) -> Row:
-    """Errors of the models, by what they are called, over the columns of one unit."""
+    """Returns the row of errors of the models, by display name, over the columns of one unit."""
     (shown, factor), columns = thousandths(row["unit"]), row["columns"]
     own, *others = (f"{words} {factor * error:.4g}".lstrip() for words, error in errors.items())
     which = columns[0] if len(columns) == 1 else f"{len(columns)} columns"

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What is known about a run: its task and the numbers in its files, read once for pictures, hints and page."""
+"""Facts about a run: its task and the numbers in its files, read once for pictures, advice and page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def mapping(value: Any) -> Mapping[str, Any]:
 
 
 def number(value: Any, *keys: str) -> float | int | None:
-    """Returns the value, or the entry of an entry that some keys lead to in it, if it is a finite number, else None."""
+    """Returns the value, or its nested entry at ``keys``, if it is a finite number, else None."""
     for key in keys:
         value = mapping(value).get(key)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -31,9 +31,9 @@ def number(value: Any, *keys: str) -> float | int | None:
 
 @dataclass(frozen=True)
 class RunFacts:
-    """Holds what is known about a run: its task, if anybody here knows it, and its JSON files.
+    """Facts about a run: its task, if it is known, and its JSON files.
 
-    Those that are absent or damaged are empty; ``damaged`` says what was wrong with which.
+    Absent or damaged files are empty; ``damaged`` has the messages about damaged ones.
     """
 
     folder: Path
@@ -46,7 +46,7 @@ class RunFacts:
 
     @classmethod
     def read(cls, folder: str | Path) -> RunFacts:
-        """Reads the JSON files of a run directory, those that are there."""
+        """Reads the JSON files of a run directory that exist."""
         folder, damaged = Path(folder), []
         if not folder.is_dir():
             raise FileNotFoundError(f"there is no run directory {str(folder)!r}")
@@ -60,13 +60,13 @@ class RunFacts:
                 damaged.append(str(error))
         try:
             task = task_from(files["config"]["task"], files["config"].get("task_definition"))
-        except (ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
+        except (ValueError, KeyError, TypeError, AttributeError):  # the task is not registered here
             task = None
         return cls(folder, task, damaged=tuple(damaged), **files)
 
     @property
     def offline(self) -> bool:
-        """Whether the task has no environment, so that recorded data say how good the run is."""
+        """Whether the task has no environment, so that the run is evaluated on recorded data."""
         return self.task is not None and self.task.env is None
 
     @property
@@ -76,7 +76,7 @@ class RunFacts:
 
     @property
     def modes(self) -> Modes:
-        """The ways to do the task; none where it is not known or was rolled out in another environment."""
+        """The modes of the task; none if it is unknown or was rolled out in another environment."""
         return Modes() if self.task is None or self.evaluation.get("env") else self.task.modes
 
     @property
@@ -86,34 +86,34 @@ class RunFacts:
         return {name: values for name, values in known if isinstance(values, Mapping)}
 
     def success(self, entry: str = "rate") -> float | None:
-        """Returns the success rate, an end of its interval or the number of rollouts; None if it is not there."""
+        """Returns the success rate, an end of its interval or the number of rollouts; None if it is missing."""
         return number(self.evaluation, "rates", "success", entry)
 
     @property
     def successes(self) -> int:
-        """Number of successful rollouts, 0 where there are none."""
+        """Number of successful rollouts."""
         rate, episodes = self.success(), self.success("episodes")
         return round(rate * episodes) if rate and episodes else 0
 
     @property
     def expected_entropy(self) -> float | None:
-        """Mode entropy that a uniform choice would have with as many successes; None where there is no choice."""
+        """Mode entropy that a uniform choice would have with as many successes; None without modes or successes."""
         choice = self.modes.number > 1 and self.successes
         return expected_entropy(self.successes, self.modes.number) if choice else None
 
     @property
     def action_errors(self) -> Mapping[str, Any]:
-        """Errors of decoded actions by the labels that they were measured on; each may be a note why there is none."""
+        """Errors of decoded actions by the labels on which they were measured; each may be a note why it is missing."""
         return mapping(self.evaluation.get("action_errors"))
 
     def evaluated(self, name: str) -> float | None:
-        """Returns a number of the evaluation, None if it is not there."""
+        """Returns a number of the evaluation, None if it is missing."""
         return number(self.evaluation, name)
 
     def experiment(self, name: str) -> float | None:
         """Returns the success of an experiment of ``koap inspect``, None if it was not made.
 
-        Where things are pushed or grasped, the controller alone succeeds where it stays near a recorded tool path.
+        In tasks where objects are moved, the controller alone succeeds if it stays near a recorded tool path.
         """
         left, episodes = (number(self.inspection, "recordings_left", entry) for entry in ("count", "episodes"))
         if name == "controller_alone" and left is not None and episodes:

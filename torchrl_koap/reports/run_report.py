@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The one-page report of a run directory: what a template needs, gathered from the files that are there."""
+"""The one-page report of a run directory: collects the content of its template from the existing files."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _CONFIG_ELSEWHERE = ("versions", "command")
 
 
 def write_report(folder: str | Path, *, draw: bool = True, animation: bool = True) -> Path:
-    """Writes ``index.html`` into a run directory; sections whose files are absent say which command makes them.
+    """Writes ``index.html`` into a run directory; sections whose files are absent name the command that makes them.
 
-    Pictures are drawn first (``draw``; otherwise those already there are shown), moving ones too (``animation``).
+    Draws pictures first (``draw``; else existing ones are shown), with animations if ``animation``.
     """
     run = RunFacts.read(folder)
     problems = draw_pictures(run.folder, animation=animation) if draw else {}
@@ -72,7 +72,7 @@ def _subtitle(run: RunFacts) -> str:
 
 
 def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
-    """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
+    """Returns the figures to show, and for each command the titles of the pictures whose source it would write."""
     no_actions = mapping(run.action_errors.get("outside_budget")).get("note")
     figures: list[dict[str, Any]] = []
     missing: dict[str, list[str]] = {}
@@ -107,7 +107,7 @@ def _eval_command(run: RunFacts) -> str:
 
 
 def _words(options: Mapping[str, Any]) -> list[str]:
-    """Options as words of a command, those that were given."""
+    """Returns the given options as words of a command."""
     words = []
     for key, value in options.items():
         if value not in (None, []):
@@ -116,7 +116,7 @@ def _words(options: Mapping[str, Any]) -> list[str]:
 
 
 def _filled(command: str, run: RunFacts) -> str:
-    """A command of this run; one that rolls out does so in the environment of the last rollouts."""
+    """Fills in a command for this run; rollouts use the environment of the last ones."""
     places = {"run": run.folder, "data": run.config.get("dataset")}
     line = command.format(**{name: shlex.quote(str(place)) for name, place in places.items()})
     rolls_out = "--episodes" in command or command.startswith("koap inspect")

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Draws a task from above: what stands still, its bodies, paths of tool and bodies."""
+"""Draws a task from above: still shapes, bodies, paths of tool and bodies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.reports.style import BLUE, FAILURE_MARKS, FAINT, GREEN, INK, MUTED, RED, entry, tidy
 from torchrl_koap.tasks import Body, Shape, Task
 
-# how a role is drawn; a shape's own colour goes before the role's
+# style of each role; a shape's own colour overrides the role's
 ROLES = {
     "clearance": {"facecolor": "#e9ebee", "edgecolor": "none", "zorder": 0.5},
     "obstacle": {"facecolor": "#7b828d", "edgecolor": "#565c66", "linewidth": 0.8, "zorder": 0.6},
@@ -28,15 +28,15 @@ ROLES = {
     "zone": {"facecolor": "#fff3e0", "edgecolor": "#d9730d", "linewidth": 0.8, "zorder": 0.5},
     "target": {"facecolor": "#ffe0b8", "edgecolor": "none", "zorder": 0.6},
 }
-MANY = 20  # contexts: from here on only centres are drawn
+MANY = 20  # contexts; of more only centres are drawn
 _NAMED = {"red": RED, "green": GREEN, "blue": BLUE, "grey": MUTED}
 _LABEL_COLORS = {"finish": GREEN, "zone": "#9a5b13"}
-_MOST_ROOM = 0.5  # of the scene's own size is added on a side where paths leave it, at most
+_MOST_ROOM = 0.5  # share of the scene's size that is added at most on a side where paths leave it
 _UNKNOWN = Body("objects", position="")
 
 
 def color_of(name: str) -> str:
-    """Returns the colour that pictures use for a name such as ``"red"``; others, such as ``"#9a5b13"``, as they are."""
+    """Returns the colour that pictures use for a name such as ``"red"``; keeps others, such as ``"#9a5b13"``."""
     return _NAMED.get(name, name)
 
 
@@ -76,15 +76,15 @@ def _draw_shape(axes: Axes, shape: Shape) -> None:
 
 
 def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
-    """Widens a panel until paths ``[n, 2]`` (m) lie inside it, on every side by at most half of what it showed before.
+    """Widens a panel until paths ``[n, 2]`` (m) lie inside it, on every side by at most half of its previous size.
 
-    A panel that shows no scene yet is fitted to the paths.
+    A panel without a scene is fitted to the paths.
     """
     points = np.concatenate([np.zeros((0, 2)), *paths])
     points = points[np.isfinite(points).all(1)]
     if not len(points):
         return
-    fresh = axes.get_autoscale_on()  # nobody has set limits
+    fresh = axes.get_autoscale_on()  # true if no limits were set
     low, high = points.min(0), points.max(0)
     margin = 0.03 * np.maximum(high - low, 1e-3)
     for now, change, start, end in (
@@ -99,14 +99,14 @@ def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
 
 
 def read_episodes(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Returns the positions ``[length, 2]`` (m) of each episode without the padding, and modes and outcomes ``[E]``."""
+    """Returns the positions ``[length, 2]`` (m) of each episode without padding, and modes and outcomes ``[E]``."""
     paths = _paths(rollouts, "position", [None, None, 2])
     mode, outcome = (entry(rollouts, key, [len(paths)]).astype(int) for key in ("mode", "outcome"))
     return paths, mode, outcome
 
 
 def body_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
-    """Returns the path ``[frames, bodies, 2]`` (m) of the bodies of each episode, the last state included; or none."""
+    """Returns the body paths ``[frames, bodies, 2]`` (m) of each episode, with the last state; none without bodies."""
     if "object_position" not in rollouts:
         return []
     return _paths(rollouts, "object_position", [None, None, None, 2], last=1)
@@ -120,7 +120,7 @@ def _paths(rollouts: Mapping[str, Any], key: str, shape: Sequence[int | None], l
 
 
 def bodies_of(task: Task | None, number: int) -> tuple[Body, ...]:
-    """Returns a body to draw for each of ``number``; grey ones where the task is not known or has another number."""
+    """Returns ``number`` bodies to draw; grey ones if the task is unknown or has another number."""
     bodies = task.bodies if task is not None and len(task.bodies) == number else (_UNKNOWN,) * number
     return tuple(replace(body, color=color_of(body.color)) for body in bodies)
 
@@ -131,7 +131,7 @@ def draw_bodies(
     """Draws the bodies of a task: start outlines (if there are contexts), paths in their colours, ends.
 
     Paths are positions ``[frames, bodies, 2]`` (m) of each episode, contexts ``[E, bodies, 3]`` starts: x, y (m),
-    yaw (rad). Bodies end in a dot where an episode is ``good``, otherwise in a cross.
+    yaw (rad). Ends are dots in ``good`` episodes, else crosses.
     """
     bodies = bodies_of(task, paths[0].shape[1] if len(paths) else 0)
     if contexts is not None:
@@ -151,10 +151,10 @@ def draw_bodies(
 
 
 def draw_starts(axes: Axes, contexts: Any, bodies: Sequence[Body]) -> None:
-    """Draws outlines of bodies as contexts ``[E, bodies, 3]`` (x, y in m, yaw in rad) place them, paler the more.
+    """Draws outlines of bodies at contexts ``[E, bodies, 3]`` (x, y in m, yaw in rad), paler if there are many.
 
-    The far side of a body whose orientation matters is thick; of more than 20 only the centres are drawn, each with a
-    line to its far side.
+    The far side of a body whose orientation matters is thick; for more than 20 contexts such a body is drawn as its
+    centre with a line to the far side.
     """
     contexts = entry({"context": contexts}, "context", [None, len(bodies), 3]).astype(float)
     many = len(contexts) > MANY
@@ -185,7 +185,7 @@ def outlines(poses: np.ndarray, half: tuple[float, float]) -> np.ndarray:
 
 
 def body_handles(bodies: Sequence[Body], good: Sequence[bool] = ()) -> list[Line2D]:
-    """Returns handles of a legend: every kind of body once, and the marks of :func:`draw_bodies` that occur.
+    """Returns legend handles: every kind of body once, and the marks of :func:`draw_bodies` that occur.
 
     ``good`` says whether each drawn episode succeeded.
     """
@@ -200,7 +200,7 @@ def body_handles(bodies: Sequence[Body], good: Sequence[bool] = ()) -> list[Line
 
 
 def draw_failure_end(axes: Axes, path: np.ndarray, outcome: int) -> None:
-    """Marks where an episode with the path ``[n, 2]`` (m) has ended that failed, by the number of its outcome."""
+    """Marks the end of a failed episode's path ``[n, 2]`` (m), by the number of its outcome."""
     if len(path):
         mark = FAILURE_MARKS.get(int(outcome), "D")
         axes.scatter(*path[-1], s=75, marker=mark, color=INK, edgecolors="white", linewidths=0.9, zorder=6)

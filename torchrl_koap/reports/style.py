@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The look that all pictures share: colours, marks, frames, and how arrays come in."""
+"""The common style of all pictures: colours, marks, frames; and the check of input arrays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X", ERROR: "v"}
 
 
 def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.ndarray:
-    """Returns an entry, which has to be there, as an array of a shape, of which None allows any size."""
+    """Returns a required entry as an array of the given shape, where None allows any size."""
     if key not in data:
         raise ValueError(f"missing entry {key!r}; got {', '.join(sorted(map(str, data))) or 'nothing'}")
     value = np.asarray(data[key])
@@ -32,14 +32,14 @@ def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Returns a name and, in brackets, its unit if it has one."""
+    """Returns a name, with its unit in brackets if it has one."""
     return f"{name} ({unit})" if unit else name
 
 
 def panels(
     count: int, across: int, size: tuple[float, float], room: tuple[float, float] = (0, 0)
 ) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with panels of a size (inches) in rows of at most ``across``; ``room`` is for what is around."""
+    """Returns a figure with panels of a size (inches) in rows of at most ``across``; ``room`` is added around them."""
     across = max(min(count, across), 1)
     down = -(-count // across)
     width, height = size[0] * across + room[0], size[1] * down + room[1]
@@ -48,7 +48,7 @@ def panels(
 
 
 def tidy(axes: Axes, title: str | None = None, *, grid: bool = False) -> Axes:
-    """Styles a panel with a light frame, small ticks and labels; a title flush left and lines across if asked for."""
+    """Styles a panel: light frame, small ticks and labels, optionally a title flush left and horizontal grid lines."""
     if title is not None:
         set_title(axes, title)
     if grid:
@@ -65,7 +65,7 @@ def tidy(axes: Axes, title: str | None = None, *, grid: bool = False) -> Axes:
 
 
 def set_title(axes: Axes, text: str) -> None:
-    """Sets the title of a panel, one line or several, flush left."""
+    """Sets the title of a panel, of one or several lines, flush left."""
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
 
 

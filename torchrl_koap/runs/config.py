@@ -134,7 +134,7 @@ class RunConfig:
         precision: of the matrix products in the planner's training: "float32", "bfloat16" (several times faster if the
             processor has units for it, else many times slower), or "auto": bfloat16 if it has.
         logger: "csv" (metrics.csv alone), or also "wandb" (offline unless WANDB_MODE says otherwise) or "tensorboard".
-        resume: go on with an interrupted run; options that are not given are those it was started with.
+        resume: resume an interrupted run; options that are not given keep their first values.
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run, which keeps the absolute paths of files.
 

@@ -105,7 +105,7 @@ def planned_windows(data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
 def column_weights(task: Task) -> Tensor | None:
     """Returns weights ``[d]`` of the state columns in a planner's loss: those of the robot, which executes, sum to 1/3.
 
-    None, all columns alike, if the robot has no column or at least a third of them, or the task has an environment.
+    None, all columns alike, if the robot has no column, or a share of 1/3 or more, or the task has an environment.
     """
     columns, robot = task.state_dim, len(task.robot)
     if task.env is not None or not 0 < 3 * robot < columns:

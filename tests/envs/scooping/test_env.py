@@ -134,7 +134,7 @@ def test_who_demonstrates_has_to_be_said(tmp_path):
         Demos(out=tmp_path / "a", task="scooping")()
     with pytest.raises(ValueError, match="unknown embodiment 'foot'"):
         Demos(out=tmp_path / "a", task="scooping", embodiment="foot")()
-    with pytest.raises(ValueError, match="one embodiment alone"):
+    with pytest.raises(ValueError, match="has only one embodiment"):
         Demos(out=tmp_path / "a", task="avoiding", embodiment="hand")()
     assert not (tmp_path / "a").exists()
 
