@@ -57,7 +57,7 @@ def test_what_is_ignored_stays_ignored():
 @pytest.mark.parametrize("words", [["--out", ""], ["--out="], [""]])
 def test_empty_words_are_refused(words, capsys):
     assert cli.main(["train", *words]) == 1
-    assert "is a variable of the shell not set?" in capsys.readouterr().err
+    assert "is a shell variable not set?" in capsys.readouterr().err
 
 
 def test_a_narrow_terminal_gets_its_help(monkeypatch, capsys):

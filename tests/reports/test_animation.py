@@ -83,7 +83,7 @@ def test_film_starts_from_the_context(task, monkeypatch):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({}, "a film needs the 'context'"),
+        ({}, "a film needs the entry 'context'"),
         ({"context": np.zeros((1, 2, 3))}, r"'context' must have shape \[any, 4, 3\]"),
         ({"action": np.zeros((1, 3, 5))}, r"'action' must have shape \[any, any, 2\]"),
     ],

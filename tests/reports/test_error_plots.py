@@ -50,7 +50,7 @@ def test_a_running_mean_skips_what_is_missing():
 
 @pytest.mark.parametrize(
     ("rows", "message"),
-    [([], "no row"), ([{"step": "1"}], r"no value of any loss_\* column"), ([{"step": "1", "loss_a": "x"}], "float")],
+    [([], "no row"), ([{"step": "1"}], r"no value in a loss_\* column"), ([{"step": "1", "loss_a": "x"}], "float")],
 )
 def test_bad_metrics(rows, message):
     with pytest.raises(ValueError, match=message):

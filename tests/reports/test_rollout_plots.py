@@ -55,7 +55,7 @@ def test_modes_in_words():
 
 
 def test_without_a_choice_there_is_nothing_to_draw():
-    with pytest.raises(NothingToDraw, match="no choice"):
+    with pytest.raises(NothingToDraw, match="only one mode"):
         drawn("scooping", [0, 0])
 
 
@@ -182,7 +182,7 @@ def test_plans_over_time_where_nobody_knows_a_plane():
     np.testing.assert_allclose(figure.axes[5].lines[0].get_ydata(), state[0, :, 1])
     planned = figure.axes[5].collections[0].get_segments()[0]
     np.testing.assert_allclose(planned, np.stack([np.arange(1, 15), state[0, 1:15, 1]], 1))
-    assert "columns that actions are about" in all_pictures()["plans.png"].caption_for(run)
+    assert "columns that actions move" in all_pictures()["plans.png"].caption_for(run)
     for draw in (draw_rollouts, animate_rollouts):
         with pytest.raises(NothingToDraw, match="it is not known which columns are planar"):
             draw(hand, run)

@@ -165,7 +165,7 @@ def test_several_data_sets_must_name_their_tasks(tmp_path):
     places = [tmp_path / name for name in ("one", "two")]
     for place in places:
         save_arm(place)
-    with pytest.raises(ValueError, match="must be TASK=FOLDER where there are several"):
+    with pytest.raises(ValueError, match="must be TASK=FOLDER if there are several"):
         complete(Study(out=tmp_path / "s", datasets=tuple(map(str, places))))
     assert complete(Study(out=tmp_path / "s", datasets=(str(places[0]),))).tasks == ("arm",)
 

@@ -66,7 +66,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     """
     modes, number = run.modes, run.modes.number
     if number < 2:
-        raise NothingToDraw("the task has no modes")
+        raise NothingToDraw("the task has only one mode")
     mode = entry(rollouts, "mode", [None]).astype(int)
     mode = mode[entry(rollouts, "outcome", [len(mode)]) == SUCCESS]
     lost = int(((mode < 0) | (mode >= number)).sum())

@@ -26,7 +26,7 @@ from torchrl_koap.training.policy_facts import tells_commands
 CONTROLLER_UPDATES = 500
 PLACES = "absolute"  # default preset if decoded actions are positions
 FOLLOWED = "delayed"  # default preset if they are targets of state columns, which a robot reaches with a delay
-# planner options for recorded data: about a hundred demonstrations, which larger networks overfit
+# planner options for recorded data, usually a hundred demonstrations or so: they avoid overfitting
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.4  # of plans in tasks without an environment, where no modes are counted
 PLAN_SECONDS = 0.1  # least time between plans with feedback: a new plan starts where the robot lags behind the last one
