@@ -75,7 +75,7 @@ RESUME = ("train", "--out", "RUN", "--resume")
     [
         (("train", "--out", "RUN", "--dataset", "DATA", *TINY), "holds a run already; choose another --out, or --res"),
         ((*RESUME, "--seed", "3"), "was started with another run.seed: it cannot be resumed"),
-        ((*RESUME, "--steps", "30", "--preset", "paper"), "started with another planner.steps, controller.preset; it"),
+        ((*RESUME, "--steps", "30", "--preset", "paper"), "started with another planner.steps, controller.preset: it"),
         (("eval", "RUN", "--strategy", "oracel"), "unknown strategy 'oracel'; did you mean 'oracle'?"),
         (("eval", "RUN", "--replan-interval", "15"), "replan_interval must be in 1..14"),
         (("eval", "RUN", "--episodes", "0"), "episodes must be >= 1, got 0"),

@@ -101,7 +101,7 @@ def test_a_plugin_that_was_moved_is_taken_from_where_it_is_now(copied_run, tmp_p
     config = json.loads((copied_run / "config.json").read_text())
     config["run"]["plugins"] = [str(tmp_path / "there" / "mine.py")]
     (copied_run / "config.json").write_text(json.dumps(config))
-    with pytest.raises(PluginError, match="there is no plugin file '.*/there/mine.py'; --plugin says where"):
+    with pytest.raises(PluginError, match="there is no plugin file '.*/there/mine.py'; give its present path"):
         Trained.load(copied_run)
     (tmp_path / "mine.py").write_text("LOADED = True\n")
     assert Trained.load(copied_run, plugins=[str(tmp_path / "mine.py")]).planner is not None

@@ -74,8 +74,8 @@ def advice(run: RunFacts) -> Iterator[Advice]:
         seen = f"the entropy of the modes is {entropy:.2f}, a uniform choice would average {even:.2f}"
         if policy:
             yield Advice(
-                f"{seen}: a method without a planner knows the labelled ways only",
-                "a method that plans learns the ways from all demonstrations (--method koap)",
+                f"{seen}: a method without a planner learns only from labelled demonstrations",
+                "a method that plans learns the modes from all demonstrations (--method koap)",
             )
         else:
             yield Advice(

@@ -20,7 +20,7 @@ from torchrl_koap.tasks import Task
 ON_THE_CIRCLE = 1e-3  # eigenvalues with a magnitude this near to 1 count as on the unit circle
 _SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
 _EXPERIMENTS = {
-    "planner_alone": "planner alone\n(plans that come true)",
+    "planner_alone": "planner alone\n(exactly executed plans)",
     "controller_alone": "controller alone\n(recorded states)",
     "both": "both\n(closed loop)",
 }

@@ -55,8 +55,8 @@ _LISTED = 10  # up to this many modes of a single choice, bars are wide and have
     source="rollouts.safetensors",
     title="Modes of the successful rollouts",
     caption="One bar per mode, in the colour of its rollouts. Black ticks: the share of each mode in the"
-    " demonstrations, where they say which they took. Entropy is 1 when all modes are equally frequent; a handful of"
-    " rollouts cannot reach 1 even with a uniform choice, the title says what to expect.",
+    " demonstrations, if their modes are known. Entropy is 1 if all modes are equally frequent; a few rollouts cannot"
+    " reach 1 even with a uniform choice: the title gives its mean value.",
     order=40,
 )
 def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:

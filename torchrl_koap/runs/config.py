@@ -135,8 +135,8 @@ class RunConfig:
             processor has units for it, else many times slower), or "auto": bfloat16 if it has.
         logger: "csv" (metrics.csv alone), or also "wandb" (offline unless WANDB_MODE says otherwise) or "tensorboard".
         resume: resume an interrupted run; options that are not given keep their first values.
-        plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
-            reads the run, which keeps the absolute paths of files.
+        plugins: modules that register tasks, methods or pictures; imported before anything else, and again by every
+            command that reads the run, which records absolute paths of files.
 
     Raises:
         ValueError: for a number out of range, or an unknown device, precision or logger.

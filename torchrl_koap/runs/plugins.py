@@ -45,7 +45,7 @@ def absolute_files(names: Sequence[str]) -> tuple[str, ...]:
 
 def _load(name: str) -> None:
     if name.endswith(".py") and not os.path.isfile(name):
-        raise PluginError(f"there is no plugin file {name!r}; --plugin says where one is now")
+        raise PluginError(f"there is no plugin file {name!r}; give its present path with --plugin")
     try:
         import_code(name)
     except Exception as error:

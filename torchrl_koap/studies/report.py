@@ -23,7 +23,7 @@ _CAPTIONS = {
         "Success against the labels",
         "Left against the labelled share, right against the number of distinct transitions whose action was read: a"
         " label on a window or a trajectory is many actions, and overlapping windows share them. Bands (whiskers where"
-        " there are many methods, drawn a little beside each other) are 95 % Wilson intervals over all rollouts of all"
+        " there are many methods, drawn next to each other) are 95 % Wilson intervals over all rollouts of all"
         " seeds.",
     ),
     "mode_entropy": (

@@ -77,9 +77,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 # options of the sections that a study sets itself, and the reason
-_ONE_THREAD = "a cell has one thread; --workers says how many run at a time"
+_ONE_THREAD = "a cell has one thread; --workers sets how many run at a time"
 DECIDED = {
-    "run.seed": "cells have the seeds 0, 1, ..., as many as --seeds says",
+    "run.seed": "cells have the seeds 0, 1, ...; --seeds sets their number",
     "run.resume": "it always resumes",
     "run.threads": _ONE_THREAD,
     "planner.source": "name runs with --planners",

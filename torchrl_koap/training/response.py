@@ -43,7 +43,7 @@ def tracked_columns(task: Task) -> dict[str, Any]:
     if task.command is None:
         lacks = "its observation has no part that repeats the last command (Task.command)"
     elif rest:
-        lacks = f"nothing tells the actions {', '.join(rest)}"
+        lacks = f"it is not known what the actions {', '.join(rest)} move"
     elif columns is None:
         lacks = (
             f"its {task.action_dim} actions, the commands ({task.command!r}) and the state columns that they move"
