@@ -35,7 +35,7 @@ def run(env, steps, seeds=None):
     env.reset()
     frames = []
     for _ in range(steps):
-        action = torch.full((*env.batch_size, 2), PUSH)
+        action = torch.full((*env.batch_size, 2), PUSH, requires_grad=True)  # as of a policy, outside of no_grad
         frames.append(env.step(TensorDict({"action": action}, env.batch_size))["next"])
     return torch.stack(frames, 1)
 

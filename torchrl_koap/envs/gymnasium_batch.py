@@ -146,7 +146,7 @@ class GymnasiumBatch(EnvBase):
         return self._leaves(seen)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen, reward, _, _, info = self._env.step(tensordict.get(ACTION).cpu().numpy() + self._added)
+        seen, reward, _, _, info = self._env.step(tensordict.get(ACTION).detach().cpu().numpy() + self._added)
         self._steps += info["played"]
         self.record.actions += int(info["played"].sum())
         self.record.clipped += int(info["clipped"].any(-1).sum())
