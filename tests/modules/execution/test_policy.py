@@ -128,8 +128,25 @@ def test_a_missing_transform_is_named():
         EpisodesOfRandomLength(2, LENGTHS).rollout(2, policy_of())
     with pytest.raises(KeyError, match="reads 'is_init': append policy_transforms"):
         policy_of()(TensorDict({"observation_history": torch.zeros(2, 2, 3)}, [2]))
-    with pytest.raises(ValueError, match=r"must hold 2 frames on axis -2, got \[2, 4, 3\]"):
+    with pytest.raises(ValueError, match=r"must be \[2, 2, 'obs'\] .*, got \[2, 4, 3\]"):
         policy_of()(step_input(torch.zeros(2, 4, 3)))
+    agents = TensorDict({"observation_history": torch.zeros(2, 5, 2, 3), "is_init": torch.ones(2, 1).bool()}, [2])
+    with pytest.raises(ValueError, match=r"must be \[2, 2, 'obs'\] .*, got \[2, 5, 2, 3\]"):
+        policy_of()(agents)  # five agents would be five frames of a plan
+
+
+@pytest.mark.parametrize("elsewhere", [1, 2])
+def test_a_plan_that_is_lost_is_that_of_another_environment_if_the_policy_acted_there(elsewhere):
+    policy = policy_of()
+
+    def act(count, number, begins):
+        seen = [float(max(number - back, number // 100 * 100)) for back in (1, 0)]
+        frames = torch.stack([torch.full((count, 3), each) for each in seen], 1)
+        return policy(step_input(frames).set("is_init", torch.full((count, 1), begins)))["action"][0, 3].item()
+
+    assert [act(2, 0, True), act(2, 1, False)] == [0, 0]  # the state in which the plan was made
+    assert [act(elsewhere, 100, True), act(elsewhere, 101, False)] == [100, 100]
+    assert [act(2, 2, False), act(2, 3, False)] == [2, 2]
 
 
 def test_planned_states_are_not_executed_nor_sampled_actions_decoded():

@@ -36,7 +36,7 @@ class PlanningPolicy(TensorDictModuleBase):
     at its own times, counted from its own reset (:class:`torchrl.modules.MultiStepActorWrapper`). Batches may have any
     shape, including ``[]`` for a single environment. The current plan is stored in the tensordict. The policy also
     remembers the last one that it wrote: a :class:`torchrl.envs.ParallelEnv` whose workers reset by themselves returns
-    only its own entries.
+    only its own entries. If it has acted in another environment since, it plans anew.
 
     :func:`torch.compile` does not change a policy, since data decide when plans are made; :meth:`compile` compiles its
     denoiser in place.
@@ -239,21 +239,24 @@ class PlanningPolicy(TensorDictModuleBase):
     @torch.compiler.disable  # a graph would freeze the step counter of its first call
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of the current step, and the plan that the next step continues."""
-        observed = tensordict.get(self.in_keys[0], None)
-        for name, value in ((self.in_keys[0], observed), (IS_INIT, tensordict.get(IS_INIT, None))):
+        observed, begins = tensordict.get(self.in_keys[0], None), tensordict.get(IS_INIT, None)
+        for name, value in ((self.in_keys[0], observed), (IS_INIT, begins)):
             if value is None:
                 raise KeyError(f"the policy reads {name!r}: append policy_transforms() to the environment")
-        if observed.shape[-2] != self.history:
-            raise ValueError(
-                f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
-            )
         batch, kept = tensordict.batch_size, [self._chunk_key, self.receding.counter_key]
-        if self._written is not None and self._written.batch_size == batch and kept[0] not in tensordict.keys():
-            if not tensordict.get(IS_INIT).all():
-                tensordict.update(self._written)
+        if observed.shape[:-1] != (*batch, self.history):
+            raise ValueError(
+                f"{self.in_keys[0]!r} must be {[*batch, self.history, 'obs']} (batch size, frames, columns),"
+                f" got {list(observed.shape)}"
+            )
+        if kept[0] not in tensordict.keys() and not begins.all():
+            if self._continues(tensordict):
+                tensordict.update(self._written.select(*kept))
+            else:  # the policy acted elsewhere in the meantime
+                begins = torch.ones_like(begins)
         noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
         # MultiStepActorWrapper needs exactly one batch dimension
-        flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
+        flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False).set(IS_INIT, begins)
         flat = flat.reshape(-1) if batch else flat.unsqueeze(0)
         under_way = tensordict.get(UNDER_WAY, None)
         if under_way is None or under_way.all():
@@ -265,8 +268,19 @@ class PlanningPolicy(TensorDictModuleBase):
             written[rows] = part
         written = written.select(self._action_key, *kept, *self.receding.action_keys)
         tensordict.update(written.reshape(batch) if batch else written[0])
-        self._written = tensordict.select(*kept)
+        # a copy of the history: environments in processes overwrite theirs
+        self._written = tensordict.select(*kept).set(self.in_keys[0], observed.clone())
         return tensordict
+
+    def _continues(self, tensordict: TensorDictBase) -> bool:
+        """Whether all rows that are under way and do not begin are one step after those written last."""
+        observed, begins = tensordict.get(self.in_keys[0]), tensordict.get(IS_INIT)
+        before = None if self._written is None else self._written.get(self.in_keys[0])
+        if before is None or before.shape != observed.shape:
+            return False
+        follows = (observed[..., :-1, :] == before[..., 1:, :]).flatten(-2).all(-1, keepdim=True)
+        idle = ~tensordict.get(UNDER_WAY, torch.ones_like(begins)).reshape(begins.shape)
+        return bool((follows | begins | idle).all())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = self.receding(tensordict)
