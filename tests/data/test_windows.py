@@ -97,6 +97,12 @@ def test_labels_on_inner_frames_count_unasked():
     assert WindowTable.build(data, 16).labelled.all()
 
 
+def test_steps_may_be_counted_as_torchrl_does():
+    data = demonstrations()
+    counted = data.copy().set("step_count", data["step_count"].unsqueeze(-1))
+    assert torch.equal(WindowTable.build(counted, 16).starts, WindowTable.build(data, 16).starts)
+
+
 def test_wrong_options():
     data = demonstrations()
     for counted in (range(1, 16), range(-1, 4)):

@@ -93,6 +93,7 @@ class WindowTable:
         new = begins(data)
         count = data.get(keys.STEP_COUNT, None)
         if count is not None:  # a trajectory with missing steps is split there
+            count = count.reshape(-1)  # TorchRL's StepCounter counts in [N, 1]
             new[1:] |= count[1:] != count[:-1] + 1
         first = new.nonzero().squeeze(-1)
         lengths = torch.diff(first, append=torch.tensor([steps], device=device))
