@@ -82,13 +82,18 @@ def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, re
     if value is None:
         there = sorted(tensordict.keys(True, True), key=str)
         raise KeyError(f"{type(module).__name__} reads {key!r}; there are {there}; rename with {rename}")
+    check_type(module, value, key)
+    return value
+
+
+def check_type(module: nn.Module, value: Tensor, key: NestedKey) -> None:
+    """Refuses an entry of another floating type than the weights of a module."""
     weight = next(module.parameters(), None)
     if weight is not None and value.is_floating_point() and value.dtype != weight.dtype:
         name = type(module).__name__
         raise ValueError(
             f"{key!r} is {value.dtype}, {name} {weight.dtype}: cast one of them, as with .to({weight.dtype})"
         )
-    return value
 
 
 def observed_numbers(given: Any) -> Tensor:

@@ -53,6 +53,10 @@ class SamplerTestBase:
         flat = sampler.sample(history.reshape(-1, 2, 2), noise.reshape(-1, 6, self.width))
         torch.testing.assert_close(sequence.reshape(-1, 6, self.width), flat)
 
+    def test_states_of_another_type_are_refused(self):
+        with pytest.raises(ValueError, match=r"'history' is torch.float64, .* torch.float32: cast one of them"):
+            self.make().sample(torch.zeros(3, 2, 2, dtype=torch.float64))  # as MuJoCo's are in Gymnasium
+
     @pytest.mark.parametrize("exploration", ExplorationType)
     def test_without_noise_every_sample_is_another(self, exploration):
         sampler, history = self.make(), torch.randn(3, 2, 2)

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from torchrl_koap.keys import HISTORY, read_entry
+from torchrl_koap.keys import HISTORY, check_type, read_entry
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.noise_schedule import SOLVERS, NoiseSchedule
@@ -114,6 +114,7 @@ class ConditionalSampler(TensorDictModuleBase):
     def encode_history(self, history: Tensor) -> Tensor:
         """Maps raw histories ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d + f]``."""
         _check(history, repr(self.in_keys[0]), self.history, self.state_dim, "history, state_dim")
+        check_type(self, history, self.in_keys[0])
         return self.condition_normalizer(self.condition(history))
 
     def far(self, state: Tensor) -> Tensor:
