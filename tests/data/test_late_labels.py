@@ -70,6 +70,15 @@ def test_a_script_that_reacts_to_noisy_states_is_on_time():
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
+def test_paths_without_anything_unforeseen_say_nothing():
+    time, generator = np.linspace(0, 1, FRAMES + 1)[:, None], np.random.default_rng(0)
+    paths = [time**3 * generator.normal(size=3) + np.sin(np.pi * time) * generator.normal(size=3) for _ in range(4)]
+    targets = [path[1:] + 0.02 * np.diff(path, axis=0) for path in paths]
+    data = make_demonstrations([path[:-1] for path in paths], targets, control_hz=30, action_kind="absolute")
+    assert frames_late(*data) == 0
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_few_or_constant_labels_say_nothing():
     data, task = recordings(2)
     data["has_action"][16:] = False

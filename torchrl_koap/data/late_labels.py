@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap import keys
@@ -15,6 +16,7 @@ from torchrl_koap.tasks import Task
 REACH = 3  # frames before and after a label; a longer lag is not found
 CLEAR, NEAR = 0.15, 0.05  # shares of the error: what later labels must explain, and what counts as nothing
 FOLDS, MOST, PENALTY = 5, 4000, 1e-6  # of the cross-validation; most rows; relative ridge
+INNOVATION = 3e-4  # share of the changes' variance that past states must leave: of analytic paths they leave less
 LARGEST_GAIN = 1.03  # frames per target: a robot goes no farther than its target
 
 
@@ -40,24 +42,22 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
 
     Labels that are early cannot be told from a robot that responds late. A late robot hides as many late frames.
     """
-    episode, labelled = (data.get(key).flatten().cpu().numpy() for key in (keys.EPISODE, keys.HAS_ACTION))
-    rows = np.arange(REACH, len(episode) - REACH)
-    rows = rows[episode[rows - REACH] == episode[rows + REACH]]
-    rows = rows[np.all([labelled[rows + ahead] for ahead in range(-REACH, REACH + 1)], axis=0)]
-    rows = spread_evenly(data.get(keys.EPISODE).new_tensor(rows), MOST).cpu().numpy()
+    rows = _labelled_rows(data)
     states = data.get(keys.OBSERVATION).double().cpu().numpy()[:, list(task.state_columns)]
     actions, moved = data.get(keys.ACTION).double().cpu().numpy(), list(task.moves.values())
     change = (states[rows + 1] - states[rows])[:, moved]
     robot = states[:, list(task.robot) or moved]
     inputs = (REACH + 1) * robot.shape[1] + (2 * REACH + 1) * actions.shape[1]
-    used = np.flatnonzero(change.std(0) > 1e-9) if len(rows) > inputs else []
+    if not moved or len(rows) <= inputs:
+        return 0
+    past = [robot[rows]] + [robot[rows - i] - robot[rows - i - 1] for i in range(REACH)]
+    errors = _regress(past, change)[0]
+    used = np.flatnonzero(errors > INNOVATION * change.var(0) * len(rows))
     if not len(used):
         return 0
-    change, commands = change[:, used], np.array(list(task.moves))[used]
-    past = [robot[rows]] + [robot[rows - i] - robot[rows - i - 1] for i in range(REACH)]
+    change, errors, commands = change[:, used], errors[used], np.array(list(task.moves))[used]
     given = [actions[rows + ahead] for ahead in range(-REACH, REACH + 1)]
-    errors, gains = _regress(past, change)[0], []
-    shares = []
+    shares, gains = [], []
     for ahead in range(REACH + 1):
         error, weights = _regress([*past, *given[: REACH + ahead + 1]], change)
         shares.append(np.median(np.minimum(error / errors, 1)))
@@ -66,6 +66,14 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
     needed = next(ahead for ahead, share in enumerate(shares) if share <= min(shares) + NEAR)
     clear = shares[0] - min(shares) > CLEAR and gains[needed] > 0
     return needed if clear and not (task.targets and gains[needed] > LARGEST_GAIN) else 0
+
+
+def _labelled_rows(data: TensorDictBase) -> np.ndarray:
+    """Returns rows ``[n]`` of flat data whose neighbours up to ``REACH`` are labelled and of the same trajectory."""
+    episode, labelled = (data.get(key).flatten().cpu().numpy() for key in (keys.EPISODE, keys.HAS_ACTION))
+    rows = np.arange(REACH, len(episode) - REACH)
+    near = [(episode[rows + ahead] == episode[rows]) & labelled[rows + ahead] for ahead in range(-REACH, REACH + 1)]
+    return spread_evenly(torch.from_numpy(rows[np.all(near, axis=0)]), MOST).numpy()
 
 
 def _regress(parts: list[np.ndarray], outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
