@@ -12,7 +12,7 @@ from gymnasium.wrappers.utils import create_zero_array
 
 SUCCESS_KEYS = ("is_success", "success")
 _ROUNDING = 1e-6  # float32 may move an action this far beyond its box, relative and absolute
-_BONUS = 2.0  # a final reward above this multiple of all earlier ones means success
+_BONUS = 2.0  # a final reward above this multiple of the largest earlier one means success
 _LONGEST_PROBE = 1000  # steps within which the requested success key must appear
 
 
@@ -28,9 +28,9 @@ class GymnasiumEpisode(gymnasium.Wrapper):
     box; ``success``; and ``error``, the environment's error in this step or at the reset, which truncates the episode.
     A wrong observation (:class:`ObservationError`) is such an error, which names the column by ``names``.
 
-    Success is the entry ``success_key`` of the environment's ``info``, else ``is_success`` or ``success``. Without
-    one, an episode succeeds if its last step terminates it with a positive reward above twice any earlier one. A
-    positive reward alone is not enough: a walker has one in all steps, also when it falls.
+    Success is the entry ``success_key`` of the environment's ``info``; by default ``is_success`` or ``success``. If
+    the default finds none, an episode succeeds if its last step terminates it with a positive reward above twice any
+    earlier one. A positive reward alone is not enough: a walker has one in all steps, also when it falls.
     """
 
     def __init__(
