@@ -7,8 +7,8 @@ control step it
     1. chooses a box    of the next colour, and keeps it until it has arrived
     2. chooses a way    to push: the direction that is best for the way of the box to the bin, past the other boxes, and
                         for the way of the rod to the place behind the box
-    3. moves the rod    around all boxes to that place, or, once behind the box, forwards; while pushing it steers
-                        twice as far to the side as the box lies off, which brings the box back in front of it
+    3. moves the rod    around all boxes to that place, or, once behind the box, forwards; while pushing it turns
+                        by 1.4 times the angle between push and box, which brings the box back in front of it
 
 The last two are in :mod:`torchrl_koap.envs.experts.sorting_decision`.
 """
