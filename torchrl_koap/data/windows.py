@@ -175,7 +175,7 @@ class WindowSampler(RandomSampler):
             have a label; the others have none, if such windows exist. Default: labels do not affect the draw.
 
     Raises:
-        ValueError: if the share is outside (0, 1], or no window has a label.
+        ValueError: if ``labelled_share`` is outside (0, 1], or is given and no window has a label.
 
     Examples:
         >>> import torch
