@@ -14,14 +14,14 @@ from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.tasks import Task
 
 REACH = 3  # frames before and after a label; a longer lag is not found
-CLEAR, NEAR = 0.15, 0.05  # shares of the error: what later labels must explain, and what counts as nothing
+CLEAR, NEAR = 0.15, 0.05  # shares of the error without labels: least gain by late labels; gains that are ignored
 FOLDS, MOST, PENALTY = 5, 4000, 1e-6  # of the cross-validation; most rows; relative ridge
-INNOVATION = 3e-4  # share of the changes' variance that past states must leave: of analytic paths they leave less
-LARGEST_GAIN = 1.03  # frames per target: a robot goes no farther than its target
+INNOVATION = 3e-4  # share of the changes' variance that past states must leave unexplained; analytic paths leave less
+LARGEST_GAIN = 1.03  # largest coefficient of a target: a robot goes no farther than its target
 
 
 def late_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
-    """Yields a warning if labels of flat data ``[N]`` are late: later labels cause the motion, present ones do not."""
+    """Yields a warning if labels of flat data ``[N]`` are late: later labels explain the motion, present ones less."""
     late = frames_late(data, task)
     if late:
         frames = "one frame" if late == 1 else f"{late} frames"
@@ -35,12 +35,12 @@ def late_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
 def frames_late(data: TensorDictBase, task: Task) -> int:
     """Counts the frames by which the labels of flat data ``[N]`` are late; 0 where that is not clear.
 
-    This is a test of Granger causality. The next change of every commanded column is regressed on past states and on
-    labels up to a frame, by cross-validated ridge regression. Labels that are on time explain it by the present frame.
-    If later labels are needed, they are late by that many frames. A script that reacts to noisy states leaves the same
-    trace, with a coefficient of the other sign, or above 1 for targets; such data count as on time.
+    This is a test of Granger causality. Cross-validated ridge regression predicts the next change of every commanded
+    column from past states and labels up to some frame. If labels are on time, those up to the present frame suffice.
+    If later ones are needed, labels are late by that many frames. Labels of a script that reacts to noisy states look
+    the same, but their coefficient is negative, or above 1 for targets; they count as on time.
 
-    Labels that are early cannot be told from a robot that responds late. A late robot hides as many late frames.
+    Early labels look like a robot that responds late. A robot that responds k frames late hides k late frames.
     """
     rows = _labelled_rows(data)
     states = data.get(keys.OBSERVATION).double().cpu().numpy()[:, list(task.state_columns)]
