@@ -28,7 +28,7 @@ from torchrl_koap.training.policy_facts import command_ranges
 from torchrl_koap.training.trained import Trained
 
 STEPS, ROBOTS = 300, 16
-DIVERGED = 1e12  # a rollout ends beyond this state, far below values whose squares overflow in a network
+DIVERGED = 1e12  # a rollout ends if a column exceeds this, far below values whose squares overflow in a network
 _MIN_ROLLOUTS, _START_MARGIN = 5, 0.02  # to compare starts; tolerance, as a share of the range of the column
 _EXPLAINED = 0.5  # smallest share of the variance of changes that a usable linear model explains
 _SMOOTH = 8  # frames that are averaged before distances from the start are measured
@@ -104,7 +104,7 @@ def check_loop(
 
 
 def _growth(commands: Tensor, ends: Tensor, steps: int) -> tuple[Tensor, float]:
-    """Returns commands ``[T, n, act]`` over the largest demonstrated ``[T, n]``, and the maximum of the last third."""
+    """Returns the largest ratios ``[T, n]`` of commands to demonstrated ones, and their maximum in the last third."""
     growth = ((commands - ends.mean(-1)) / (ends.diff(dim=-1).squeeze(-1) / 2)).nan_to_num(math.inf).abs()
     growth = growth[..., ends[:, 0].isfinite()].amax(-1)
     return growth, float(growth[2 * len(growth) // 3 :].max()) if len(growth) == steps else math.inf
@@ -124,7 +124,7 @@ def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
 
 
 def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> list[str]:
-    """Counts failed rollouts ``[T]`` that, in most columns, hardly leave their start compared to demonstrations."""
+    """Reports failed rollouts ``[T]`` that, in most columns, hardly leave their start compared to demonstrations."""
 
     def reach(rows: Tensor) -> Tensor:
         smooth = rows.double().unfold(0, min(_SMOOTH, len(rows)), 1).mean(-1)  # sensor noise is not motion
