@@ -201,7 +201,7 @@ def unlabelled_warnings(
     """Finds columns of ``[T_i, d]`` in which over 10 % of the unlabelled trajectories differ from the labelled ones.
 
     They differ if most frames lie outside the labelled range, widened by half of it on both sides. They also differ if
-    two or more columns that move in all labelled trajectories move at most a tenth as far. ``known`` says which
+    two or more columns that move in all labelled trajectories move less than a tenth as far. ``known`` says which
     trajectories have labels.
     """
     labelled, others = (
