@@ -178,8 +178,8 @@ def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *
 def distance_to_demonstrations(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:
     """Measures how far visited and held-out demonstrated states are from the nearest other demonstrated state.
 
-    Every second demonstration is held out, so that neither is compared with itself. Returns 95 % quantiles in units of
-    the states' spread (standard deviation); an empty dict for a single demonstration.
+    Every second demonstration is held out, so that neither is compared with itself. Returns 95 % quantiles
+    in standard deviations (root mean square over columns); an empty dict for a single demonstration.
     """
     every = data[EPISODE] % 2 == 0
     known, held_out = data[STATE][every], data[STATE][~every]
