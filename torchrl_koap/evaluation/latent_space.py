@@ -72,7 +72,7 @@ def prediction_errors(
       the same inputs, no lifting;
     * ``copy_last``: :math:`x_{t+h} = x_t`.
 
-    ``reconstruction``, :math:`g_\psi(g_\theta(x_{t+h}))`, is the smallest error that the first one can reach.
+    ``reconstruction``, :math:`g_\psi(g_\theta(x_{t+h}))`, is the part of the first one's error due to mapping back.
 
     Both ``u`` and ``v`` read recorded states *ahead* of every step, so this tests the models; it is no forecast. The
     linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others.
