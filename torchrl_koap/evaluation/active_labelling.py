@@ -80,8 +80,8 @@ def rank_trajectories(
             steps count for the choice.
 
     Keyword Args:
-        penalty (float): ridge penalty over the mean square norm of the labelled latent actions (of all, if none is
-            labelled), as in :class:`~torchrl_koap.modules.RidgeFit`.
+        penalty (float): ridge penalty relative to the mean square norm of the labelled latent actions (of all, if none
+            is labelled), as in :class:`~torchrl_koap.modules.RidgeFit`.
         count (int, optional): number of trajectories. Default: 5, or all that are left.
         bias (bool): whether the decoder has a fitted mean.
         score (callable): score, the highest of which is chosen; arguments as for :func:`variance_reduction`.
@@ -142,7 +142,7 @@ def _rows(latent: Tensor, labelled: Tensor, penalty: float, bias: bool) -> tuple
     if bias:
         latent, reference = latent - reference.mean(0), reference - reference.mean(0)
     unit = reference.square().sum(-1).mean()
-    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # all latent actions are 0: any scale will do
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # all (centred) latent actions are 0: any scale will do
     if bias:
         latent = torch.cat([latent, (_MEAN_SPREAD * unit.sqrt()).expand(len(latent), 1)], -1)
     return latent, penalty * unit
