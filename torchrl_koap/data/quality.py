@@ -197,7 +197,7 @@ def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _noise(parts: Sequence[np.ndarray]) -> np.ndarray | float:
-    """Estimates the deviation ``[d]`` of independent noise by neighbouring steps; 0 where most parts move."""
+    """Estimates the standard deviation ``[d]`` of noise from neighbouring steps; 0 for columns that move."""
     steps = [np.diff(part, axis=0) for part in parts if len(part) == WINDOW]
     if not steps:
         return 0.0

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Errors of plans and actions on recorded data; no environment is needed.
 
-Several futures may be right: a plan that differs from the demonstration is not wrong. Plans are therefore scored as a
+Several futures may be right: a plan that differs from the demonstration need not be wrong. Plans are scored as a
 distribution.
 
 Labels outside the budget are read here, for evaluation only, after the training. The result says how many.

@@ -99,7 +99,7 @@ def task_scores(
 
 
 def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
-    """Returns as ``rates`` in which rollouts of Stacking at least one box, or two, reached the zone."""
+    """Returns as ``rates`` whether one or more, and two or more boxes reached the zone in rollouts of Stacking."""
     stacked = [int((episode[-1]["next", MODE] >= 0).sum()) for episode in episodes]
     least = {"one box stacked": 1, "two boxes stacked": 2}
     return {"rates": {name: [count >= number for count in stacked] for name, number in least.items()}}

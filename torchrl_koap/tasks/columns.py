@@ -115,7 +115,7 @@ class Columns:
 
     @cached_property
     def state_slices(self) -> dict[str, slice]:
-        """State columns of every part."""
+        """State columns of every part of the state."""
         return _slices({part: len(self._feature_names(part, kind)) for part, kind in self.state_parts.items()})
 
     @property

@@ -79,7 +79,7 @@ def _joined(name: str) -> str:
 def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
     """Converts a column ``[T]`` of any type to float64; None if it holds no numbers.
 
-    Booleans become 0 and 1, dates of a clock its unit, names of episodes numbers in order of appearance.
+    Booleans become 0 and 1. Dates become times in the clock's unit. Names of episodes are numbered as they appear.
     """
     (kind, unit), held = kind_of(name), values.dtype.kind
     if held in "mM" and kind == "clock":

@@ -50,7 +50,7 @@ def forward_kinematics(q, axes, origins, tcp, quat):
 
 @njit(cache=True)
 def _quaternion(axes, quat):
-    """Quaternion (w, x, y, z) of a rotation whose columns are the rows of ``axes``."""
+    """Writes the quaternion (w, x, y, z) of the rotation whose columns are the rows of ``axes``."""
     xx, yy, zz = axes[0, 0], axes[1, 1], axes[2, 2]
     xy, yx, xz, zx, yz, zy = axes[1, 0], axes[0, 1], axes[2, 0], axes[0, 2], axes[2, 1], axes[1, 2]
     if xx + yy + zz > 0.0:
@@ -69,13 +69,13 @@ def _quaternion(axes, quat):
 
 @njit(cache=True)
 def clip(value, low, high):
-    """Returns the value, or the bound that it lies beyond."""
+    """Returns the value, limited to ``low`` and ``high``."""
     return min(max(value, low), high)
 
 
 @njit(cache=True)
 def _cholesky(matrix, shift, factor):
-    """Lower Cholesky factor of ``matrix - shift * I``; False if that is not positive definite."""
+    """Writes the lower Cholesky factor of ``matrix - shift * I``; returns False if it is not positive definite."""
     for i in range(6):
         for j in range(i + 1):
             total = matrix[i, j] - (shift if i == j else 0.0)

@@ -203,7 +203,7 @@ class SimulationBatch(Simulations):
         """Returns what D3IL's recorder logs for the last control step (docs/appendix/d3il.md, Recordings).
 
         It records after the *first* substep: ``c_pos`` (m) is the TCP at the beginning of the step. Joints are in rad;
-        all are arrays ``[n, ...]``. The second value are the poses of the free bodies [n, objects, 7] (m, quaternion).
+        all are arrays ``[n, ...]``. The second value holds poses of the free bodies [n, objects, 7] (m, quaternion).
         """
         robot = {name: self._log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
         return robot, self._log[:, controller.LOG_WIDTH :].reshape(len(self), -1, 7).copy()
