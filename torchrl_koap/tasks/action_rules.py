@@ -73,7 +73,7 @@ def shift_actions(actions: Tensor, states: Tensor, distances: Sequence[tuple[int
 
 
 def gripper_command(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:
-    """Computes gripper commands ``[*B, T - 1]`` (m) from widths ``[*B, T]`` (m), which are open above ``open_above``."""
+    """Computes gripper commands ``[*B, T - 1]`` from widths ``[*B, T]`` (m), which are open above ``open_above``."""
     now, following = width[..., :-1], width[..., 1:]
     padded = torch.cat([following, width[..., -1:].expand(*width.shape[:-1], OPENING - 1)], -1)
     soon = padded.unfold(-1, OPENING, 1).amax(-1)
