@@ -89,5 +89,5 @@ def test_few_or_constant_labels_say_nothing():
 
 
 def test_the_warning_says_by_how_many_frames():
-    with pytest.warns(UserWarning, match="actions look 2 frames late.* up by 2 frames and leave the last ones empty"):
+    with pytest.warns(UserWarning, match="actions look 2 frames late.* 2 frames earlier and leave the last ones empty"):
         recordings(2)

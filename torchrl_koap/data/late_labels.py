@@ -26,9 +26,9 @@ def late_warnings(data: TensorDictBase, task: Task) -> Iterator[str]:
     if late:
         frames = "one frame" if late == 1 else f"{late} frames"
         yield (
-            f"actions look {frames} late: the robot moves {frames} before its command, and policies of such labels"
-            f" fail; move the actions of every recording up by {frames} and leave the last ones empty, unless a script"
-            " computed them from noisy states"
+            f"actions look {frames} late: the robot moves {frames} before its command, and policies trained on such"
+            f" labels fail; shift the actions of every recording {frames} earlier and leave the last ones empty, unless"
+            " a script computed them from noisy states"
         )
 
 
