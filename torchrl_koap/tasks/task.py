@@ -274,7 +274,7 @@ class Task(Columns):
             ValueError: if the task has no goal, or the number of state columns is wrong.
         """
         if self.goal is None:
-            raise ValueError(f"task {self.name!r} has no goal: goal_reached needs one")
+            raise ValueError(f"task {self.name!r} has no goal to check states against: give it one (Task.goal)")
         if state.shape[-1] != self.state_dim:
             raise ValueError(f"a state of task {self.name!r} has {self.state_dim} columns, got {state.shape[-1]}")
         return resolve(self.goal, f"goal of task {self.name!r}")(self, state)
