@@ -185,7 +185,7 @@ def make_demonstrations(
         own = [column for column in others if moving[column]] or others
     else:
         own = _columns(robot, names, "robot", problems)
-    problems += [f"column {names[column]!r} is robot and command" for column in own if column in commanded]
+    problems += [f"column {names[column]!r} is both robot and command" for column in own if column in commanded]
     if commanded and commanded != list(range(min(commanded), min(commanded) + len(commanded))):
         problems.append(f"command columns must be adjacent, got {', '.join(names[c] for c in commanded)}")
     if not others:
@@ -193,7 +193,7 @@ def make_demonstrations(
     kinds = [ACTION_KINDS[kind] for kind in one_each(action_kind, len(acting), "action_kind", problems)]
     reached = _targets(kinds, targets, own, names, problems)
     if targets is not None:
-        problems += [f"column {names[column]!r} is target and command" for column in reached if column in commanded]
+        problems += [f"column {names[index]!r} is both target and command" for index in reached if index in commanded]
     units = one_each(action_units, len(acting), "action_units", problems)
     own_units = one_each(state_units, len(names), "state_units", problems)
     origin = _origin(np.concatenate(recordings.states), names, "state", problems)
