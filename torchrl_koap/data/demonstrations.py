@@ -39,7 +39,7 @@ def save_demonstrations(
     """Writes demonstrations, of which few or none have actions, as a data set for ``koap train --dataset``.
 
     Args:
-        folder (str or Path): folder to create; a data set there is replaced atomically.
+        folder (str or Path): folder to create; a data set there is replaced once the new one is complete.
         states (sequence of array, or Recordings): frames of every trajectory ``[T_i, d]``, in the units that the robot
             reports; or the result of :func:`~torchrl_koap.data.read_recordings`.
         actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, NaN

@@ -34,7 +34,7 @@ _ABOUT, _STEPS = "about.json", "steps.safetensors"
 
 
 def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mapping[str, Any] | None = None) -> Path:
-    """Writes flat TED data into a folder; an earlier data set there is replaced atomically.
+    """Writes flat TED data into a folder; replaces an earlier data set once the new one is complete.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout.
