@@ -103,8 +103,8 @@ def make_recordings(
 
     Raises:
         DataError: listing all faults: no trajectories, other widths than in the first, fewer than two frames, states
-            that are not finite numbers, infinite actions, neither ``T`` nor ``T - 1`` actions, action columns with few
-            values, names that do not match.
+            that are not finite numbers, infinite actions, neither ``T`` nor ``T - 1`` actions, action columns that are
+            mostly empty, names that do not match.
 
     Examples:
         >>> import numpy as np

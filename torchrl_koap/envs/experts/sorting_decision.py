@@ -207,8 +207,8 @@ def _direction_cost(box, yaw, angle, to_go, way, slowness):
 def best_push(boxes, yaws, present, target, lane, rod):
     """Chooses how to push a box to its bin; arguments are those of :func:`decide`.
 
-    Returns the costs of the rest of the box's way and of the rod's [X, Y], its slowness [X, Y], the angle along
-    which to push (rad), and the cost of that (m of way), the rod's own way included.
+    Returns the costs of the box's remaining way and of the rod's way [X, Y], the slowness of the rod [X, Y], the angle
+    of the push (rad), and its cost (m of way), which includes the rod's way.
     """
     others = present.copy()
     others[target] = False
