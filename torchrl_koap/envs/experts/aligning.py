@@ -164,7 +164,7 @@ class _Player:
         return self.pose[:2] + _turned(point, self.pose[2])
 
     def _entry(self) -> np.ndarray:
-        """Returns where the rod is lowered: inside, shortly before the contact; outside, 22 mm off the wall."""
+        """Returns where the rod is lowered: inside, at 35 % of the way to the contact; outside, 22 mm off the wall."""
         rod = self.contact[4:6]
         if self.mode == _INSIDE:
             return self._in_world(0.35 * rod + self.slip)
