@@ -42,8 +42,7 @@ def open_dataset(
 
     Raises:
         FileNotFoundError: if there is no such folder, or it holds no demonstrations.
-        DataError: if the data are damaged, or of another task.
-        ValueError: if the data name a task that is not registered.
+        DataError: if the data are damaged, of another task, or name a task that is not registered.
 
     Examples:
         >>> import tempfile
