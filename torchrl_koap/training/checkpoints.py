@@ -18,7 +18,7 @@ def save_training_state(
 ) -> None:
     """Writes all that a training loop needs to resume: parameters (targets included), moments, random state, ``about``.
 
-    The module holds the loss and all else that has a state. An ``about`` is ``{"phase": "planner", "step": 500}``.
+    The module holds the loss and all else that has a state. ``about`` is, e.g., ``{"phase": "planner", "step": 500}``.
     """
     moments = optimizer.state_dict()["state"]
     tensors = _state(module)

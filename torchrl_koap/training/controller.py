@@ -67,7 +67,7 @@ def learn_controller(
 def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None:
     """Raises a ValueError before training if a trajectory of flat data ``[N]`` is shorter than a window.
 
-    A controller whose actions do not have the task's width is refused, too. Warns of labels that no fit sees.
+    Also if a controller fails or its actions lack the task's width. Warns of late switches that no fit sees.
     """
     method, window, past, ahead = get_method(config.method), WINDOW, 1, 0
     if method.plans and method.fit is None:

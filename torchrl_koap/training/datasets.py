@@ -41,7 +41,7 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
     """Returns the numbers of the trajectories to hold out from the planner, those without a label first.
 
     Trajectories with labels are taken only if the others do not suffice. They lose no label: the planner does not
-    see them, the controller does. At least one trajectory is held out (two of ten or more), and at least one is left.
+    see them, the controller does. At least one trajectory is held out (of ten or more, two), and at least one is left.
     A single trajectory is not held out.
 
     The fraction is a share of all trajectories of flat data ``[N]``, in ``[0, 1)``; None is 0.

@@ -103,7 +103,7 @@ def planned_windows(data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
 
 
 def column_weights(task: Task) -> Tensor | None:
-    """Returns weights ``[d]`` of state columns in a planner's loss: those of the robot, which are executed, sum to 1/3.
+    """Returns weights ``[d]`` of state columns in a planner's loss: the executed ones of the robot have 1/3 of the sum.
 
     None, all columns alike, if the robot has no column, or a share of 1/3 or more, or the task has an environment.
     """

@@ -64,7 +64,7 @@ def _commands_of(task: Task, actions: Sequence[int]) -> dict[str, list[int]]:
 
 
 def tells_commands(task: Task, method: Method) -> bool:
-    """Returns whether labels of a method include the commands that actions change; with ``fit`` it reads changes."""
+    """Returns whether labels include the commands that actions change; not for ``fit`` methods, which read changes."""
     return task.defaults.commands and method.fit is None
 
 

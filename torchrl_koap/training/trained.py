@@ -188,7 +188,7 @@ class Trained:
     def policy(
         self, execution: Execution | ExecutionConfig | None = None, *, follower: Follower | None = None
     ) -> PlanningPolicy:
-        """Makes a policy of the networks: observations in, an action per control step out.
+        """Makes a policy from the networks; it maps observations to one action per control step.
 
         Args:
             execution (Execution or ExecutionConfig, optional): how plans become actions. Fields that are None keep
