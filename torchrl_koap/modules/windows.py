@@ -114,7 +114,7 @@ class WindowReader(nn.Module):
         return self.num_past + 1 + self.look_ahead[-1]
 
     def valid_frames(self, num_frames: int) -> range:
-        """Returns the frames that count in the losses: their past, successor and look-ahead lie in the window."""
+        """Returns the frames that count in losses: the window holds past, successor and, unless clamped, look-ahead."""
         ahead = self.min_offset if self.clamped else self.look_ahead[-1]
         frames = range(self.num_past, num_frames - ahead)
         if not frames:

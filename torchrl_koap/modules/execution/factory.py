@@ -32,8 +32,8 @@ def make_policy(
 ) -> PlanningPolicy:
     """Makes a policy from planner and controller; it maps observations to one action per control step.
 
-    All keyword arguments but the first two are facts of a task;
-    :func:`~torchrl_koap.training.policy_facts.policy_facts` returns them.
+    :func:`~torchrl_koap.training.policy_facts.policy_facts` returns the facts of a task as keyword arguments: all but
+    ``execution``, ``follower``, ``observe`` and the keys.
 
     Args:
         planner (StatePlanner or DiffusionPolicy): samples plans, or actions that need no controller.

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl_koap.modules.execution.followers import Follower, blend_plan, command_rest
 
 SMOOTHNESS = 3.0  # weight of changes of the commanded velocity, relative to distances from the plan
-END_SPEED = 5.0  # weight of the speed at the end of the look-ahead: a short look-ahead is unstable without it
+END_SPEED = 5.0  # weight of the error of the last planned step: a short look-ahead is unstable without it
 
 
 class ResponseModel(nn.Module):

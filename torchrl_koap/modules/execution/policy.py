@@ -64,7 +64,7 @@ class PlanningPolicy(TensorDictModuleBase):
 
     Raises:
         ValueError: for a replan interval longer than the horizon, a follower that does not support the execution, a
-            StatePlanner without follower or a DiffusionPolicy with one. At a call for a history of another length.
+            StatePlanner without follower or a DiffusionPolicy with one; at a call for another batch size or history.
         KeyError: at a call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
 
     Examples:

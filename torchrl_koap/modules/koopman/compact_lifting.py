@@ -24,7 +24,7 @@ NEIGHBOURS, LANDMARKS = 12, 200  # initial neighbours of each point, and points 
 COMPONENTS = 64  # largest number of components
 PRETRAINING_UPDATES, PRETRAINING_RATE = 1000, 3e-3  # of the training to Isomap coordinates
 BATCH = 2048  # windows that are lifted at once
-GAIN = 0.7  # twice the coordinates are kept if their reconstruction error is below this share of the other's
+GAIN = 0.7  # twice the coordinates are kept if their root mean square error is below this share of the other's
 
 
 def noise_covariance(windows: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ class CompactLifting(TensorDictModuleBase):
 
     ``P`` are the :class:`NoiseAdjustedComponents` and ``w`` their variances in units of the noise. ``g_1`` has ``m``
     ``coordinates`` and ``g_2`` twice as many; both are trained. :meth:`finish` keeps the smaller one unless the larger
-    one has less than 70 % of its reconstruction error, for example because objects move independently of the robot.
+    one has less than 70 % of its root mean square error, for example because objects move independently of the robot.
     Coordinates of the network that is not kept are 0.
 
     States are ``[*B, T, d]``, lifted ones ``[*B, T, 3 m]``; ``hidden_dims`` are the widths of all networks.

@@ -15,7 +15,7 @@ from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 _DEFAULT: dict[str, Any] = {
-    "normalization": {"state": "standard", "action": "rms"},  # modes of Normalizer.fit, for callers
+    "normalization": {"state": "standard", "action": "rms"},  # modes of Normalizer.fit; callers pass the normalisers
     "network": LatentActionFourier,
     "latent_dim": 32,
     "hidden_dim": 64,
@@ -56,7 +56,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # for actions, or commands, that are target positions: the present frame has more weight than the steps around it
     "absolute": _DEFAULT
     | {
-        # Targets are far from zero compared with their spread. The sizes of principal components carry information.
+        # Targets are far from zero compared with their spread. One scale for all state columns keeps their sizes.
         "normalization": {"state": "shared", "action": "standard"},
         "penalty": 1e-3,
     }

@@ -24,7 +24,7 @@ NUM_TRAIN_STEPS = 50
 
 
 class NoiseLevel(NamedTuple):
-    """One step of a solver: time in training steps, and the amplitudes of signal and noise."""
+    """One noise level of a solver: time in training steps, and the amplitudes of signal and noise."""
 
     time: float
     signal: float

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner's default denoiser: a small one-dimensional U-Net over the steps of a plan."""
+"""A small one-dimensional U-Net over the steps of a plan; the default if a task with an environment names no other."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class TemporalUnet(Denoiser):
         channels = tuple(channels)
         if not channels or any(width < 1 or width % GROUPS for width in channels):
             raise ValueError(f"channels must be multiples of {GROUPS}, got {channels}")
-        # plans are padded to a multiple of these steps: the gradient of group norm is slow on fewer than 8
+        # plans are padded to a multiple of this many steps: the gradient of group norm is slow on fewer than 8
         self.multiple = max(8, 2 ** (len(channels) - 1))
 
         def block(width_in: int, width_out: int) -> nn.ModuleList:
