@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 
 import_mujoco()
 
-# imported when first asked for: a network or a task costs no simulator, a version no torch
+# imported on first access: networks and tasks load no simulator, the version loads no torch
 _OFFERS = {
     "data": ("make_demonstrations", "save_demonstrations"),
     "evaluation": ("EvalConfig", "evaluate", "load_policy"),

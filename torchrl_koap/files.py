@@ -203,7 +203,7 @@ def one_at_a_time(path: str | Path, *, busy: str) -> Iterator[None]:
 
 
 def _exchange(new: Path, path: Path) -> None:
-    """Renames ``new`` to ``path``. A full folder cannot be the target, so it is renamed first."""
+    """Renames ``new`` to ``path``. A folder that is not empty cannot be the target, so it is renamed first."""
     try:
         os.replace(new, path)
         return

@@ -87,7 +87,7 @@ def read_entry(module: nn.Module, tensordict: TensorDictBase, key: NestedKey, re
 
 
 def check_type(module: nn.Module, value: Tensor, key: NestedKey) -> None:
-    """Refuses an entry of another floating type than the weights of a module."""
+    """Raises a ValueError if the floating dtype of an entry differs from that of a module's weights."""
     weight = next(module.parameters(), None)
     if weight is not None and value.is_floating_point() and value.dtype != weight.dtype:
         name = type(module).__name__

@@ -133,7 +133,7 @@ class RunConfig:
         device: "cpu" or "cuda".
         precision: of the matrix products in the planner's training: "float32", "bfloat16" (several times faster if the
             processor has units for it, else many times slower), or "auto": bfloat16 if it has.
-        logger: "csv" (metrics.csv alone), or also "wandb" (offline unless WANDB_MODE says otherwise) or "tensorboard".
+        logger: "csv" (metrics.csv alone), or also "wandb" (offline unless WANDB_MODE is set) or "tensorboard".
         resume: resume an interrupted run; options that are not given keep their first values.
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by every
             command that reads the run, which records absolute paths of files.

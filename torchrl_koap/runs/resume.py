@@ -36,7 +36,7 @@ def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
 
 
 def check_resume(run: RunDirectory, config: TrainConfig) -> None:
-    """Raises a RunDirectoryError if the folder holds a run with other options, or a run without ``resume``."""
+    """Raises a RunDirectoryError if the folder holds a run and ``resume`` is not set, or its options differ."""
     if not (run.path / "config.json").exists():
         run.refuse_data()
         names = ("planner.safetensors", "controller.safetensors", "checkpoints")

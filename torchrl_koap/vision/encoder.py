@@ -205,7 +205,7 @@ class Projection(nn.Module):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the frames that it was fitted to; a ValueError if its description lacks a valid size."""
+        """Height and width of the frames that it was fitted to; a ValueError if its description has a bad size."""
         try:
             height, width = (int(side) for side in self.about["size"].split("x"))
         except ValueError as error:
