@@ -28,7 +28,7 @@ ROLES = {
     "zone": {"facecolor": "#fff3e0", "edgecolor": "#d9730d", "linewidth": 0.8, "zorder": 0.5},
     "target": {"facecolor": "#ffe0b8", "edgecolor": "none", "zorder": 0.6},
 }
-MANY = 20  # contexts; of more only centres are drawn
+MANY = 20  # contexts; with more, bodies with an orientation are drawn as centre and line
 _NAMED = {"red": RED, "green": GREEN, "blue": BLUE, "grey": MUTED}
 _LABEL_COLORS = {"finish": GREEN, "zone": "#9a5b13"}
 _MOST_ROOM = 0.5  # share of the scene's size that is added at most on a side where paths leave it

@@ -47,7 +47,7 @@ if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # tr
 
 @dataclass(frozen=True)
 class Job:
-    """A folder that describes a task; printed output is appended to its ``log.txt``."""
+    """A folder that describes the work to do; printed output is appended to its ``log.txt``."""
 
     folder: Path
     needs: Path | None = None  # folder of the job that must succeed first
@@ -86,8 +86,8 @@ def launch(
 ) -> Generator[tuple[Job, str | None], None, None]:
     """Calls a function with every job's folder, in a process each; yields jobs as they end, with reasons of failures.
 
-    The function must be a module's, as processes import it. Jobs start in the given order. A job that needs a failed
-    one is not run and fails too. Closing the iterator stops running jobs.
+    Processes import the function, so it must be at the top level of a module. Jobs start in the given order. A job that
+    needs a failed one is not run and fails too. Closing the iterator stops running jobs.
     """
     # on a cluster, this process may be restricted to some cores of its machine
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

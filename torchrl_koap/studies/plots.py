@@ -36,7 +36,7 @@ MEASURES = {  # label of the vertical axis, title, factor
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 _DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
-_HOLLOW = "\nhollow, dashed: the paper, whose demonstrations are others"  # in titles
+_HOLLOW = "\nhollow, dashed: the paper, with its own demonstrations"  # in titles
 _BANDS = 3  # more lines have whiskers, as more bands hide each other
 _ASIDE = 0.025  # inches between the whiskers of two methods
 

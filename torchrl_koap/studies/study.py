@@ -106,7 +106,7 @@ class Study:
         record: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS.
         labels: shares of the units that keep their labels; 1 is all of them, not one as for `koap train`.
-        levels: label levels of the paper for every task (1: fewest labels) instead of shares.
+        levels: label levels of the paper for every task (1: fewest labels), instead of or with labels.
         first_seed_only: levels that are trained with seed 0 only (default: those of the preset).
         label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
         demonstrations: shares of the demonstrations that planner and controller use at all (default: 1).
