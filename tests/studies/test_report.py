@@ -67,7 +67,7 @@ def test_page_says_what_was_run_and_what_was_not(folder):
         "avoiding, ridge, 1 % labels, seed 1: missing",
         "1 of 2",
         "One planner is shared by all cells that plan",
-        "resamples contexts and training seeds",
+        "resamples both contexts and training seeds",
     ):
         assert wanted in text
 
@@ -78,9 +78,9 @@ def test_contexts_do_not_recur_in_an_environment_of_gymnasium(tmp_path):
         Page(write_study_report(tmp_path, rows, outcomes, title="t", options={"evaluation": options})).text
         for options in ({"episodes": 20}, {"env": "mine:Reach-v0"})
     )
-    words = ("rolled out on fixed evaluation contexts", "contexts recur", "met the same contexts")
+    words = ("rolled out on fixed evaluation contexts", "contexts recur", "on the same contexts")
     assert all(word in own and word not in other for word in words)
-    assert "rolled out in mine:Reach-v0. " in other and "an episode stands in place of a context below. The" in other
+    assert "rolled out in mine:Reach-v0. " in other and "every episode is a context below. The" in other
 
 
 def test_the_paper_stands_beside_labelled_windows(tmp_path):
