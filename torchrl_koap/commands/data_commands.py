@@ -53,8 +53,8 @@ class Demos(Command):
         seed: seed of the experts' variation.
         threads: simulator threads.
         disturbance: share of the demonstrations in which the expert is disturbed at times (pushes, slips, late turns, a
-            drifting height); those from which it recovers are kept, and OUT/ted/about.json counts them (default: that
-            of the task).
+            drifting height); those from which it recovers are kept, and OUT/ted/about.json lists the disturbances
+            (default: that of the task).
         embodiment: for tasks recorded by a camera: "robot" (with actions) or "hand" (frames only); OUT is then a
             LeRobot data set with pictures, for `koap embed`.
         plugins: modules that register tasks; imported before anything else.
