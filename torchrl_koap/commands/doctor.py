@@ -66,7 +66,7 @@ def machine_facts() -> dict[str, str]:
 
 
 def check_run(folder: Path) -> dict[str, str]:
-    """Reads every file of a run that commands read, checksums included; returns files, or raises with all problems."""
+    """Checks all files of a run that commands read, with checksums; returns them, or raises a RunDirectoryError."""
     run, problems = RunDirectory(folder), dict[str, None]()  # an ordered set of messages
 
     def look(read: Callable, *what: Any) -> None:

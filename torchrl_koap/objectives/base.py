@@ -21,7 +21,7 @@ class NetworkLoss(LossModule):
 
     A subclass has the dataclass ``_AcceptedKeys`` and lists its mandatory entries in :attr:`required`. With
     ``create_target_params``, ``target_network_params`` holds an averaged copy of the weights. Raises a ValueError if
-    the reduction is not ``"mean"``, ``"sum"`` or ``"none"``, and a TypeError if the network has no type of ``trains``.
+    the reduction is not ``"mean"``, ``"sum"`` or ``"none"``, a TypeError if the network is of no type in ``trains``.
     """
 
     trains: tuple[type[nn.Module], ...] = (nn.Module,)

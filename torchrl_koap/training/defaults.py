@@ -29,7 +29,7 @@ FOLLOWED = "delayed"  # default preset if they are targets of state columns, whi
 # planner options for recorded data, usually a hundred demonstrations or so: they avoid overfitting
 OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.4  # of plans in tasks without an environment, where no modes are counted
-PLAN_SECONDS = 0.1  # between plans with feedback, within step limits: a new plan starts where the robot lags behind
+PLAN_SECONDS = 0.1  # between plans with feedback, within limits: a new plan starts where the robot lags behind the last
 
 
 def resolve(config: TrainConfig, task: Task) -> TrainConfig:

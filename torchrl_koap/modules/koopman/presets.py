@@ -56,7 +56,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # for actions, or commands, that are target positions: the present frame has more weight than the steps around it
     "absolute": _DEFAULT
     | {
-        # Targets are far from zero compared with their spread. One scale for all state columns keeps their sizes.
+        # Targets are far from zero compared with their spread. One state scale keeps the sizes of principal components.
         "normalization": {"state": "shared", "action": "standard"},
         "penalty": 1e-3,
     }
