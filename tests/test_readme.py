@@ -88,7 +88,7 @@ def test_python_runs(code, demonstrations, tmp_path, monkeypatch):
 
     monkeypatch.setattr(torchrl_koap, "train", train_shortly, raising=False)
     monkeypatch.setattr(torchrl_koap, "evaluate", evaluate_shortly, raising=False)
-    few = {"planner": {"steps": 1, "batch_size": 2, "width": 8}, "controller": {"steps": 0}}
+    few = {"planner": {"steps": 1, "batch_size": 2, "width": 8}, "controller": {"steps": 1}}
     fit = torchrl_koap.fit
     monkeypatch.setattr(torchrl_koap, "fit", lambda *data, **asked: fit(*data, **(asked | few)), raising=False)
     monkeypatch.setattr(pictures, "_PICTURES", dict(pictures.all_pictures()))
