@@ -109,6 +109,22 @@ def test_cameras_of_robomimic(tmp_path, behind):
     np.testing.assert_array_equal(read(recordings, "agentview_image"), frames[: 6 + behind])
 
 
+@pytest.mark.parametrize("entry", ["observations/images/top", "data/demo_0/obs/top"])
+def test_frames_that_an_hdf5_file_no_longer_holds_are_missing(tmp_path, entry):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file[entry] = film(4)
+    clip = Clip(str(tmp_path / "a.hdf5"), tuple(range(5)), entry)
+    with pytest.raises(ValueError, match=r"frame 4 is missing: .*a.hdf5 has 4"):
+        list(clip.read())
+    np.testing.assert_array_equal(list(clip.take(range(4)).read()), film(4))
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["data/demo_0/next_obs/top"] = film(5)[1:]
+    missing = "frame 5 is missing: .*a.hdf5 has 5" if "/obs/" in entry else "frame 4 is missing: .*a.hdf5 has 4"
+    with pytest.raises(ValueError, match=missing):
+        list(Clip(clip.file, tuple(range(6)), entry).read())
+
+
 @pytest.mark.parametrize("embodiment", ["robot", "hand"])
 def test_pictures_of_lerobot(tmp_path, embodiment):
     recordings = read_recordings(write_camera_set(tmp_path / "set", embodiment), action_dim=7)

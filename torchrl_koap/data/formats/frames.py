@@ -139,9 +139,13 @@ def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
     import h5py
 
     with h5py.File(clip.file, "r") as stream:
-        frames, next_entry = stream[clip.entry], clip.entry.replace("/obs/", "/next_obs/")
+        frames = stream[clip.entry]
+        following = stream.get(clip.entry.replace("/obs/", "/next_obs/")) if "/obs/" in clip.entry else None
+        held = len(frames) + (following is not None)
         for number in clip.numbers:  # number T: the last frame of next_obs
-            frame = frames[number] if number < len(frames) else stream[next_entry][-1]
+            if number >= held:
+                raise ValueError(f"frame {number} is missing: {clip.file} has {held}")
+            frame = frames[number] if number < len(frames) else following[-1]
             yield frame if frames.ndim == 4 else _decode(np.asarray(frame).tobytes(), number)
 
 
