@@ -68,6 +68,18 @@ def test_frames_on_a_clock_of_their_own_are_matched(tmp_path):
         read_recordings(tmp_path)
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_camera_with_fewer_than_two_times_is_refused_unless_its_recording_is_as_short(tmp_path, count):
+    write_tables(tmp_path, lengths=(6, 1), clock=True)
+    np.save(tmp_path / "run_1" / "wrist_times.npy", [0.004])
+    recordings = read_recordings(tmp_path)
+    assert len(recordings.states) == 1 and recordings.skipped[0] == "run_1.npz (fewer than two frames)"
+    np.save(tmp_path / "run_0" / "wrist.npy", film(count))
+    np.save(tmp_path / "run_0" / "wrist_times.npy", np.zeros(count))
+    with pytest.raises(DataError, match=f"camera 'wrist': wanted two or more frames for 6 rows, got {count}"):
+        read_recordings(tmp_path)
+
+
 def test_what_is_cut_is_cut_from_the_cameras_too(tmp_path):
     states = np.r_[np.zeros(5), np.arange(20.0), np.full(5, 19.0)][:, None]
     (tmp_path / "a").mkdir()

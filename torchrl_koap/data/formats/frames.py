@@ -243,6 +243,10 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
 
 def _nearest(stamps: np.ndarray, clock: np.ndarray, camera: str) -> np.ndarray:
     """Returns the frame nearest in time to every row."""
+    if len(stamps) < 2:  # no step, in which a frame could be late
+        if len(clock) == len(stamps):  # too short a recording, left out later
+            return np.arange(len(stamps))
+        raise ValueError(f"camera {camera!r}: wanted two or more frames for {len(clock)} rows, got {len(stamps)}")
     after = np.searchsorted(stamps, clock).clip(1, len(stamps) - 1)
     nearest = np.where(clock - stamps[after - 1] <= stamps[after] - clock, after - 1, after)
     off, most = np.abs(stamps[nearest] - clock), LATE * float(np.median(np.diff(stamps)))
