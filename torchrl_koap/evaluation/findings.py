@@ -91,11 +91,11 @@ def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
     if not koopman < float("inf"):
         return ["the latent dynamics diverge: their prediction is not finite"]
     if koopman > still:
-        faults.append(f"the latent dynamics predict {_times(koopman, still)} worse than standing still")
+        faults.append(f"the latent dynamics predict {_worse(koopman, still, 'standing still')}")
     if koopman > _WORSE * linear:
-        faults.append(f"the latent dynamics predict {_times(koopman, linear)} worse than a linear model on raw states")
+        faults.append(f"the latent dynamics predict {_worse(koopman, linear, 'a linear model on raw states')}")
     if faults and back > _WORSE * linear:
-        faults.append(f"mapping lifted states back alone errs {_times(back, linear)} as much as that linear model")
+        faults.append(f"mapping lifted states back alone is {_worse(back, linear, 'that linear model')}")
     return faults
 
 
@@ -205,5 +205,5 @@ def _against(own: float, other: float, unit: str) -> str:
     return f"{own * factor:.4g} against {other * factor:.4g} {shown}".rstrip()
 
 
-def _times(large: float, small: float) -> str:
-    return f"{large / small:.3g} times" if small > 0 else "infinitely"
+def _worse(own: float, other: float, model: str) -> str:
+    return f"{own / other:.3g} times worse than {model}" if other > 0 else f"worse than {model}, which makes no error"
