@@ -93,6 +93,12 @@ def test_a_column_that_never_moves_is_left_alone():
     assert torch.equal(reader.scales, torch.ones(10, 1))
 
 
+def test_a_given_spread_is_not_changed():
+    reader, spread = WindowReader(1, num_past=1, look_ahead=(2,)), torch.tensor([[2.0], [3.0], [0.0]])
+    reader.set_spread(spread)
+    assert reader.scales.tolist() == [[2.0], [1.0], [1.0]] and spread.tolist() == [[2.0], [3.0], [0.0]]
+
+
 def test_wrong_windows_and_offsets_are_named():
     reader = WindowReader(2, num_past=4, look_ahead=(1, 5), min_offset=1)
     with pytest.raises(ValueError, match="2 columns"):

@@ -159,5 +159,5 @@ class WindowReader(nn.Module):
 
     def set_spread(self, spread: Tensor) -> None:
         """Sets the spread ``[F, d]`` that steps are divided by; 1 for steps without spread."""
-        spread[self.num_past] = 1.0  # the present frame stays in the normaliser's units
         self.scales.copy_(torch.where(spread > 1e-9, spread, 1.0))
+        self.scales[self.num_past] = 1.0  # the present frame stays in the normaliser's units
