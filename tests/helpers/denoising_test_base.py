@@ -4,7 +4,7 @@
 import pytest
 import torch
 from loss_test_base import LossTestBase
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import HardUpdate, SoftUpdate
 
 
 def noised(network, clean, noise, time):
@@ -39,10 +39,11 @@ class DenoisingLossTestBase(LossTestBase):
         network = loss.network
         history, noise = torch.randn(3, network.history, network.state_dim), torch.randn(3, *network.noise_shape)
         trained = network.sample(history, noise)
-        with loss.target_network_params.to_module(network):
+        with loss.target_network_params.to_module(network, preserve_module_state=False):
             averaged = network.sample(history, noise)
         assert not torch.allclose(trained, averaged)
         torch.testing.assert_close(network.sample(history, noise), trained)
+        HardUpdate(loss, value_network_update_interval=1).step()  # raises if the average requires gradients
         assert any("target" in name for name in loss.state_dict())
         assert not any("target" in name for name in self.make_loss(create_target_params=False).state_dict())
 

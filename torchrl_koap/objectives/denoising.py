@@ -104,6 +104,9 @@ class DenoisingLoss(NetworkLoss):
 class PlannerLoss(DenoisingLoss):
     """Trains a planner on windows of states; Args as for :class:`DenoisingLoss`.
 
+    Plan with the averaged weights as below. Without ``preserve_module_state=False`` they require gradients afterwards,
+    and an updater made then raises an error.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -115,8 +118,9 @@ class PlannerLoss(DenoisingLoss):
         >>> average = SoftUpdate(loss, eps=0.99)
         >>> loss(TensorDict({"state": torch.randn(8, 16, 2)}, [8]))["loss_planner"].backward()
         >>> average.step()
-        >>> with loss.target_network_params.to_module(planner):
+        >>> with loss.target_network_params.to_module(planner, preserve_module_state=False):
         ...     plan = planner(TensorDict({"history": torch.randn(3, 2, 2)}, [3]))["plan"]
+        >>> SoftUpdate(loss, eps=0.99).step()  # an updater made later
     """
 
     @dataclass
