@@ -116,8 +116,11 @@ def test_wrong_options():
         make_window_buffer(data, 16, 4, select=["observation", "states"])
     with pytest.raises(KeyError, match="windows need the entry 'episode'"):
         make_window_buffer(data.exclude("episode"), 16, 4)
-    with pytest.raises(ValueError, match="flat data"):
-        make_window_buffer(demonstrations((20, 20)).reshape(2, 20), 16, 4)
+    for cut in (cut_windows, lambda data, window: make_window_buffer(data, window, 4)):
+        with pytest.raises(ValueError, match=r"flat data .* got batch size \[2, 20\] and 'episode' \[2, 20\]"):
+            cut(demonstrations((20, 20)).reshape(2, 20), 16)
+        with pytest.raises(ValueError, match=r"got batch size \[\d+\] and 'episode' \[\d+, 1\]"):
+            cut(data.copy().set("episode", data["episode"].unsqueeze(-1)), 16)
     with pytest.raises(ValueError, match="of a batch of 4 rounds to 0 windows"):
         make_window_buffer(data, 16, 4, labelled_share=0.1)
 

@@ -78,7 +78,9 @@ class WindowTable:
         labels of the frames ``counted`` count; by default all but the first and the last frame.
 
         Raises:
-            ValueError: if an argument is out of range, or a trajectory is too short.
+            KeyError: if there is no ``episode``.
+            ValueError: if the data or ``episode`` are not flat, an argument is out of range, or a trajectory is too
+                short.
         """
         counted = range(1, window - 1) if counted is None else counted
         if window < 2 or not 0 <= counted.start <= counted.stop < window:
@@ -89,6 +91,9 @@ class WindowTable:
         episode = data.get(keys.EPISODE, None)
         if episode is None:
             raise KeyError(f"windows need the entry {keys.EPISODE!r}; the data have {sorted(map(str, data.keys()))}")
+        if data.batch_dims != 1 or episode.ndim != 1:
+            got = f"batch size {list(data.batch_size)} and {keys.EPISODE!r} {list(episode.shape)}"
+            raise ValueError(f"windows are cut from flat data [N] with {keys.EPISODE!r} [N], got {got}")
         device, steps = episode.device, len(episode)
         new = begins(data)
         count = data.get(keys.STEP_COUNT, None)
@@ -251,7 +256,7 @@ def cut_windows(
         TensorDictBase: ``[M, window]`` in the order of the data, with ``padded`` ``[M, window, 1]``.
 
     Raises:
-        ValueError: if a trajectory is too short for a window.
+        KeyError, ValueError: as :meth:`WindowTable.build`.
 
     Examples:
         >>> import torch
@@ -311,8 +316,6 @@ def make_window_buffer(
     """
     if isinstance(data, ReplayBuffer):
         data = data.storage.get(slice(None))
-    if data.batch_dims != 1:
-        raise ValueError(f"windows are cut from flat data [N], got batch size {list(data.batch_size)}")
     table = WindowTable.build(data, window, counted=counted, pad_before=pad_before, pad_after=pad_after)
     if select is not None:
         absent = [key for key in select if data.get(key, None) is None]
