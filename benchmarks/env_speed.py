@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Control steps per second of the environments, per core and over threads, against the original simulator.
+"""Measures control steps per second of the environments by threads, relative to the original simulator.
 
     python benchmarks/env_speed.py --task avoiding --num-envs 60 --steps 40 --threads 1 2
     python benchmarks/env_speed.py --task aligning --num-envs 30 --steps 150 --recordings d3il_reference
 
 The original (one environment, one core, Python controller) makes 19 to 80 control steps per second, depending on the
-task; ratios are against that. With ``--recordings`` every environment plays the first recorded episode of the task,
-pushes and grasps included; otherwise it moves on at human speed.
+task; ratios are relative to that. With ``--recordings`` every environment plays the first recorded episode of the task,
+pushes and grasps included. Otherwise the robot moves in a fixed direction at human speed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ANCHORS = {"avoiding": 26.0, "aligning": 27.5, "sorting": 19.0, "stacking": 80.5
 
 
 def straight_on(env: ManipulationEnv):
-    """A policy that moves at human speed through the scene, so that controller and contacts have work to do."""
+    """Returns a policy that moves through the scene at human speed, so that controller and contacts are exercised."""
     generator = torch.Generator().manual_seed(0)
     spec = env.action_spec
     aim = torch.rand(spec.shape, generator=generator) * (spec.high - spec.low) / 2 + spec.low / 2
@@ -46,7 +46,7 @@ def straight_on(env: ManipulationEnv):
 
 
 def recorded(env: ManipulationEnv, file: Path):
-    """A policy that plays the first recorded episode, and its context."""
+    """Returns a policy that plays the first recorded episode, and the episode's context."""
     data = np.load(file)
     commands, context = torch.from_numpy(data["ep0_action"]), None
     if env.task.objects:
@@ -65,7 +65,7 @@ def recorded(env: ManipulationEnv, file: Path):
 
 
 def rollout_speed(env: ManipulationEnv, steps: int, repeats: int, file: Path | None) -> list[float]:
-    """Control steps per second of ``env.rollout`` (TorchRL included), once per repeat."""
+    """Returns the control steps per second of ``env.rollout`` (TorchRL included), one value per repeat."""
     env.rollout(2, straight_on(env), break_when_any_done=False)
     speeds = []
     for _ in range(repeats):
@@ -78,7 +78,7 @@ def rollout_speed(env: ManipulationEnv, steps: int, repeats: int, file: Path | N
 
 
 def shares(env: ManipulationEnv, steps: int) -> dict[str, float]:
-    """Microseconds per substep spent in the physics alone and in physics with controller (one thread)."""
+    """Returns microseconds per substep of the physics alone and of physics with controller (one thread)."""
     env.reset()
     if env.task.tool_kinematics is not None:
         return {}
@@ -98,12 +98,12 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="avoiding", choices=sorted(ANCHORS))
-    parser.add_argument("--recordings", type=Path, help="folder of d3il_reference")
+    parser.add_argument("--recordings", type=Path, help="folder d3il_reference")
     parser.add_argument("--num-envs", type=int, default=60)
     parser.add_argument("--steps", type=int, default=40, help="control steps per measurement")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--sleep", action="store_true", help="let MuJoCo put bodies at rest to sleep (not as recorded)")
+    parser.add_argument("--sleep", action="store_true", help="enable MuJoCo's sleeping of bodies (not as recorded)")
     options = parser.parse_args()
     torch.set_num_threads(1)
 

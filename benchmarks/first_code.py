@@ -1,11 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The networks of KOAP's first public code as methods of their own, in one file (docs/variants.md).
+"""Registers the networks of KOAP's first public code as two methods (docs/variants.md).
 
     PYTHONPATH=benchmarks koap train --plugin first_code --method first_code --dataset DIR --out runs/first_code
 
 ``first_code`` is KOAP with a recurrent lifting, a feed-forward ``f`` on raw frames with dropout and a diagonal
-operator, its decoder trained by gradients; ``first_code_dd`` is the supervised LSTM. What else differs there (learning
-rates, epochs of each method's own windows, selection on validation labels) is not taken over.
+operator, its decoder trained by gradients; ``first_code_dd`` is the supervised LSTM. Other properties of that code are
+not reproduced: learning rates, epochs over each method's own windows, selection on validation labels.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LATENT_DIM, HIDDEN_DIM, DROPOUT = 512, 256, 0.1
 
 
 class SequenceLSTM(nn.Module):
-    """Runs one LSTM layer over the time axis from a zero state, then a linear map: ``[*B, T, in] -> [*B, T, out]``.
+    """Applies one LSTM layer over time from a zero state, then a linear map: ``[*B, T, in] -> [*B, T, out]``.
 
     Args:
         in_features (int): columns of the sequence.
@@ -43,7 +43,7 @@ class SequenceLSTM(nn.Module):
         self.readout = nn.Linear(hidden_dim, out_features)
 
     def forward(self, sequence: Tensor) -> Tensor:
-        """Runs the layer over ``[*B, T, in]``."""
+        """Applies the layers to ``[*B, T, in]``."""
         flat = sequence.reshape(-1, *sequence.shape[-2:])
         zeros = flat.new_zeros(1, flat.shape[0], self.lstm.hidden_size)
         out, _ = self.lstm(flat, (zeros, zeros))
@@ -51,7 +51,7 @@ class SequenceLSTM(nn.Module):
 
 
 class RecurrentLifting(KoopmanLifting):
-    """Lifts by an LSTM over the window, so that ``z_t`` depends on ``x_0..x_t``, and maps back by another.
+    """Lifts by an LSTM over the window, so that ``z_t`` depends on ``x_0..x_t``; another LSTM maps back.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -75,7 +75,7 @@ class DiagonalOperator(KoopmanOperator):
         self.weight = nn.Parameter(torch.randn(latent_dim))
 
     def reset_parameters(self) -> None:
-        """Draws the numbers anew."""
+        """Redraws the numbers."""
         nn.init.normal_(self.weight)
 
     def eigenvalues(self) -> Tensor:
@@ -108,7 +108,7 @@ class FeedForwardAction(LatentActionModule):
 
 
 class RecurrentInverseDynamics(InverseDynamics):
-    """Reads ``a_t`` off ``x_0, ..., x_{t+1}`` by an LSTM; the last frame repeats the action of the one before.
+    """Predicts ``a_t`` from ``x_0, ..., x_{t+1}`` by an LSTM; the last frame repeats the action of the previous one.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -134,7 +134,7 @@ class RecurrentInverseDynamics(InverseDynamics):
 
 
 def build(task, columns, normalizers, preset):
-    """Builds KOAP as the first public code has it."""
+    """Builds KOAP as in the first public code."""
     return KoopmanInverseDynamics(
         FeedForwardAction(len(columns), LATENT_DIM),
         LinearActionDecoder(LATENT_DIM, task.action_dim),
@@ -149,7 +149,7 @@ def build_supervised(task, columns, normalizers, preset):
     return RecurrentInverseDynamics(len(columns), task.action_dim, **normalizers)
 
 
-# presets: how states and actions are normalised there, by their range as in the paper
+# preset "paper": the first code normalises states and actions by their range, as the paper does
 register_method(
     Method("first_code", "KOAP, first public code", build, (Phase("controller", KOAPLoss),), presets=("paper",))
 )

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Proving grounds in the README and on their page: pooled scores, the table and the picture."""
+"""Pools scores of the proving grounds; makes their table and picture for the README and the page of results."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ COMPARED = {
     "vpt": ("VPT", "#b39ddb"),
     "dp": ("Diffusion Policy", MUTED),
 }
-ONE_SEED = "\N{DAGGER}"  # behind a score of fewer training seeds than its row says
-STEP = 0.9 / len(COMPARED)  # between two bars
+ONE_SEED = "\N{DAGGER}"  # marks a score with fewer training seeds than its row states
+STEP = 0.9 / len(COMPARED)  # distance of neighbouring bars
 
 
 @dataclass(frozen=True)
 class Score:
-    """A method on a ground, all training seeds together: counts, and means of what the rows have.
+    """Score of a method on a ground, pooled over all training seeds.
 
     Args:
         seeds (int): training seeds.
-        n (int): rollouts or recordings of all of them.
-        successes (int): rollouts that succeed.
+        n (int): rollouts or recordings over all seeds.
+        successes (int): successful rollouts.
         reward (float, optional): mean largest reward.
-        error (float): its standard error.
-        plan, action (float, optional): error of plans as a share of standing still's, of actions as one of a ridge's.
+        error (float): standard error of that mean.
+        plan, action (float, optional): plan error relative to standing still, action error relative to a ridge.
     """
 
     seeds: int
@@ -60,14 +60,14 @@ class Score:
 
     @property
     def interval(self) -> tuple[float, float, float]:
-        """Mean largest reward, or share of successes where there is none, with its 95 % interval."""
+        """Returns the mean largest reward, or else the success rate, with its 95 % interval."""
         if self.reward is not None:
             return self.reward, self.reward - 1.96 * self.error, self.reward + 1.96 * self.error
         return self.successes / self.n, *wilson_interval(self.successes, self.n)
 
     @property
     def text(self) -> str:
-        """The score in words."""
+        """Formats the score."""
         if self.reward is not None:
             return f"{self.reward:.2f}"
         if self.plan is not None or self.action is not None:
@@ -76,7 +76,7 @@ class Score:
 
 
 def ground_score(ground: str, method: str) -> Score | None:
-    """Pools the rows of a method on a ground, with :func:`usual_labels` and its own execution; None if there are none.
+    """Pools the rows of a method on a ground with :func:`usual_labels` and default execution; None without rows.
 
     Args:
         ground (str): its name.
@@ -103,13 +103,13 @@ def ground_score(ground: str, method: str) -> Score | None:
 
 
 def usual_labels(ground: str) -> int:
-    """Finds the number of labelled demonstrations that most trainings on a ground had."""
+    """Returns the number of labelled demonstrations in most trainings on a ground."""
     counts = Counter(int(row["labels"]) for row in read_rows("proving_grounds", ground=ground))
     return counts.most_common(1)[0][0]
 
 
 def ground_text(ground: str, method: str) -> str:
-    """Formats the score of a method on a ground, or says that it was not run."""
+    """Formats the score of a method on a ground; "not run" if it has none."""
     score = ground_score(ground, method)
     return "not run" if score is None else score.text
 
@@ -130,7 +130,7 @@ def grounds_table() -> str:
 
 
 def _beside(score: Score | None, seeds: int) -> str:
-    """A cell of a row whose first method had so many training seeds."""
+    """Formats a cell and marks a score with fewer than ``seeds`` training seeds."""
     if score is None:
         return "not run"
     return score.text + ONE_SEED * (score.seeds < seeds)
@@ -177,6 +177,6 @@ def draw_grounds(path: Path) -> Path:
 def _bar(axes, place: float, mean: float, low: float, high: float, color: str, name: str) -> None:
     axes.bar(place, mean, width=0.9 * STEP, color=color, label=name)
     axes.plot([place, place], [low, high], color=INK, linewidth=1)
-    top = min(high, 0.9 * axes.get_ylim()[1])  # a bar that is cut off keeps its number
+    top = min(high, 0.9 * axes.get_ylim()[1])  # the number of a bar that exceeds the axis is drawn inside the bar
     ink = INK if top == high else "white"
     axes.annotate(f"{mean:.2f}", (place, top), ha="center", va="bottom", fontsize=6, color=ink, rotation=90)

@@ -1,13 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Whether suggested demonstrations are worth more labels than random ones.
+"""Compares action errors after labelling suggested demonstrations with those after labelling random ones.
 
     python benchmarks/label_suggestions.py --dataset DIR
 
-The Koopman model is trained once, without a label. For every seed one random trajectory is labelled first; each
-criterion then chooses the next ones, and the decoder is fitted in closed form to what is labelled. Action errors are
-measured on the trajectories that no criterion chose, the same for all of them. "longest" looks at lengths alone: what
-more labels per demonstration are worth. The interval is that of the mean paired difference to random choices over the
-seeds (Student's t).
+The Koopman model is trained once, without labels. For every seed, one random trajectory is labelled first. Each
+criterion then chooses further ones, and the decoder is fitted to the labels in closed form. Action errors are measured
+on the trajectories that no criterion chose. "longest" ranks by length alone and so isolates the effect of more labels
+per demonstration. The interval is that of the mean paired difference to random choices over the seeds (Student's t).
 """
 
 from __future__ import annotations
@@ -40,16 +39,16 @@ CHOICES = ("a_optimal", "uncertainty", "random", "longest")
 
 
 def within(data: TensorDictBase, episodes: list[int]) -> TensorDictBase:
-    """The data with the labels of some trajectories alone; all other actions are NaN."""
+    """Returns the data with labels for the given trajectories only; all other actions are NaN."""
     has_action = torch.isin(data["episode"], torch.tensor(episodes))[:, None]
     hidden = torch.where(has_action, data["action"], torch.nan)
     return data.clone().update({"has_action": has_action, "action": hidden})
 
 
 def train_unlabelled(data: TensorDictBase, task: Task, preset: str, updates: int) -> KoopmanInverseDynamics:
-    """The Koopman model of `koap train`, from states alone."""
+    """Trains the Koopman model of `koap train` on states alone."""
     torch.manual_seed(0)
-    # the action normaliser is replaced before every fit; nothing else of the first trajectory's labels is used
+    # the labels of trajectory 0 set only the action normaliser, which is replaced before every fit
     controller = build_controller(task, get_method("koap"), ControllerConfig(preset, 0, "robot"), within(data, [0]))
     window = max(WINDOW, controller.num_window_frames)
     history = controller.num_past
@@ -64,7 +63,7 @@ def train_unlabelled(data: TensorDictBase, task: Task, preset: str, updates: int
 def error_of(
     controller: KoopmanInverseDynamics, task: Task, mode: str, labelled: TensorDictBase, test: TensorDictBase
 ) -> float:
-    """Action error on the steps ``test`` (:func:`infer_steps`) of a decoder fitted to labelled data."""
+    """Returns the action error on steps ``test`` (:func:`infer_steps`) of a decoder fitted to labelled data."""
     normalizer = Normalizer.fit(labelled["action"], mode=mode, mask=labelled["has_action"])
     controller.action_normalizer.load_state_dict(normalizer.state_dict())
     fit_closed_form(controller, labelled, **action_facts(task, task.controller_columns("robot")))
@@ -74,12 +73,12 @@ def error_of(
 
 
 def uncertainty(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
-    """Mean leverage of the steps of a demonstration: where the decoder is least certain."""
+    """Returns the mean leverage of a demonstration's steps, which grows with the decoder's uncertainty."""
     return ((latent @ covariance) * latent).sum(-1).mean().item()
 
 
 def chosen_by(criterion: str, steps: TensorDictBase, first: int, count: int, seed: int) -> list[int]:
-    """The first trajectory and those that a criterion adds."""
+    """Returns the first trajectory and those that a criterion adds."""
     labelled = steps["episode"] == first
     if criterion == "random":
         names = steps["episode"][~labelled].unique()
@@ -100,7 +99,7 @@ def chosen_by(criterion: str, steps: TensorDictBase, first: int, count: int, see
 
 
 def row(criterion: str, budget: int, labels: list[int], errors: list[float], random: list[float]) -> str:
-    """One line of the table."""
+    """Formats one line of the table."""
     mean, spread = statistics.fmean(errors), f"({min(errors):.3f}-{max(errors):.3f})"
     text = f"{budget:>6}  {criterion:<9} {statistics.fmean(labels):>6.0f}  {mean:6.3f} {spread}"
     if criterion == "random" or budget == 1:
@@ -112,7 +111,7 @@ def row(criterion: str, budget: int, labels: list[int], errors: list[float], ran
 
 
 def main() -> None:
-    """Trains once, chooses and fits for every seed, prints the table."""
+    """Trains once, chooses labels and fits for every seed, and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dataset", default="scripted", help="folder of `koap demos`, or 'scripted': record 96")
     parser.add_argument("--task", default="avoiding")

@@ -1,13 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Time of a whole policy on one core: exported in several ways, and in a control loop whose planner takes 100 ms.
+"""Times a whole policy on one core: exported in several ways, and in a control loop with a 100 ms planner.
 
     python benchmarks/latency.py --write            # a policy of the default size, random weights
     python benchmarks/latency.py --run runs/demo    # a trained one
-    python benchmarks/latency.py --loop-steps 800   # plans made between two steps, and in a thread
+    python benchmarks/latency.py --loop-steps 800   # plans between control steps, and in a thread
 
-Every way is called in turn, so that a busy machine slows all of them alike; before that its actions are compared with
-the eager ones. ``--write`` writes ``benchmarks/results/exported_policy.csv``. torch.compile and AOTInductor need a C++
-compiler, ONNX the extra ``onnx``; what is missing is named and left out.
+Each export is first compared with the eager policy. All are then called in turn, so that a busy machine slows them
+alike. ``--write`` writes ``benchmarks/results/exported_policy.csv``. torch.compile and AOTInductor need a C++ compiler,
+ONNX the extra ``onnx``; an export that cannot be made is skipped with a message.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ TOLERANCE = 1e-5
 
 
 class SlowPlanner(StatePlanner):
-    """Takes as long as a large planner does on a small computer."""
+    """Delays every plan to the time of a large planner on a small computer."""
 
     seconds = 0.1
 
     def solve(self, *arguments, **options):
-        """Plans, and waits for the rest of the time."""
+        """Plans, then waits until ``seconds`` have passed."""
         began = time.perf_counter()
         plan = super().solve(*arguments, **options)
         time.sleep(max(self.seconds - (time.perf_counter() - began), 0))
@@ -62,18 +62,18 @@ class SlowPlanner(StatePlanner):
 
 
 def default_policy() -> tuple[PlanningPolicy, int]:
-    """A policy for seven joints and their goals, of the size that ``koap train`` gives it, and its observation."""
+    """Returns a policy for seven joints and their goals in the default size, and the width of its observation."""
     planner = StatePlanner(TemporalUnet(14, 28, channels=(64, 128)), state_dim=14)
     controller = make_koopman_inverse_dynamics(7, 7)
     return make_policy(planner, controller, state_of=range(14), reads=StateReader(range(7))), 14
 
 
 def compiled(what: Exportable) -> Callable:
-    """The policy through torch.compile, compared with the eager one."""
+    """Compiles the policy with torch.compile and compares it with the eager one."""
     try:
         function = torch.compile(what.module, fullgraph=True, dynamic=False)
         gap = relative_gap(function(*what.inputs.values()), what.module(*what.inputs.values()))
-    except Exception as error:  # the compiler is asked in many places
+    except Exception as error:  # a missing compiler raises various errors
         raise ExportError(f"torch.compile needs a C++ compiler such as g++: {str(error).splitlines()[0]}") from error
     if not gap <= TOLERANCE:
         raise ExportError(f"torch.compile differs from the policy by {gap:.1e}, at most {TOLERANCE:.0e} is allowed")
@@ -83,10 +83,10 @@ def compiled(what: Exportable) -> Callable:
 def time_calls(
     functions: Mapping[str, Callable[..., Tensor]], inputs: tuple[Tensor, ...], *, repeats: int = 100
 ) -> dict[str, dict[str, float]]:
-    """Times functions that are called in turn, so that a busy machine slows all of them alike.
+    """Times functions that are called in turn, so that a busy machine slows them alike.
 
-    Ten calls of each come before those that count. By name: ``p50`` and ``p99`` in ms, and ``ratio``, the median of its
-    time over that of the first function in the same turn.
+    Ten warm-up calls of each are not counted. Returns by name ``p50`` and ``p99`` in ms, and ``ratio``, the median of
+    the time divided by that of the first function in the same turn.
     """
     taken: dict[str, list[float]] = {name: [] for name in functions}
     with torch.no_grad():
@@ -108,7 +108,7 @@ def time_calls(
 
 
 def exported(run: Path | None, repeats: int) -> list[dict[str, str]]:
-    """A row per way to call a policy."""
+    """Returns a row per way to call a policy."""
     policy, width = default_policy() if run is None else (load_policy(run), Trained.load(run).task.observation_dim)
     what = exportable(policy, columns={"observations": {f"column {index}": "" for index in range(width)}})
     ways: dict[str, Callable] = {"eager": what.module}
@@ -135,7 +135,7 @@ def exported(run: Path | None, repeats: int) -> list[dict[str, str]]:
 
 
 def print_loops(steps: int, control_hz: float) -> None:
-    """Late steps of a control loop, with plans made between two steps and in a thread."""
+    """Prints the late steps of a control loop that plans between its steps, and of one that plans in a thread."""
     planner = SlowPlanner(TemporalUnet(7, 14, channels=(16, 32)), state_dim=7, num_steps=4)
     policy = make_policy(planner, make_koopman_inverse_dynamics(7, 7), state_of=range(7))
     observations = np.random.default_rng(0).normal(size=(steps, 7)).cumsum(0) / 100
@@ -150,11 +150,11 @@ def main(
     """Prints the table of exported policies, or the control loops.
 
     Args:
-        run: run directory instead of random weights.
-        repeats: calls of every way.
+        run: run directory. Default: random weights.
+        repeats: timed calls per way.
         write: write the table.
-        loop_steps: steps of a control loop, instead of the table.
-        control_hz: its rate.
+        loop_steps: measure control loops of this many steps instead of the table.
+        control_hz: rate of the control loops.
     """
     torch.set_num_threads(1)
     torch.manual_seed(0)

@@ -4,9 +4,9 @@
     python benchmarks/make_results.py           # write
     python benchmarks/make_results.py --check   # compare with what is committed, exit 1 if it differs
 
-Figures are in ``benchmarks/results/*.csv``; the text of each page is a template beside them. Pages of docs/results
-extend ``page.jinja``, which says what each one has. A number of a template must be one of the CSV files that its page
-links (tests/docs/test_results_form.py). Intervals are computed from n and successes.
+Figures are in ``benchmarks/results/*.csv``; the text of each page is a template in the same folder. Pages of
+docs/results extend ``page.jinja``, which defines their sections. A number in a template must occur in a CSV file that
+its page links (tests/docs/test_results_form.py). Intervals are computed from n and successes.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- results: made by benchmarks/make_results.py -->", "<!-- end of results -->"
-ORPHAN = "---\norphan: true\n---\n\n"  # pages outside of the navigation
+ORPHAN = "---\norphan: true\n---\n\n"  # front matter of pages outside the navigation
 
 
 def pages() -> dict[Path, str]:
-    """Every generated text by its path from the repository's root."""
+    """Renders every generated text, by its path relative to the repository's root."""
     environment = Environment(
         loader=FileSystemLoader(tables.SOURCE), undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
@@ -50,10 +50,10 @@ def pages() -> dict[Path, str]:
 
 
 def main(*, check: bool = False) -> int:
-    """Writes every page and picture that is made from committed figures; returns the exit status.
+    """Writes every page and picture made from committed figures; returns the exit status.
 
     Args:
-        check: write nothing, compare with what is there.
+        check: write nothing, compare with the committed pages.
     """
     stale = []
     for path, text in pages().items():
@@ -64,7 +64,7 @@ def main(*, check: bool = False) -> int:
                 (ROOT / path).parent.mkdir(parents=True, exist_ok=True)
                 (ROOT / path).write_text(text, encoding="utf-8")
     if check:
-        print("\n".join(f"{path} is not what the figures give" for path in stale) or "every page is up to date")
+        print("\n".join(f"{path} differs from what the figures give" for path in stale) or "every page is up to date")
         return int(bool(stale))
     drawn = pictures.draw_all(ROOT / "docs" / "pictures")
     print("\n".join(f"wrote {path}" for path in [*stale, *(path.relative_to(ROOT) for path in drawn)]))

@@ -1,10 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A robot of seven joints as its owner would teach it: arrays with few labels, about a minute of training, new goals.
+"""Trains a seven-joint robot from arrays with few labels for about a minute and tests it on new goals.
 
     python benchmarks/own_robot.py --write
 
-Joints follow delta commands with a lag; 50 demonstrations from random places to random goals, 5 of them with actions.
-The trained policy then drives ten robots to goals that no demonstration had. ``--write`` writes
+Joints follow delta commands with a lag. There are 50 demonstrations from random positions to random goals, 5 of them
+with actions. The trained policy then moves ten robots to goals that no demonstration had. ``--write`` writes
 ``benchmarks/results/own_robot.csv``.
 """
 
@@ -37,29 +37,29 @@ from torchrl_koap.training.closed_form import fit_closed_form
 
 RESULTS = Path(__file__).resolve().parent / "results" / "own_robot.csv"
 JOINTS, DEMONSTRATIONS, LABELLED, FRAMES = 7, 50, 5, 60
-REACHED = 0.05  # rad, every joint
+REACHED = 0.05  # rad, largest distance of any joint to its goal
 NAMES = [f"q{joint + 1}" for joint in range(JOINTS)] + [f"goal{joint + 1}" for joint in range(JOINTS)]
 
 
 class Arm:
-    """Several arms at once, somewhere, with a goal each."""
+    """A batch of arms with random positions and goals."""
 
     def __init__(self, count: int, generator: np.random.Generator):
         self.joints, self.goals = generator.uniform(-1, 1, (2, count, JOINTS))
         self.speed = np.zeros((count, JOINTS))
 
     def observe(self) -> np.ndarray:
-        """Joints and goals ``[count, 14]`` (rad)."""
+        """Returns joints and goals ``[count, 14]`` (rad)."""
         return np.concatenate([self.joints, self.goals], 1)
 
     def step(self, action: np.ndarray) -> None:
-        """Delta commands ``[count, 7]`` (rad), followed with a lag."""
+        """Applies delta commands ``[count, 7]`` (rad), which the joints follow with a lag."""
         self.speed = 0.6 * self.speed + 0.4 * action
         self.joints = self.joints + self.speed
 
 
 def record(seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Demonstrations: frames ``[60, 14]`` and actions ``[60, 7]`` of each."""
+    """Records demonstrations; returns frames ``[60, 14]`` and actions ``[60, 7]`` of each."""
     generator = np.random.default_rng(seed)
     arm, states, actions = Arm(DEMONSTRATIONS, generator), [], []
     for _ in range(FRAMES):
@@ -70,7 +70,7 @@ def record(seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def drive(run: Path, seed: int, steps: int = 200) -> np.ndarray:
-    """Distance to the goal of the worst joint of ten arms after some steps (rad)."""
+    """Rolls out ten arms; returns the goal distance of each arm's worst joint after ``steps`` steps (rad)."""
     arm, agent = Arm(10, np.random.default_rng(1000 + seed)), Agent(load_policy(run), seed=seed)
     agent.reset()
     for _ in range(steps):
@@ -79,7 +79,7 @@ def drive(run: Path, seed: int, steps: int = 200) -> np.ndarray:
 
 
 def action_errors(run: Path, states: list[np.ndarray], actions: list[np.ndarray]) -> tuple[float, float]:
-    """Errors on the demonstrations whose actions were kept back, of the controller and of a ridge (rad)."""
+    """Returns the action errors of controller and ridge on the demonstrations without labels (rad)."""
     trained = Trained.load(run)
     every, few = (
         trained.seen(select_state(data, task.state_of))
@@ -101,7 +101,7 @@ def _few(actions: list[np.ndarray]) -> list[np.ndarray | None]:
 
 
 def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, Any]:
-    """Records, trains, judges and drives once."""
+    """Records, trains, evaluates and rolls out once; returns a row."""
     states, actions = record(seed)
     data, task = make_demonstrations(
         states,
@@ -136,7 +136,7 @@ def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, A
 
 
 def main() -> None:
-    """Prints a row per training seed and, if asked, writes them."""
+    """Prints a row per training seed and, with ``--write``, writes the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=800, help="updates of the planner")
     parser.add_argument("--seeds", type=int, default=1)

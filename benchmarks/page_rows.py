@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The one table of each page in docs/results, the times that its commands took, and the picture of Scooping.
+"""Formats tables of docs/results and the run times of their commands; draws the picture of Scooping.
 
     python benchmarks/page_rows.py --folder runs/scooping  # draws the picture
 
-Its frames are those of the recordings, its bars those of ``benchmarks/results/scooping.csv``.
+The picture shows frames of the recordings and the success rates of ``benchmarks/results/scooping.csv``.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from torchrl_koap.tasks.scooping import CAMERA, FRAME_HZ
 STARTS = ("left", "near", "right")
 _CELL = ("labels", "unlabelled", "method")
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "scooping.png"
-SHOWN = 5  # frames of each film
+SHOWN = 5  # frames per video
 LABELS = ("2", "5")
-# what is labelled of a task
+# labelled part of each task
 CONTROLLERS = {"avoiding": "1 trajectory", "stacking": "1 % of windows"}
 COLORS = {"koap": BLUE, "koap_untrained": PALE_BLUE, "dp": MUTED, "linear": ORANGE}
 NAMES = {
@@ -42,26 +42,26 @@ NAMES = {
 
 
 def bench_rate(name: str, task: str, method: str, level: int = 0) -> str:
-    """Formats the success of all seeds of a method in whole percent; level 0 has the fewest labels."""
+    """Formats a method's success over all seeds in whole percent; level 0 has the fewest labels."""
     return percent(count_successes(name, task, method, label_shares(name, task)[level]), 0)
 
 
 def hours(name: str) -> str:
-    """Formats how long the controllers and rollouts of a comparison took, on one core each."""
+    """Formats the time of the controllers and rollouts of a comparison, each on one core."""
     seconds = sum(float(row[part] or 0) for row in finished_cells(name) for part in ("train_seconds", "eval_seconds"))
     return f"{seconds / 3600:.1f} core hours for controllers and rollouts, planners apart"
 
 
 def minutes(name: str, column: str) -> str:
-    """Formats the sum of a column of seconds in minutes; rows that share a training are counted once."""
+    """Formats the sum of a column of seconds in minutes; rows that share a training count once."""
     found = {(row.get("seed"), row[column]) for row in read_rows(name)}
     return f"{sum(float(seconds) for _, seconds in found) / 60:.0f} core minutes of training"
 
 
 def paper_success_table(name: str) -> str:
-    """Formats a row per task: success of KOAP and of the paper's KOAP, a column per label level.
+    """Formats the success of KOAP here and in the paper: a row per task, a column per label level.
 
-    Between them an arrow says that ours is above or below what the paper prints around its mean, "=" that it is within.
+    "=" means that ours lies within the spread around the paper's mean; an arrow means that it lies above or below.
     """
     rows: dict[str, dict[int, str]] = {}
     for entry in paper_cells_beside(name):
@@ -81,13 +81,13 @@ def _beside_the_paper(entry: Entry) -> str:
 
 
 def controllers_table() -> str:
-    """Formats success of KOAP, its controls and `mpc` behind the same planner."""
+    """Formats the success of KOAP, its controls and `mpc` with the same planner."""
     body = []
     for task, text in CONTROLLERS.items():
         names = ("koap", "koap_untrained", "linear_steps", "mpc")
         cells = [count_successes("controllers", task, name, 0.01) for name in names]
-        told = [f"{percent(counts, 0)} of {counts['n']}" if counts["n"] else "not run" for counts in cells]
-        body.append([f"`{task}`", text, *told])
+        rates = [f"{percent(counts, 0)} of {counts['n']}" if counts["n"] else "not run" for counts in cells]
+        body.append([f"`{task}`", text, *rates])
     return table(["task", "labelled", "KOAP", "random features", "ridge regression", "`mpc`"], body)
 
 
@@ -100,7 +100,7 @@ FOLLOWED = {
 
 
 def followed_table(labels: int, regimes: Sequence[str]) -> str:
-    """Formats how often held-out demonstrations were followed: a row per observation model, a column per method.
+    """Formats the share of held-out demonstrations followed: a row per observation model, a column per method.
 
     Args:
         labels (int): labelled demonstrations.
@@ -126,7 +126,7 @@ SCOOPING_ROWS = (
 
 
 def scooping_matrix() -> str:
-    """Formats success by bowl, labelled demonstrations and unlabelled videos; Diffusion Policy reads labelled ones."""
+    """Formats success by bowl, labels and unlabelled videos; Diffusion Policy reads labelled data only."""
     methods = {"KOAP": "koap", "random features": "koap_untrained", "ridge": "linear", "Diffusion Policy": "dp"}
     body = []
     for task, labels, unlabelled in SCOOPING_ROWS:
@@ -144,21 +144,21 @@ def scooping_matrix() -> str:
 
 
 def suggestions_table() -> str:
-    """Formats action errors by number of labelled demonstrations, and what criteria differ from random choice."""
+    """Formats action errors by labelled demonstrations, and the difference of each criterion to random choice."""
     rows = read_rows("label_suggestions")
     criteria = list(dict.fromkeys(row["criterion"] for row in rows))
     body = []
     for chosen in dict.fromkeys(row["chosen"] for row in rows):
-        mine = {row["criterion"]: row for row in rows if row["chosen"] == chosen}
-        body.append([chosen, mine[criteria[0]]["random_error"]])
+        found = {row["criterion"]: row for row in rows if row["chosen"] == chosen}
+        body.append([chosen, found[criteria[0]]["random_error"]])
         body[-1] += [
-            "{error}; {difference} ({difference_low} to {difference_high})".format(**mine[name]) for name in criteria
+            "{error}; {difference} ({difference_low} to {difference_high})".format(**found[name]) for name in criteria
         ]
     return table(["labelled", "random", *(f"`{name}`; difference" for name in criteria)], body)
 
 
 def speed_table() -> str:
-    """Formats what a user waits for: training, plans and environments."""
+    """Formats times of training and planning, and rates of training and environments."""
     speed = {(row["part"], row["variant"].split()[0]): row for row in read_rows("training_speed")}
     ways = {row["way"]: row["p50_ms"] for row in read_rows("exported_policy")}
     env = read_rows("env_speed", task="avoiding", batch=60, threads=1)[0]
@@ -182,7 +182,7 @@ def observation_rate(name: str, method: str, part: float) -> str:
 
 
 def followed_rollouts(labels: int, regimes: Sequence[str]) -> str:
-    """Formats the rollouts of an entry of :func:`followed_table`."""
+    """Formats the number of rollouts per entry of :func:`followed_table`."""
     rows = [row for regime in regimes for row in read_rows("unlabelled_rollouts", regime=regime, labels=labels)]
     sizes: dict[tuple[str, str], int] = {}
     for row in rows:
@@ -192,16 +192,16 @@ def followed_rollouts(labels: int, regimes: Sequence[str]) -> str:
 
 
 def requirement(name: str) -> str:
-    """Reads which versions of a package pyproject.toml asks for."""
+    """Returns the version requirement of a package in pyproject.toml."""
     text = (SOURCE.parents[1] / "pyproject.toml").read_text(encoding="utf-8")
     return re.search(rf'"({name}[<>=][^"]*)"', text)[1]
 
 
 def scooping_cells(rows: Sequence[Mapping[str, str]] | None = None) -> list[dict[str, Any]]:
-    """Cells of the study, each with the rollouts of all its training seeds; of a seed those of its longest row.
+    """Pools the rollouts of each cell over its training seeds; per seed the row with most rollouts counts.
 
     Args:
-        rows (sequence of mapping, optional): rows of ``scooping.csv``. Default: those that are committed.
+        rows (sequence of mapping, optional): rows of ``scooping.csv``. Default: the committed rows.
 
     Returns:
         list of dict: the cell's columns, ``n``, ``successes``, ``rims``, ``seeds``, mean rates by start position, and
@@ -224,7 +224,7 @@ def scooping_cells(rows: Sequence[Mapping[str, str]] | None = None) -> list[dict
 
 
 def scooping_table(task: str = "scooping") -> str:
-    """A row per cell of the study.
+    """Formats a row per cell of the study.
 
     Args:
         task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
@@ -245,11 +245,11 @@ def scooping_table(task: str = "scooping") -> str:
 
 
 def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], path: Path) -> Path:
-    """Films to the left, bars of success with 95 % intervals to the right.
+    """Draws videos on the left, success rates with 95 % intervals on the right.
 
     Args:
-        films (mapping): by caption the frames ``[T, H, W, 3]`` of a demonstration.
-        cells (sequence of mapping): of :func:`scooping_cells`.
+        films (mapping): caption to the frames ``[T, H, W, 3]`` of a demonstration.
+        cells (sequence of mapping): from :func:`scooping_cells`.
         path (Path): png to write.
     """
     figure = Figure(figsize=(9.6, 3.2), layout="constrained")
@@ -283,12 +283,12 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
 
 
 def main(*, folder: Path) -> None:
-    """Draws the picture.
+    """Draws the picture of Scooping.
 
     Args:
-        folder: of benchmarks/scooping.py.
+        folder: recordings that benchmarks/scooping.py wrote.
     """
-    from torchrl_koap.data import read_recordings  # needs an extra
+    from torchrl_koap.data import read_recordings  # imported here: needs an extra
 
     captions = {"hand": "a hand: no actions", "robot": "robot: few labels"}
     films = {

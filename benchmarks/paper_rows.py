@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Committed cells of `koap bench` as tables of docs/results, the paper's beside them."""
+"""Formats committed cells of `koap bench` as tables of docs/results, compared with the paper's."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PLURAL = {"window": "windows", "trajectory": "trajectories"}
 
 
 def read_cells(name: str) -> list[dict[str, Any]]:
-    """The cells of a whole comparison as `koap bench` writes them: numbers as numbers, None for nothing."""
+    """Reads all cells of a comparison; numbers are converted, empty entries become None."""
     return [{column: _value(text) for column, text in row.items()} for row in read_rows(f"cells/{name}")]
 
 
@@ -44,28 +44,28 @@ def _value(text: str) -> Any:
 
 
 def finished_cells(name: str) -> list[dict[str, Any]]:
-    """The finished cells of a comparison."""
+    """Returns the finished cells of a comparison."""
     return [row for row in read_cells(name) if row["status"] == "done"]
 
 
 def paper_cells_beside(name: str) -> list[Entry]:
-    """The cells of a comparison beside the paper's, those that were not run included."""
+    """Pairs the cells of a comparison with the paper's; includes cells that were not run."""
     return paper_entries(read_cells(name))
 
 
 def paper_levels_table() -> str:
-    """The shares of labels that are the paper's levels, by task."""
+    """Formats the shares of labels at the paper's levels, by task."""
     body = [[f"`{task}`", *map(share, get_task(task).label_levels)] for task in PAPER_TASKS]
     return table(["task", *(f"level {level}" for level in range(1, 6))], body)
 
 
 def bench_table(name: str) -> str:
-    """Cells of a comparison, by their file's name, in the layout of the paper's tables, the paper's beside each."""
+    """Formats the cells of a comparison file in the layout of the paper's tables, each with the paper's value."""
     return as_markdown(layout_rows(paper_entries(read_cells(name))))
 
 
 def observation_table(name: str) -> str:
-    """A row per share of the trajectories that is known, a column per method: success in percent, all seeds together.
+    """Formats success in percent over all seeds: a row per known share of the trajectories, a column per method.
 
     Args:
         name (str): file of cells without its ending.
@@ -80,7 +80,7 @@ def observation_table(name: str) -> str:
 
 
 def count_by_observations(name: str) -> dict[float, dict[str, Counter[str]]]:
-    """Successes and rollouts of all seeds, by share of the trajectories and method."""
+    """Counts successes and rollouts over all seeds, by share of the trajectories and method."""
     found: dict[float, dict[str, Counter[str]]] = {}
     for row in finished_cells(name):
         counts = found.setdefault(row["demonstrations"], {}).setdefault(row["method"], Counter())
@@ -89,7 +89,7 @@ def count_by_observations(name: str) -> dict[float, dict[str, Counter[str]]]:
 
 
 def bench_entropy(name: str, method: str, observations: float) -> str:
-    """Mean entropy of the modes over the seeds of a method with a share of the trajectories."""
+    """Formats a method's mean mode entropy over the seeds at a share of the trajectories."""
     found = [
         row["mode_entropy"]
         for row in finished_cells(name)
@@ -99,12 +99,12 @@ def bench_entropy(name: str, method: str, observations: float) -> str:
 
 
 def paper_size() -> str:
-    """Number of cells that the paper's tables have."""
+    """Returns the number of cells in the paper's tables."""
     return str(sum(cell.task != "stacking_1" for number in (1, 2) for cell in paper_cells(number)))
 
 
 def bench_sentence(name: str, method: str = "") -> str:
-    """In how many cells of a comparison KOAP is above the paper's, or another method above the paper's KOAP."""
+    """Counts the cells in which KOAP is above the paper's KOAP; with ``method``, in which that method is."""
     entries = paper_cells_beside(name)
     if method:
         entries = [replace(entry, paper=paper_cell(entry.task, "koap", entry.level)) for entry in entries]
@@ -113,7 +113,7 @@ def bench_sentence(name: str, method: str = "") -> str:
 
 
 def draw_bench_average(name: str, path: Path) -> Path:
-    """Draws the success of a comparison averaged over the tasks on which KOAP was run at every level."""
+    """Draws success averaged over the tasks on which KOAP was run at every level."""
     entries = paper_cells_beside(name)
     gaps = {entry.task for entry in entries if entry.method == "koap" and entry.success is None}
     draw_average([entry for entry in entries if entry.task not in gaps], path)
@@ -121,14 +121,14 @@ def draw_bench_average(name: str, path: Path) -> Path:
 
 
 def few_labels_table(name: str, all_labels: str, human: str) -> str:
-    """A row per task: success with the fewest labels of KOAP and what it is compared with, all seeds together.
+    """Formats success with the fewest labels over all seeds: a row per task, a column per method.
 
     The last column is Diffusion Policy with all labels.
 
     Args:
         name (str): file of cells without its ending.
-        all_labels (str): that of Diffusion Policy with all labels.
-        human (str): that of the last row, human recordings of Avoiding of which one is labelled.
+        all_labels (str): file of Diffusion Policy with all labels.
+        human (str): file of the last row: human recordings of Avoiding, one of them labelled.
     """
     methods, body = ("koap", "koap_untrained", "linear_steps", "dd", "dp"), []
     for task in PAPER_TASKS:
@@ -143,17 +143,17 @@ def few_labels_table(name: str, all_labels: str, human: str) -> str:
 
 
 def bench_rollouts(name: str) -> str:
-    """Rollouts of all seeds together of KOAP with the fewest labels, of the task that has most."""
+    """Returns KOAP's rollouts over all seeds with the fewest labels, the largest number of any task."""
     return str(max(count_successes(name, task, "koap", label_shares(name, task)[0])["n"] for task in PAPER_TASKS))
 
 
 def label_shares(name: str, task: str) -> list[float]:
-    """The shares of labels of a task, the fewest first."""
+    """Returns the shares of labels of a task, smallest first."""
     return sorted({row["labels"] for row in finished_cells(name) if row["task"] == task})
 
 
 def count_successes(name: str, task: str, method: str, labels: float) -> Counter[str]:
-    """Successes and rollouts of all seeds of a method."""
+    """Counts successes and rollouts of a method over all seeds."""
     counts: Counter[str] = Counter()
     for row in finished_cells(name):
         if (row["task"], row["method"], row["labels"]) == (task, method, labels):
@@ -162,7 +162,7 @@ def count_successes(name: str, task: str, method: str, labels: float) -> Counter
 
 
 def _pooled(name: str, task: str, method: str, labels: float | None = None) -> str:
-    """Success of all seeds in whole percent with its Wilson interval; by default with the fewest labels of the task."""
+    """Formats success over all seeds in whole percent with its Wilson interval. Default: the fewest labels."""
     counts = count_successes(name, task, method, labels or label_shares(name, task)[0])
     if not counts["n"]:
         return "not run"
@@ -171,7 +171,7 @@ def _pooled(name: str, task: str, method: str, labels: float | None = None) -> s
 
 
 def bench_size(name: str) -> str:
-    """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
+    """Formats seeds, rollouts and unit of the labels of a comparison, as found in its cells."""
     cells = finished_cells(name)
     seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
     rollouts = " or ".join(map(str, sorted(episodes)))
@@ -183,7 +183,7 @@ def bench_size(name: str) -> str:
 
 @dataclass(frozen=True)
 class Setting:
-    """A way to train and execute a method, and its mean score over the tuning tasks; 0 updates: in closed form."""
+    """Execution, updates and mean score of a method over the tuning tasks; 0 updates: fitted in closed form."""
 
     execution: str
     updates: int
@@ -191,13 +191,13 @@ class Setting:
 
     @property
     def text(self) -> str:
-        """The setting in words."""
+        """Formats the setting."""
         updates = f", {self.updates}" if self.updates else ""
         return f"{self.execution.replace('_', ' ')}{updates}: {self.score:.2f}"
 
 
 def tuned_settings(method: str) -> list[Setting]:
-    """Settings of a method that were scored on every tuning task and number of labels, the best one first."""
+    """Returns a method's settings scored on every tuning task and number of labels, best first."""
     found: dict[tuple[str, int], list[float]] = {}
     for row in read_rows("method_tuning", method=method):
         updates = int(row["updates"]) if get_method(method).phases else 0
@@ -208,10 +208,10 @@ def tuned_settings(method: str) -> list[Setting]:
 
 
 def declared_setting(method: str) -> Setting:
-    """The setting that a method declares, or the library's.
+    """Returns the setting that a method declares, or else the library's default.
 
     Raises:
-        LookupError: if the tuning did not try it.
+        LookupError: if the tuning does not include that setting.
     """
     known = get_method(method)
     execution = Execution().replaced(**known.execution)
@@ -220,11 +220,11 @@ def declared_setting(method: str) -> Setting:
     for setting in tuned_settings(method):
         if (setting.execution, setting.updates) == wanted:
             return setting
-    raise LookupError(f"{method}: {wanted} was not tried")
+    raise LookupError(f"{method}: the tuning table has no setting {wanted}")
 
 
 def tuning_table() -> str:
-    """A row per method: the setting that it declares, and the best one with another execution."""
+    """Formats a row per method: its declared setting, and the best one with another execution."""
     body = []
     for method in dict.fromkeys(row["method"] for row in read_rows("method_tuning")):
         own = declared_setting(method)
@@ -244,7 +244,7 @@ RIVALS = {
 
 
 def comparison_table() -> str:
-    """A row per task: KOAP's success with the fewest labels minus that of others, in points, paired by context."""
+    """Formats KOAP's success with the fewest labels minus that of others, in points, paired by context."""
     body = []
     for task in PAPER_TASKS:
         rows = read_rows("cells/comparisons", task=task)
@@ -261,7 +261,7 @@ def _points(row: Mapping[str, str]) -> str:
 
 
 def compared(method: str) -> str:
-    """In how many cells KOAP is above, equal to and below a method, by paired 95 % intervals: "3/4/0"."""
+    """Counts cells in which KOAP is above, equal to and below a method by paired 95 % intervals: "3/4/0"."""
     rows = [row for row in read_rows("cells/comparisons", method=method) if row["difference"]]
     above, below = sum(float(row["low"]) > 0 for row in rows), sum(float(row["high"]) < 0 for row in rows)
     return f"{above}/{len(rows) - above - below}/{below}"

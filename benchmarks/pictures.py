@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pictures of the README and of docs/results that need no recording: pipeline, curves and bars with 95 % intervals."""
+"""Draws the pictures of the README and docs/results that need no recordings: pipeline, curves and bars."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ROBOT = {"KOAP": "action", "ridge regression": "ridge"}
 
 
 def draw_all(folder: Path) -> list[Path]:
-    """Draws every picture that is made from committed figures into a folder."""
+    """Draws every picture made from committed figures into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = read_rows("own_robot")
     errors = [(name, [float(row[f"{key}_error_rad"]) for row in robot]) for name, key in _ROBOT.items()]
@@ -106,7 +106,7 @@ def draw_pipeline(path: Path) -> Path:
     axes.plot([89.5, 89.5, 5], [14.5, 3.5, 3.5], color=INK, linewidth=1.1)
     _arrow(axes, (5, 3.5), (5, 14.5))
     axes.text(48, 4.4, "robot: four actions of every plan are executed, then a new plan is made", ha="center", size=9)
-    with rc_context({"svg.hashsalt": "torchrl_koap"}):  # the same file at every call
+    with rc_context({"svg.hashsalt": "torchrl_koap"}):  # makes the file reproducible
         figure.savefig(path, dpi=130, facecolor="white", metadata={"Date": None})
     return path
 
@@ -120,13 +120,13 @@ def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], col
 
 
 def _interval(successes: int, trials: int) -> tuple[float, float, float]:
-    """Mean, low and high in percent."""
+    """Returns mean, low and high in percent."""
     low, high = wilson_interval(successes, trials)
     return 100 * successes / trials, 100 * low, 100 * high
 
 
 def _controllers() -> list[Bar]:
-    """Success of KOAP and of another controller behind the same planner."""
+    """Returns the success of KOAP and of `mpc` with the same planner."""
     bars = []
     for task in CONTROLLERS:
         for method in ("koap", "mpc"):
@@ -136,7 +136,7 @@ def _controllers() -> list[Bar]:
 
 
 def _planner_data() -> dict[str, list[Point]]:
-    """Success against the share of demonstrations that the planner knows, by method."""
+    """Returns success by the share of demonstrations that the planner is trained on, for each method."""
     found = count_by_observations("study_observations_and_planner")
     return {
         name: [
@@ -148,7 +148,7 @@ def _planner_data() -> dict[str, list[Point]]:
 
 
 def _suggestions() -> dict[str, list[Point]]:
-    """Action error against labelled demonstrations, by criterion."""
+    """Returns action errors by labelled demonstrations, for each criterion."""
     rows = read_rows("label_suggestions")
     lines: dict[str, list[Point]] = {}
     for row in rows:
@@ -159,7 +159,7 @@ def _suggestions() -> dict[str, list[Point]]:
 
 
 def draw_few_labels(path: Path) -> Path:
-    """Draws success against the labelled share, a panel per task.
+    """Draws success over the labelled share, a panel per task.
 
     Args:
         path (Path): png to write.
@@ -191,8 +191,8 @@ def draw_lines(lines: Mapping[str, Sequence[Point]], xlabel: str, ylabel: str, p
 
     Args:
         lines (mapping): name to points.
-        xlabel (str): what is varied.
-        ylabel (str): what is measured.
+        xlabel (str): label of the horizontal axis.
+        ylabel (str): label of the vertical axis.
         path (Path): png to write.
     """
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
@@ -218,7 +218,7 @@ def draw_bars(bars: Sequence[Bar], xlabel: str, path: Path, log: bool = False) -
 
     Args:
         bars (sequence of tuple): name, mean, ends of the interval.
-        xlabel (str): what is measured.
+        xlabel (str): label of the horizontal axis.
         path (Path): png to write.
         log (bool): logarithmic axis.
     """

@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which score of a planner on held-out recordings predicts its rollouts? Trainings of several lengths and networks.
+"""Measures which score of a planner on held-out recordings predicts its success in rollouts.
 
     python benchmarks/planner_scores.py pusht avoiding_human --seeds 1
 
-A tenth of the recordings is held out by hand, and no training is ended or chosen by them. One controller per seed
-follows all planners. Appends rows to ``benchmarks/results/planner_scores.csv`` and prints, for every ground, the rank
-correlation of scores with successes. ``avoiding_human`` are the recordings of Avoiding by people, the other names are
-those of ``benchmarks/proving_grounds``.
+Planners differ in network and number of updates. 10 % of the recordings are held out from training and from the choice
+of weights. One controller per seed is used with all planners. Appends rows to ``benchmarks/results/planner_scores.csv``
+and prints the rank correlation of scores with failures for every ground. ``avoiding_human`` is the set of human
+recordings of Avoiding; the other names are those of ``benchmarks/proving_grounds``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ HUMAN = "avoiding_human"
 
 
 def closed_loop(ground: Ground | None, trained: Trained, n: int) -> int:
-    """Successes of so many rollouts, as data of one's own are executed."""
+    """Returns the successes of ``n`` rollouts with the temperature used for a user's own data."""
     execution = ExecutionConfig(temperature=OWN_TEMPERATURE)
     if ground is not None:
         return roll(ground, trained, execution, n)["successes"]
@@ -56,17 +56,17 @@ def closed_loop(ground: Ground | None, trained: Trained, n: int) -> int:
 
 
 def energy(planner: StatePlanner, states: torch.Tensor, trained: Trained) -> float:
-    """The energy score of plans in windows that were held out, as a share of standing still's."""
+    """Returns the energy score of plans on held-out windows, relative to standing still."""
     history, future = planner.split_window(spread_evenly(states, SITUATIONS))
     still, groups = history[:, -1:].expand_as(future), list(unit_groups(trained.task.state_units).values())
     return relative_score(sample_sequences(planner, history, samples=SAMPLES), future, still, groups)
 
 
 def study(name: str, ground: Ground | None, folder: Path, seed: int, n: int) -> None:
-    """Trains and scores what the table lacks for one ground and training seed."""
+    """Trains and scores the planners that the table lacks for one ground and training seed."""
     done, write = open_table(RESULTS, COLUMNS, COLUMNS[:6])
-    left = [each for each in TRAININGS if tuple(map(str, (name, seed, *each, n))) not in done]
-    if not left:
+    missing = [each for each in TRAININGS if tuple(map(str, (name, seed, *each, n))) not in done]
+    if not missing:
         return
     source = SHARED.parent / "d3il_avoiding_human" if ground is None else folder / name
     if ground is not None and not (source / "ted").is_dir():
@@ -76,7 +76,7 @@ def study(name: str, ground: Ground | None, folder: Path, seed: int, n: int) -> 
     data, _ = budget.apply(data, command=task.command_columns)
     known, unseen, _ = split_held_out(data, choose_held_out(data, 0.1, seed=seed))
     controlled = fit(data, task, planner=False, seed=seed)
-    for network, octaves, updates in left:
+    for network, octaves, updates in missing:
         options = {"network": network, "octaves": octaves, "steps": updates, "held_out": 0.0}
         planner = fit(known, task, method="linear", planner=options, seed=seed).planner
         length = planner.history + planner.horizon
@@ -90,13 +90,13 @@ def study(name: str, ground: Ground | None, folder: Path, seed: int, n: int) -> 
 
 
 def correlations() -> None:
-    """Prints the rank correlation of each score with failures on every ground, seed by seed."""
+    """Prints the rank correlation of each score with failures, for every ground and seed."""
     rows = read_rows("planner_scores")
     for name, seed in dict.fromkeys((row["ground"], row["seed"]) for row in rows):
-        mine = [row for row in rows if (row["ground"], row["seed"]) == (name, seed)]
-        failures = [int(row["n"]) - int(row["successes"]) for row in mine]
-        found = {kind: spearmanr([float(row[kind]) for row in mine], failures)[0] for kind in COLUMNS[6:8]}
-        print(name, seed, *(f"{kind} {value:.2f}" for kind, value in found.items()), f"of {len(mine)} planners")
+        cells = [row for row in rows if (row["ground"], row["seed"]) == (name, seed)]
+        failures = [int(row["n"]) - int(row["successes"]) for row in cells]
+        found = {kind: spearmanr([float(row[kind]) for row in cells], failures)[0] for kind in COLUMNS[6:8]}
+        print(name, seed, *(f"{kind} {value:.2f}" for kind, value in found.items()), f"of {len(cells)} planners")
 
 
 def main(
@@ -113,7 +113,7 @@ def main(
         names: proving grounds, and avoiding_human.
         seeds: number of training seeds, from 0.
         n: rollouts per planner.
-        folder: where data sets of the proving grounds are, or are written to.
+        folder: data sets of the proving grounds; missing ones are written.
     """
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 1)))
     known: dict[str, Ground | None] = {**grounds(), HUMAN: None}

@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Writes ``pretrained/NAME`` from a run: compact weights, options, and a model card from its evaluation.
+"""Writes ``pretrained/NAME`` from a run: compact weights, options, and a model card with its evaluation.
 
     python benchmarks/publish_pretrained.py RUN NAME --seeds 100 1100 2100
 
-What is evaluated is the compact policy itself, in 60 episodes per seed.
+The compact policy is evaluated in 60 episodes per seed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from torchrl_koap.tasks import get_task
 
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
 PLACES = ("out", "dataset")
-LEAST = 4096  # entries of a matrix that is worth it
+LEAST = 4096  # entries; smaller matrices are not compacted
 ROOT = Path(__file__).resolve().parents[1] / "pretrained"
 CARD = """# {name}
 
@@ -59,7 +59,7 @@ Made by
 
 
 def compact(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Stores weight matrices as ``int8`` and a scale per row, as :func:`~torchrl_koap.runs.weights.expand` reads them.
+    """Converts matrices to ``int8`` with a scale per row, which :func:`~torchrl_koap.runs.weights.expand` reads.
 
     Args:
         tensors (mapping): a state dict; entries with two or more axes and at least 4,096 floats are matrices.
@@ -76,21 +76,21 @@ def compact(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def publish(run: str | Path, folder: str | Path, card: str) -> Path:
-    """Writes a trained policy as the repository holds it: compact weights, options, a model card.
+    """Writes a trained policy in the repository's format: compact weights, options, a model card.
 
-    Of the places where the run, its data and a planner that it took over were, the last part of the path is kept: where
-    they were on another machine tells nobody anything.
+    Only the last part is kept of the paths of the run, its data and a planner that it took over. Paths on another
+    machine carry no information.
 
     Args:
         run (str or Path): run directory of ``koap train``.
-        folder (str or Path): folder to write, new or that of an earlier policy; its name is that of the policy.
+        folder (str or Path): folder to write, new or of an earlier policy; its name becomes that of the policy.
         card (str): text of the ``README.md``: data, updates, success, command.
 
     Returns:
         Path: the folder.
     """
     folder = Path(folder)
-    (folder / "config.json").unlink(missing_ok=True)  # another policy of that name gives way
+    (folder / "config.json").unlink(missing_ok=True)  # replaces an earlier policy of that name
     folder = copy_run(run, folder)
     published = RunDirectory(folder)
     config = published.read_json("config.json")
@@ -101,7 +101,7 @@ def publish(run: str | Path, folder: str | Path, card: str) -> Path:
     for name in WEIGHTS:
         if (folder / name).exists():
             tensors, about = load_tensors(folder / name)
-            # a closed-form decoder was fitted to exactly these frequencies: of a controller nothing is rounded
+            # controllers are not rounded: a closed-form decoder fits only the exact frequencies of its features
             exact = name == "controller.safetensors" and (folder / WEIGHTS[0]).exists()
             save_tensors(folder / name, tensors if exact else compact(tensors), about)
     (folder / "README.md").write_text(card)
@@ -109,10 +109,10 @@ def publish(run: str | Path, folder: str | Path, card: str) -> Path:
 
 
 def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a card says of a run and of its evaluations."""
+    """Returns the entries of the model card of a run and its evaluations."""
     config, summary = (RunDirectory(run).read_json(name) for name in ("config.json", "summary.json"))
     source, trained = run, config
-    while trained["planner"]["source"]:  # a planner that was taken over is described by the run that trained it
+    while trained["planner"]["source"]:  # the run that trained the planner describes it
         source = trained["planner"]["source"]
         trained = RunDirectory(source).read_json("config.json")
     task = get_task(config["task"])
@@ -159,7 +159,7 @@ def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def disturbance_of(dataset: Path) -> float:
-    """Share of the demonstrations of a data set that were recorded with a disturbed operator."""
+    """Returns the share of demonstrations in a data set that were recorded with a disturbed operator."""
     for about in (dataset / "about.json", dataset / "ted" / "about.json"):
         if about.is_file():
             notes = json.loads(about.read_text(encoding="utf-8")).get("notes") or {}
@@ -168,16 +168,16 @@ def disturbance_of(dataset: Path) -> float:
 
 
 def main(run: Positional[Path], name: Positional[str], *, seeds: tuple[int, ...] = (100, 1100, 2100)) -> None:
-    """Publishes a run, evaluates what was published, and writes its model card.
+    """Publishes a run, evaluates the published policy, and writes its model card.
 
     Args:
         run: the run directory.
-        name: of the folder below ``pretrained``.
+        name: folder below ``pretrained``.
         seeds: noise seeds, 60 episodes each.
     """
     folder = publish(run, ROOT / name, "")
     metrics = (folder / "metrics.csv").read_text().splitlines(keepends=True)
-    kept = [metrics[0], *metrics[1::5]]  # for the report's curves a fifth of the rows is enough
+    kept = [metrics[0], *metrics[1::5]]  # every fifth row is enough for the report's curves
     (folder / "metrics.csv").write_text("".join(kept))
     with tempfile.TemporaryDirectory() as out:
         results = [

@@ -1,11 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Kills commands at random moments and compares what they end with, byte by byte, with runs that were left alone.
+"""Kills commands at random times and compares their files byte by byte with those of undisturbed runs.
 
     python benchmarks/random_kills.py --minutes 20 --table benchmarks/results/random_kills.csv
 
-A command is started as a copy of this process, which has imported everything, ended by a random signal after a random
-time, called again until it comes to its end (with ``--resume`` where it has that), and its files are compared with
-those of a run that nobody disturbed. Clock times in them are left out. The table has one row per disturbed run.
+A command is started as a fork of this process, which has imported everything. A random signal ends it after a random
+time. It is called again until it finishes, with ``--resume`` if it has that option. Clock times in the files are not
+compared. The table has one row per disturbed run.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class Case:
     """A command that is disturbed.
 
     Args:
-        name (str): what to call it.
-        begin (callable): words of the call, given the folder to write.
-        again (callable): words of the call that goes on.
-        files (tuple of str): patterns of the files that are compared.
-        prepare (callable, optional): makes the folder.
+        name (str): name in the table.
+        begin (callable): from the folder to write to the words of the first call.
+        again (callable): from that folder to the words of the call that resumes.
+        files (tuple of str): patterns of the files to compare.
+        prepare (callable, optional): creates the folder.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Case:
 
 
 def cases(data: Path, run: Path) -> list[Case]:
-    """All commands, on small data."""
+    """Returns all commands, on small data."""
 
     def train(method: str) -> Case:
         words = ("--dataset", data, *TINY, "--steps", 60, "--controller.steps", 60)
@@ -102,10 +102,10 @@ def cases(data: Path, run: Path) -> list[Case]:
 
 
 def call(words: Sequence[object], kill: tuple[str, float] | None = None) -> int:
-    """Runs a command in a copy of this process; its exit status, or minus the signal that ended it."""
+    """Runs a command in a fork of this process; returns its exit status, or minus the signal that ended it."""
     child = os.fork()
     if child == 0:
-        os.setsid()  # a curve's workers can be told apart from this process
+        os.setsid()  # separates a curve's workers from this process
         for number in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
         status = 1
@@ -127,7 +127,7 @@ def call(words: Sequence[object], kill: tuple[str, float] | None = None) -> int:
 
 
 def content(folder: Path, patterns: Sequence[str]) -> dict[str, object]:
-    """What is compared: bytes, and JSON and tables without clock times."""
+    """Reads the files to compare: bytes, and JSON and tables without clock times."""
     found: dict[str, object] = {}
     for path in sorted({path for pattern in patterns for path in folder.glob(pattern) if path.is_file()}):
         name = str(path.relative_to(folder))
@@ -148,16 +148,16 @@ def _timeless(value):
 
 
 def disturb(
-    case: Case, out: Path, alone: dict[str, object], seconds: float, chance: random.Random
+    case: Case, out: Path, undisturbed: dict[str, object], seconds: float, generator: random.Random
 ) -> dict[str, object]:
-    """One run, ended once or several times; the row of it."""
+    """Runs a command, ended one to three times; returns its row."""
     if case.prepare is not None:
         case.prepare(out)
     signals, times, calls = [], [], 0
     words = case.begin(out)
-    for _ in range(chance.choice((1, 1, 2, 3))):
-        signals.append(chance.choice(SIGNALS))
-        times.append(chance.uniform(0, 1.1 * seconds))
+    for _ in range(generator.choice((1, 1, 2, 3))):
+        signals.append(generator.choice(SIGNALS))
+        times.append(generator.uniform(0, 1.1 * seconds))
         calls += 1
         if call(words, (signals[-1], times[-1])) == 0:
             break
@@ -165,20 +165,20 @@ def disturb(
     calls += 1
     status = call(case.again(out))
     leftovers = [path.name for path in out.rglob("*") if path.name.endswith((".tmp", ".old"))]
-    equal = content(out, case.files) == alone
+    equal = content(out, case.files) == undisturbed
     return {
         "command": case.name,
         "signals": " ".join(signals),
         "seconds": " ".join(f"{seconds:.3f}" for seconds in times),
         "calls": calls,
-        # a recording that was complete when it was ended is refused, and is what was wanted
+        # `koap demos` refuses to record again when the killed call had already finished: any status is accepted
         "equal": "yes" if equal and (status == 0 or case.name == "demos") else f"no (status {status})",
         "leftovers": len(leftovers),
     }
 
 
 def main() -> int:
-    """Kills for the time asked for, and says how many runs came out equal."""
+    """Disturbs runs for the given time and prints how many ended with equal files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=20)
     parser.add_argument("--commands", default="", help="names of commands, with commas between (default: all)")
@@ -186,36 +186,36 @@ def main() -> int:
     parser.add_argument("--table", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    chance, ends, rows = random.Random(options.seed), time.monotonic() + 60 * options.minutes, []
+    generator, ends, rows = random.Random(options.seed), time.monotonic() + 60 * options.minutes, []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         data, run = write_demonstrations(root / "data"), root / "run"
         assert call(("train", "--out", run, "--dataset", data, *TINY, "--quiet")) == 0
         wanted = [name for name in options.commands.split(",") if name]
         chosen = [case for case in cases(data, run) if not wanted or case.name.split()[0] in wanted]
-        alone, took = {}, {}
+        undisturbed, took = {}, {}
         number = 0
         while time.monotonic() < ends:
             case = chosen[number % len(chosen)]
             number += 1
-            if case.name not in alone:
-                left = root / f"alone-{number}"
+            if case.name not in undisturbed:
+                reference = root / f"undisturbed-{number}"
                 if case.prepare is not None:
-                    case.prepare(left)
+                    case.prepare(reference)
                 began = time.monotonic()
-                assert call(case.begin(left)) == 0, case.name
+                assert call(case.begin(reference)) == 0, case.name
                 took[case.name] = time.monotonic() - began
-                alone[case.name] = content(left, case.files)
-                assert alone[case.name], case.name
+                undisturbed[case.name] = content(reference, case.files)
+                assert undisturbed[case.name], case.name
             out = root / f"killed-{number}"
-            rows.append(disturb(case, out, alone[case.name], took[case.name], chance))
+            rows.append(disturb(case, out, undisturbed[case.name], took[case.name], generator))
             print(" ".join(f"{rows[-1][name]}" for name in COLUMNS), flush=True)
             shutil.rmtree(out, ignore_errors=True)
             if options.table is not None:
                 write_table(options.table, rows)
     equal = sum(row["equal"] == "yes" for row in rows)
     kills = sum(len(row["signals"].split()) for row in rows)
-    print(f"{len(rows)} runs ended {kills} times: {equal} equal to a run that was left alone")
+    print(f"{len(rows)} runs ended {kills} times: {equal} equal to an undisturbed run")
     return 0 if equal == len(rows) else 1
 
 

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Harder observations of the same demonstrations: noise, wide redundant columns, distractors, small pictures.
+"""Defines harder observations of demonstrations: noise, many redundant columns, distractors, small pictures.
 
-A regime changes what is *observed*; motions and actions stay as they were recorded. All noise comes from a seed, and
-the weights of an embedding from the regime alone: all seeds see the same sensor.
+A regime changes the *observation*; motions and actions stay as recorded. Noise depends on the seed. The weights of an
+embedding depend on the regime alone, so that all seeds have the same sensor.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ PICTURE = 32  # pixels along an edge
 
 @dataclass(frozen=True)
 class Regime:
-    """A way to observe the robot.
+    """An observation model of the robot.
 
     Args:
-        name (str): what studies call it.
-        title (str): what tables and pictures call it.
-        embed (callable, optional): from standardised states ``[N, d]`` to what a sensor shows without noise ``[N, c]``.
-            Default: the state itself.
-        fit (callable, optional): from the recorded standardised states to such an ``embed``, where it depends on them.
+        name (str): name in studies.
+        title (str): name in tables and pictures.
+        embed (callable, optional): from standardised states ``[N, d]`` to observations without noise ``[N, c]``.
+            Default: the identity.
+        fit (callable, optional): from recorded standardised states to an ``embed`` that depends on them.
         noise (float): white noise on every column, in typical (root mean square) steps of that column.
-        distractors (int): coordinates beside the state that move by themselves (a slow random oscillation each) and
-            are embedded with it.
-        hidden (tuple of int): columns of the state that no sensor shows.
+        distractors (int): coordinates independent of the robot, each a slow random oscillation, that are embedded
+            together with the state.
+        hidden (tuple of int): columns of the state that are not observed.
     """
 
     name: str
@@ -46,22 +46,22 @@ class Regime:
 
 
 class RegimeSensor:
-    """What a regime shows of a state: fitted to recorded data, it can be asked for the states of a rollout too.
+    """Observes states as a regime defines; it is fitted to recorded data and also observes states of rollouts.
 
     Args:
-        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``; they set the scales.
+        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``, which determine the scales.
         regime (str or Regime): a name in :data:`REGIMES`, or a regime.
 
     Keyword Args:
-        seed (int): of noise and distractors.
+        seed (int): seed of noise and distractors.
 
     Attributes:
-        recorded (Tensor): the data as they are shown without noise ``[N, c]``.
-        distractors (Tensor, optional): coordinates that move by themselves, as they did beside the data ``[N, k]``.
+        recorded (Tensor): observations of the data without noise ``[N, c]``.
+        distractors (Tensor, optional): distractors at each step of the data ``[N, k]``.
         step (Tensor): typical step of every column ``[c]``, the unit of the noise.
 
     Raises:
-        ValueError: for an unknown regime, or a state that has no such columns to hide.
+        ValueError: for an unknown regime, or a state without the columns to hide.
     """
 
     def __init__(self, data: TensorDictBase, regime: str | Regime, *, seed: int = 0):
@@ -85,11 +85,11 @@ class RegimeSensor:
         self.step = (moved.square().sum(0) / within.sum()).sqrt()
 
     def show(self, state: Tensor, distractors: Tensor | None = None) -> Tensor:
-        """What the sensor shows without noise ``[N, c]``.
+        """Returns observations without noise ``[N, c]``.
 
         Args:
             state (Tensor): states ``[N, d]``.
-            distractors (Tensor, optional): coordinates beside them ``[N, k]``.
+            distractors (Tensor, optional): distractors at these states ``[N, k]``.
 
         Raises:
             ValueError: if the regime has distractors and none are given.
@@ -107,12 +107,12 @@ class RegimeSensor:
         return seen if distractors is None else torch.cat([seen, distractors], -1)
 
     def noisy(self, shown: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The same with noise, other noise at every call.
+        """Adds noise to observations, drawn anew at every call.
 
         Args:
             shown (Tensor): from :meth:`show` ``[N, c]``.
-            generator (torch.Generator, optional): that the noise is drawn from, for noise that does not depend on what
-                was drawn before. Default: the sensor's own.
+            generator (torch.Generator, optional): source of the noise, so that it does not depend on earlier draws.
+                Default: the sensor's own generator.
         """
         if not self.regime.noise:
             return shown
@@ -121,8 +121,8 @@ class RegimeSensor:
 
 
 def _oscillations(episode: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Coordinates that oscillate at a period of 20 to 60 steps, each trajectory with its own phase and amplitude."""
-    episode = episode.cpu()  # drawn there, so that devices agree
+    """Draws oscillations with a period of 20 to 60 steps; phase and amplitude differ between trajectories."""
+    episode = episode.cpu()  # the draw is then the same for every device
     out = torch.empty(len(episode), count)
     for number in episode.unique():
         rows = episode == number
@@ -133,12 +133,12 @@ def _oscillations(episode: Tensor, count: int, generator: torch.Generator) -> Te
 
 
 def random_network(columns: int, gain: float, seed: int = 0) -> Callable[[Tensor], Tensor]:
-    r"""A fixed random layer, :math:`\tanh(\gamma (W x / \sqrt{d} + b))` with standard normal ``W`` and ``b``.
+    r"""Returns a fixed random layer, :math:`\tanh(\gamma (W x / \sqrt{d} + b))` with standard normal ``W`` and ``b``.
 
     Args:
-        columns (int): size of what it shows.
-        gain (float): :math:`\gamma`, how nonlinear it is: at 1 a state two spreads out saturates some columns.
-        seed (int): of its weights.
+        columns (int): number of output columns.
+        gain (float): nonlinearity :math:`\gamma`: at 1 a state two standard deviations out saturates some columns.
+        seed (int): seed of the weights.
     """
 
     def embed(state: Tensor) -> Tensor:
@@ -152,22 +152,22 @@ def random_network(columns: int, gain: float, seed: int = 0) -> Callable[[Tensor
 def disc_pictures(
     recorded: Tensor, *, pixels: int = PICTURE, radius: float = 2.5, kept: int = 64
 ) -> Callable[[Tensor], Tensor]:
-    """Small pictures of a bright disc at the first two coordinates, as principal components of all recorded ones.
+    """Draws small pictures of a disc at the first two coordinates; returns a map to their principal components.
 
     Args:
         recorded (Tensor): standardised states ``[N, d]``.
 
     Keyword Args:
         pixels (int): pixels along an edge. Defaults to ``32``.
-        radius (float): of the disc's soft edge, in pixels.
-        kept (int): principal components.
+        radius (float): radius of the disc's soft edge, in pixels.
+        kept (int): number of principal components.
 
     Returns:
-        callable: from standardised states ``[N, d]`` to their pictures' components ``[N, kept]``.
+        callable: from standardised states ``[N, d]`` to the components of their pictures ``[N, kept]``.
     """
 
     def draw(state: Tensor) -> Tensor:
-        place = (pixels - 1) * (0.5 + state[:, :2] / 5)  # two and a half spreads to either side
+        place = (pixels - 1) * (0.5 + state[:, :2] / 5)  # the picture spans 2.5 standard deviations to either side
         axis = torch.arange(pixels, device=state.device, dtype=state.dtype)
         profile = torch.exp(-0.5 * ((axis - place[..., None]) / radius) ** 2)  # [N, 2, pixels]
         return (profile[:, 1, :, None] * profile[:, 0, None, :]).flatten(1)

@@ -1,15 +1,15 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scooping from pixels: what demonstrations of another embodiment are worth.
+"""Measures how demonstrations of another embodiment affect success on Scooping from pixels.
 
     python benchmarks/scooping.py --folder runs/scooping
     python benchmarks/scooping.py --folder runs/scooping --methods koap linear dd --labels 2 5 20 --unlabelled both
     python benchmarks/scooping.py --folder runs/moving --task scooping_moving_bowl
 
-Records robot and hand, embeds, trains one planner per set of unlabelled demonstrations and one controller per cell, and
-rolls each out. Folder by folder what is there already is not made again, and rows of the table are not run again.
+Records robot and hand, embeds the frames, trains one planner per set of unlabelled demonstrations and one controller
+per cell, and rolls each out. Folders and rows of the table that exist are not made again.
 
-Unlabelled demonstrations are those of the robot, of the hand (then the robot's labelled ones are all there is of it),
-both, or none. Labelled ones are the robot's first: they begin at the three start positions in turn.
+Unlabelled demonstrations are those of the robot, of the hand, both, or none. With the hand or none, only labelled
+demonstrations of the robot are used. The robot's first ones are labelled; they begin at the three starts in turn.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ RESULTS = Path(__file__).parent / "results"
 Task = Literal["scooping", "scooping_moving_bowl"]
 Unlabelled = Literal["robot", "hand", "both", "none"]
 NETWORK = Projection.load(SCOOPING).about["network"]
-FEW_ROBOTS = ("hand", "none")  # the labelled demonstrations are all there are of the robot
+FEW_ROBOTS = ("hand", "none")  # sets in which all demonstrations of the robot are labelled
 METHODS = ("koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear")
 KEYS = ("labels", "unlabelled", "method", "seed", "n")
 COLUMNS = (*KEYS, "successes", "rims", "left", "near", "right", "action_error_mrad")
 
 
 def data_set(folder: Path, unlabelled: str, labels: int, task: str = "scooping") -> Path:
-    """The data set of a cell, embedded where it is not there."""
+    """Returns the data set of a cell; embeds it if it does not exist."""
     out = folder / f"data_{_name(unlabelled, labels)}"
     if not (out / "ted").is_dir():
         few = range(labels) if unlabelled in FEW_ROBOTS else ()
@@ -60,7 +60,7 @@ def data_set(folder: Path, unlabelled: str, labels: int, task: str = "scooping")
 
 
 def _name(unlabelled: str, labels: int) -> str:
-    """A set of unlabelled demonstrations, with the labels that decide what it is."""
+    """Names a set of unlabelled demonstrations, with the number of labels if the set depends on it."""
     return f"{unlabelled}_{labels}" if unlabelled in FEW_ROBOTS else unlabelled
 
 
@@ -76,7 +76,7 @@ def run_cell(
     controller_steps: int,
     evaluation: EvalConfig,
 ) -> tuple[object, ...]:
-    """Trains and rolls out one cell, and the planner that it shares where that is not there."""
+    """Trains and rolls out one cell; trains its shared planner if that does not exist."""
     dataset = str(data_set(folder, unlabelled, labels, task))
     planner = PlannerConfig(steps=steps)
     if get_method(method).plans:
@@ -126,17 +126,17 @@ def main(
     """Runs the cells that the table of the task lacks.
 
     Args:
-        folder: where to record, embed and train.
-        task: each has a folder and a table of its own.
-        demonstrations: of each embodiment.
-        methods: what is compared.
+        folder: folder for recordings, embeddings and runs.
+        task: task; use another folder for each.
+        demonstrations: number of demonstrations per embodiment.
+        methods: methods to compare.
         labels: numbers of labelled demonstrations.
-        unlabelled: whose others there are besides.
-        seeds: of training.
+        unlabelled: embodiments of the unlabelled demonstrations.
+        seeds: training seeds.
         episodes: rollouts per cell.
         steps: planner updates.
         controller_steps: controller updates.
-        fit: make the package's projection anew and stop.
+        fit: fit the package's projection again and stop.
         results: folder of the table.
     """
     for name in methods:

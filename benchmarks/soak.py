@@ -1,11 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Plays many episodes of Avoiding in one process and watches its memory: an endurance test.
+"""Plays many episodes of Avoiding in one process and records the memory of the process.
 
     python benchmarks/soak.py --run quick --episodes 10000 --table benchmarks/results/soak.csv
     python benchmarks/soak.py --run quick --episodes 1000 --batch-size 1000 --table benchmarks/results/soak_wide.csv
 
-``--run quick`` is a policy of a few kilobytes that plans in no time: episodes are the load. The same command goes on
-where its table ends, in a process that has a number of its own there, as its memory is its own.
+``--run quick`` trains a policy of a few kilobytes, whose planning time is negligible compared with the episodes. The
+same command resumes where its table ends. The table numbers processes, because memory is measured per process.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ COLUMNS = ("process", "episodes", "seconds", "resident_mb", "largest_mb")
 
 
 def resident() -> float:
-    """Memory of this process at present, in MB."""
+    """Returns the present memory of this process in MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 1e6
 
 
 def largest() -> float:
-    """The most memory this process ever had, in MB."""
+    """Returns the largest memory of this process so far in MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 def quick_run(folder: str) -> str:
-    """A run that was trained for a moment: it fails, and plans in no time."""
+    """Trains a tiny run, which plans fast and does not solve the task; returns its folder."""
     data = write_demonstrations(Path(folder) / "data")
     if koap("train", "--out", f"{folder}/run", "--dataset", data, *TINY, "--quiet"):
         raise SystemExit("the quick run could not be trained")
@@ -54,7 +54,7 @@ def quick_run(folder: str) -> str:
 
 
 def play(episodes: range, batch_size: int, run: str) -> Iterator[tuple[float, ...]]:
-    """Episodes, seconds and memory after each batch; nothing of an episode is kept."""
+    """Yields episodes, seconds and memory after each batch; keeps no episode."""
     task = get_task("avoiding")
     policy, make = load_policy(find_run(run)), partial(make_env, task, max_steps=task.max_steps, noisy=True)
     began = time.perf_counter()
@@ -65,13 +65,13 @@ def play(episodes: range, batch_size: int, run: str) -> Iterator[tuple[float, ..
 
 
 def main(*, table: Path, run: str = "pretrained:avoiding", episodes: int = 1000, batch_size: int = 50) -> None:
-    """Plays what the table does not hold yet.
+    """Plays the episodes that the table lacks.
 
     Args:
-        table: where to append a row after each batch.
+        table: CSV file that gets a row after each batch.
         run: run directory, pretrained:NAME or quick.
-        episodes: how many in all.
-        batch_size: how many at a time.
+        episodes: episodes in total.
+        batch_size: episodes at a time.
     """
     torch.set_num_threads(1)
     done, write = open_table(table, COLUMNS, COLUMNS[:2])

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Figures of the committed CSV files as cells and tables of the pages in docs/results, and how studies write them."""
+"""Formats figures of the committed CSV files for the pages in docs/results; reads and writes the tables of studies."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ def columns(rows: Sequence[Row], **cells: str) -> str:
     """Formats a markdown table with a column per keyword.
 
     Args:
-        rows (sequence of mapping): its rows.
+        rows (sequence of mapping): rows of a CSV file.
         **cells: heading, with ``_`` for a space, to a format string of the row's columns, such as
-            ``"{error} ({low}-{high})"``. ``{percent}`` is the success with its interval, ``{paired}`` the difference
-            with its interval where there is one; whole numbers may be formatted as such (``"{steps:,}"``).
+            ``"{error} ({low}-{high})"``. ``{percent}`` is the success with its interval. ``{paired}`` is the
+            difference with its interval, or empty. Whole numbers take formats of integers (``"{steps:,}"``).
     """
     body = []
     for row in rows:
@@ -72,7 +72,7 @@ def columns(rows: Sequence[Row], **cells: str) -> str:
 
 
 def total(rows: Sequence[Row], **first: str) -> list[dict[str, str]]:
-    """Adds a row with the sums of all columns that are whole numbers, and ``first`` in the others."""
+    """Adds a row with the sums of all columns of whole numbers and the entries ``first``."""
     sums = {name: str(sum(int(row[name]) for row in rows)) for name in rows[0] if rows[0][name].isdigit()}
     return [*map(dict, rows), dict.fromkeys(rows[0], "") | sums | first]
 
@@ -93,29 +93,29 @@ def fact(key: str, form: str = "") -> str:
 
 
 def kills(rows: Sequence[Row]) -> list[dict[str, str]]:
-    """Counts disturbed runs, signals, runs equal to an undisturbed one and files left over, by command."""
-    made = []
+    """Counts disturbed runs, signals, runs equal to an undisturbed one and leftover files, by command."""
+    counts = []
     for command in dict.fromkeys(row["command"] for row in rows):
-        mine = [row for row in rows if row["command"] == command]
-        made.append(
+        found = [row for row in rows if row["command"] == command]
+        counts.append(
             {
                 "command": f"`{command}`",
-                "runs": str(len(mine)),
-                "kills": str(sum(len(row["signals"].split()) for row in mine)),
-                "equal": str(sum(row["equal"] == "yes" for row in mine)),
-                "leftovers": str(sum(int(row["leftovers"]) for row in mine)),
+                "runs": str(len(found)),
+                "kills": str(sum(len(row["signals"].split()) for row in found)),
+                "equal": str(sum(row["equal"] == "yes" for row in found)),
+                "leftovers": str(sum(int(row["leftovers"]) for row in found)),
             }
         )
-    return total(made, command="all")
+    return total(counts, command="all")
 
 
 def every(rows: Sequence[Row], count: int = 4) -> list[Row]:
-    """Picks the first row, the last, and a few between."""
+    """Returns the first row, the last, and evenly spaced rows between them."""
     return [*rows[: -1 : max(1, len(rows) // count)], rows[-1]]
 
 
 def commands(rows: Sequence[Row]) -> str:
-    """Formats the commands that made some rows as a block of code."""
+    """Formats the commands that produced the rows as a code block."""
     lines = dict.fromkeys(row["command"] for row in rows if row["command"])
     return "```bash\n" + "\n".join(lines) + "\n```"
 
@@ -123,15 +123,15 @@ def commands(rows: Sequence[Row]) -> str:
 def open_table(
     table: Path, columns: Sequence[str], keys: Sequence[str]
 ) -> tuple[set[tuple[str, ...]], Callable[[Sequence[object]], None]]:
-    """What a table holds already, and a function that adds a row; a new table gets its header.
+    """Returns the keys of a table's rows and a function that appends a row; creates the table if needed.
 
     Args:
-        table (Path): the file; its folder is made if it is not there.
-        columns (sequence of str): of the table.
-        keys (sequence of str): columns that tell cells of the study apart.
+        table (Path): the file; its folder is created if it does not exist.
+        columns (sequence of str): columns of the table.
+        keys (sequence of str): columns that identify a cell of the study.
 
     Returns:
-        tuple: the keys of the rows that are there, and the function.
+        tuple: the keys of the existing rows, and the function.
     """
     done: set[tuple[str, ...]] = set()
     if table.exists():
@@ -149,7 +149,7 @@ def open_table(
 
 
 def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes the rows of a study as a CSV file, in place of what is there."""
+    """Writes the rows of a study as a CSV file; replaces an existing file."""
     with file.open("w", newline="", encoding="utf-8") as out:
         writer = csv.DictWriter(out, rows[0], lineterminator="\n")
         writer.writeheader()

@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Success in closed loop against training time, written to ``benchmarks/results/time_to_policy.csv``.
+"""Measures success in closed loop by training time; writes ``benchmarks/results/time_to_policy.csv``.
 
     koap demos --task sorting --episodes 1000 --seed 0 --out runs/sorting-data
     OMP_NUM_THREADS=1 python benchmarks/time_to_policy.py sorting runs/sorting-data --fraction 0.01 --steps 3000 8000
 
-Every number of updates is a training of its own, with its own schedule of the learning rate and the task's defaults
-for the rest. Seconds are those of one core, for planner and controller together. Rollouts are 60 fixed contexts with
-three seeds of noise each. What is in the table is not run again.
+Every number of updates is a separate training with its own learning rate schedule; other options are the task's
+defaults. Seconds are those of one core, for planner and controller together. Rollouts use 60 fixed contexts with three
+noise seeds each. Rows of the table are not run again.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ def main(
     folder: Path = Path("runs/time_to_policy"),
     results: Path = RESULTS,
 ) -> None:
-    """Trains with each number of updates and rolls out.
+    """Trains with each number of updates and rolls each policy out.
 
     Args:
         task: name of the task.
-        dataset: its demonstrations.
-        steps: updates of the planner, at most.
-        count: trajectories whose labels may be seen.
-        fraction: share of the windows whose labels may be seen, instead.
-        method: what is trained (default: the task's).
+        dataset: demonstrations of the task.
+        steps: maximum numbers of planner updates.
+        count: number of labelled trajectories.
+        fraction: share of labelled windows, instead of count.
+        method: method to train (default: the task's).
         network: network of the planner (default: the task's).
-        held_out: share of the trajectories that the weights are chosen by (default: the task's).
-        learning_rate: its peak, of the planner (default: the network's).
-        seed: of the training.
-        folder: where to train.
+        held_out: share of the trajectories held out to choose the weights (default: the task's).
+        learning_rate: peak learning rate of the planner (default: the network's).
+        seed: training seed.
+        folder: folder of the runs.
         results: the table.
     """
     torch.set_num_threads(1)

@@ -1,16 +1,16 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Speed of training and planning on one core, written to ``benchmarks/results``.
+"""Measures the speed of training and planning on one core; writes tables in ``benchmarks/results``.
 
     OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner
     OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part precision
     OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part loop
     python benchmarks/training_speed.py --part cuda
 
-Controller: every preset of KOAP, batches of 256 windows of 16 frames (17 for "semi_supervised"), sampling included.
-Planner: the default U-Net on 256 windows, and one plan and 60. Precision: updates of wide MLPs with matrix products in
-float32 and bfloat16, which a processor without units for it emulates. Loop: the whole training loop beside a bare one
-around the same network, as it is and compiled, by turns. CUDA: the whole training loop on a GPU, windows
-and augmentation included, step by step, with a compiled denoiser, and with the update replayed as a graph.
+controller: every preset of KOAP, batches of 256 windows of 16 frames (17 for "semi_supervised"), sampling included.
+planner: updates of the default U-Net with 256 windows, and batches of 1 and 60 plans. precision: updates of wide MLPs
+with matrix products in float32 and bfloat16, which some processors emulate. loop: the training loop compared with bare
+updates of the same network, eager and compiled. cuda: the training loop on a GPU, windows and augmentation included:
+eager, with a compiled denoiser, and with updates replayed as a CUDA graph.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ SIZES = ((512, 4, 512), (512, 4, 256), (256, 3, 128))  # width, residual layers,
 
 
 def median_seconds(call: Callable[[], object], repeats: int, warm_up: int = 2) -> float:
-    """Median time of a call."""
+    """Returns the median time of a call in seconds."""
     times = []
     for index in range(warm_up + repeats):
         began = time.perf_counter()
@@ -68,7 +68,7 @@ def median_seconds(call: Callable[[], object], repeats: int, warm_up: int = 2) -
 
 
 def update_of(loss: LossModule, batches: Callable[[], TensorDict]) -> Callable[[], None]:
-    """One update: loss, gradients, AdamW (fused)."""
+    """Returns a function that makes one update: loss, gradients, AdamW (fused)."""
     optimizer = torch.optim.AdamW(loss.parameters(), lr=3e-4, fused=True)
 
     def update() -> None:
@@ -81,12 +81,12 @@ def update_of(loss: LossModule, batches: Callable[[], TensorDict]) -> Callable[[
 
 
 def size_of(module: torch.nn.Module) -> int:
-    """Number of parameters."""
+    """Returns the number of parameters."""
     return sum(parameter.numel() for parameter in module.parameters())
 
 
 def controllers(repeats: int) -> Iterable[tuple[object, ...]]:
-    """A row per preset of KOAP, for states and actions of Avoiding."""
+    """Yields a row per preset of KOAP, for states and actions of Avoiding."""
     torch.manual_seed(0)
     paths = [torch.randn(81, 4).cumsum(0) * 0.01 for _ in range(96)]
     data = select_state(flatten_trajectories(paths, [path[1:, :2] - path[:-1, :2] for path in paths]), (2, 3))
@@ -100,7 +100,7 @@ def controllers(repeats: int) -> Iterable[tuple[object, ...]]:
 
 
 def planners(repeats: int) -> Iterable[tuple[object, ...]]:
-    """A row for the default planner of Avoiding."""
+    """Yields a row for the default planner of Avoiding."""
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, num_steps=10)
     windows = TensorDict({"state": torch.randn(256, planner.history + planner.horizon, 2).cumsum(1)}, [256])
@@ -116,7 +116,7 @@ def planners(repeats: int) -> Iterable[tuple[object, ...]]:
 
 
 def wide_update(width: int, depth: int, batch: int, dtype: torch.dtype | None) -> Callable[[], None]:
-    """An update of a wide MLP planner for 19 columns, with matrix products of a number type."""
+    """Returns an update of a wide MLP planner for 19 columns with matrix products in ``dtype``."""
     torch.manual_seed(0)
     planner = StatePlanner(MLPDenoiser(19, 38, horizon=14, width=width, depth=depth), state_dim=19, horizon=14)
     windows = TensorDict({"state": torch.randn(batch, 16, 19).cumsum(1)}, [batch])
@@ -125,12 +125,12 @@ def wide_update(width: int, depth: int, batch: int, dtype: torch.dtype | None) -
 
 
 def make_denoiser(network: str) -> torch.nn.Module:
-    """A network of a planner for 19 columns."""
+    """Returns a planner's network for 19 columns."""
     return MLPDenoiser(19, 38, horizon=14) if network == "mlp" else TemporalUnet(19, 38)
 
 
 def loop_rate(network: str, *, device: str, replay: bool = False, compiled: bool = False) -> float:
-    """Updates per second of the training loop after its first hundred, in bfloat16, for 19 columns."""
+    """Returns updates per second of the training loop in bfloat16 for 19 columns, without the first 100."""
     torch.manual_seed(0)
     denoiser = make_denoiser(network)
     planner = StatePlanner(denoiser, state_dim=19)
@@ -151,14 +151,14 @@ def loop_rate(network: str, *, device: str, replay: bool = False, compiled: bool
         learning_rate=1e-3,
         target_update=moving_average(loss, UPDATES),
         replay=replay,
-        log_every=100,  # reads the losses, so that the GPU is waited for
+        log_every=100,  # reading the losses waits for the GPU
         progress=lambda done, values: times.append(time.perf_counter()) if done % 100 == 0 else None,
     )
     return (UPDATES - 100) / (times[-1] - times[0])
 
 
 def bare_update(network: str, *, compiled: bool) -> Callable[[], None]:
-    """An update of the network of :func:`loop_rate` with nothing around it: noise, squared error, AdamW."""
+    """Returns a minimal update of the network of :func:`loop_rate`: noise, squared error, AdamW."""
     torch.manual_seed(0)
     denoiser = make_denoiser(network)
     if compiled:
@@ -177,7 +177,7 @@ def bare_update(network: str, *, compiled: bool) -> Callable[[], None]:
 
 
 def beside_bare() -> None:
-    """Writes a row per network: milliseconds of an update of the loop and of bare ones, and shares of their rates."""
+    """Writes a row per network: times of an update in the loop and of bare updates (ms), and their ratios."""
     known = (torch.cpu.get_capabilities()["cpu_name"], int(has_bfloat16_units()))
     done, write = open_table(RESULTS / "training_loop.csv", LOOP, LOOP[:4])
     for network in ("mlp", "unet"):
@@ -201,7 +201,7 @@ def beside_bare() -> None:
 
 
 def on_gpu() -> None:
-    """Writes a row per network with the rates on the GPU that is there, and on one core of its machine."""
+    """Writes a row per network with the rates on the GPU of this machine and on one of its cores."""
     device = torch.cuda.get_device_name()
     done, write = open_table(RESULTS / "training_speed_cuda.csv", CUDA, CUDA[:4])
     for network in ("mlp", "unet"):
@@ -215,10 +215,10 @@ def on_gpu() -> None:
 
 
 def main(*, part: tuple[Literal["controller", "planner", "precision", "loop", "cuda"], ...], repeats: int = 40) -> None:
-    """Measures what the tables lack.
+    """Measures the rows that the tables lack.
 
     Args:
-        part: what to measure.
+        part: parts to measure.
         repeats: calls of which the median is taken.
     """
     torch.set_num_threads(1)

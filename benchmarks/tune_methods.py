@@ -1,13 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which execution and how many updates suit each method, on demonstrations that no table uses.
+"""Scores executions and numbers of updates for each method, on demonstrations that no table uses.
 
     koap demos --task avoiding --episodes 96 --seed 7 --out runs/tuning_avoiding
     python benchmarks/tune_methods.py avoiding runs/tuning_avoiding --labels 0.02 0.1
     python benchmarks/tune_methods.py pusht runs/tuning_pusht --labels 10  # writes the first hundred demonstrations
 
-A method's own defaults (:class:`~torchrl_koap.training.Method`) come from these rows. All methods of a task share one
-planner. Avoiding scores success from start seeds of its own, Push-T the mean largest reward. What is in the table is
-not run again.
+The defaults of methods (:class:`~torchrl_koap.training.Method`) are chosen by these rows. All methods of a task share
+one planner. The score is the success rate on Avoiding, with seeds that no table uses, and the mean largest reward on
+Push-T. Rows of the table are not run again.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ METHODS = (
 
 
 def score(task: str, trained: Trained, execution: ExecutionConfig) -> float:
-    """Rolls a policy out: success on Avoiding, the mean largest reward on Push-T."""
+    """Rolls a policy out; returns the success rate on Avoiding, the mean largest reward on Push-T."""
     if task == "pusht":
         result = roll(pusht.GROUNDS["pusht"], trained, execution, N, first_seed=PUSHT_SEED)
         return float(result["largest_reward"])
@@ -72,15 +72,15 @@ def main(
     folder: Path = Path("runs/tuning"),
     results: Path = RESULTS,
 ) -> None:
-    """Trains each method with each number of updates and scores it by each execution.
+    """Trains each method with each number of updates and scores it with each execution.
 
     Args:
-        task: where to tune.
-        dataset: its demonstrations; those of Push-T are written where there are none.
-        labels: share of the windows (below 1) or number of the demonstrations whose labels may be seen.
-        methods: what is trained.
-        updates: of the controllers; methods that are fitted in closed form alone have one.
-        folder: where to train.
+        task: task to tune on.
+        dataset: demonstrations of the task; those of Push-T are written if they do not exist.
+        labels: share of labelled windows (below 1) or number of labelled demonstrations.
+        methods: methods to train.
+        updates: controller updates; methods fitted in closed form alone use the first.
+        folder: folder of the runs.
         results: the table.
     """
     torch.set_num_threads(1)

@@ -1,20 +1,19 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Where unlabelled data pay: controllers against labelled trajectories, by what is observed.
+"""Compares controllers by number of labelled trajectories under several observation models.
 
     koap demos --out runs/avoiding96 --episodes 96 --seed 11
     python benchmarks/unlabelled.py --dataset runs/avoiding96 --observed plain noise wide_64 --rollouts
     python benchmarks/unlabelled.py --dataset runs/stacking --observed joints_hidden
 
-Every method sees the same observations (with noise in training and in the trajectories it is judged on) and the same
-labelled trajectories, and all other trajectories without labels. The error is that of one decoded action on 24
-other trajectories, whose actions are read for it alone. With ``--rollouts`` the same controllers drive the simulated
-robot of Avoiding along demonstrations not seen before: at every step the plan is what the demonstration did next, as
-the sensor showed it, bent towards the present observation as the library's policies do; what the controller sees of
-the robot goes through the same sensor, with fresh noise, the same for every controller of a seed.
+All methods get the same observations, with noise in training and test trajectories, the same labelled trajectories and
+all other trajectories without labels. The error is that of one decoded action on 24 test trajectories, whose actions
+only this error reads. With ``--rollouts`` the controllers follow held-out demonstrations in the simulation of Avoiding.
+At every step the plan is the continuation of the observed demonstration, blended with the present observation as the
+library's policies do. The same sensor observes the robot, with fresh noise that is the same for every controller of a
+seed.
 
-What is trained without labels is trained once for all numbers of labelled trajectories of a seed: the weights are those
-that separate trainings would give, for no label is read before the closed form at the end. Rows are appended to the
-tables as they are known; what is there already is not run again.
+Methods trained without labels are trained once per seed for all numbers of labelled trajectories. Separate trainings
+would give the same weights, since only the final closed-form fit reads labels. Rows of the tables are not run again.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ RESULTS = Path(__file__).parent / "results"
 KEYS = ("dataset", "regime", "labels", "seed", "method")
 ERRORS = (*KEYS, "error", "unit", "choice", "updates")
 ROLLOUTS = (*KEYS, "blend_decay", "n", "successes", "collisions", "distance_mm")
-# what --methods calls them: method, preset, updates, does training read labels
+# name for --methods: method, preset, updates, whether training reads labels
 METHODS = {
     "semi_supervised": ("koap", "semi_supervised", 1000, False),
     "semi_supervised, untrained": ("koap_untrained", "semi_supervised", 0, False),
@@ -63,20 +62,20 @@ METHODS = {
     "dd_lookahead": ("dd_lookahead", None, 500, True),
 }
 OBSERVED = REGIMES | {"joints_hidden": Regime("joints_hidden", "Stacking, joints hidden", hidden=tuple(range(7)))}
-JUDGED = 24  # trajectories, the last of a seed's order, on which the error of controllers is measured
+JUDGED = 24  # test trajectories for the error of controllers: the last ones in the order of a seed
 HORIZON = 14
-NOISE_SEED = 2000  # plus the seed: noise of the rollouts, apart from that of the demonstrations
+NOISE_SEED = 2000  # added to the seed, so that the noise of rollouts differs from that of demonstrations
 SPARE = 40  # control steps that a rollout may take longer than its demonstration
 Cell = tuple[str, int]  # method, number of labelled trajectories
 
 
 def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
-    """Flat data with the robot's own columns as ``state``, and targets, but no commands, as distances from it."""
+    """Returns flat data with the robot's columns as ``state``; targets, but not commands, become distances."""
     return controller_data(task, ControllerConfig(columns="robot"), data)
 
 
 def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
-    """Flat data with what the robot's controller could read as ``state``, and the unit of its actions."""
+    """Returns flat data with the columns that a controller may read as ``state``, and the unit of the actions."""
     data, task = open_dataset(dataset)
     if task.source == "stacking":  # joints, gripper, tool; the gripper's action has no unit and is left out
         data = data.copy().set("state", data["state"][:, :11]).set("action", data["action"][:, :7])
@@ -86,7 +85,7 @@ def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
 
 
 def as_own_data(data: TensorDictBase) -> tuple[TensorDictBase, Task]:
-    """The data as those of a robot about which nothing is known, with all labels."""
+    """Converts the data, with all labels, to those of a robot without a registered task; returns data and task."""
     parts = [data[data["episode"] == number] for number in data["episode"].unique()]
     states, actions = ([part[key].numpy() for part in parts] for key in ("state", "action"))
     made, task = make_demonstrations(states, actions, control_hz=30)
@@ -94,13 +93,13 @@ def as_own_data(data: TensorDictBase) -> tuple[TensorDictBase, Task]:
 
 
 def with_labels(data: TensorDictBase, episodes: torch.Tensor) -> TensorDictBase:
-    """The data with the actions of some trajectories alone."""
+    """Returns the data with the actions of the given trajectories only."""
     kept = data["has_action"] & torch.isin(data["episode"], episodes)[:, None]
     return data.copy().set("has_action", kept).set("action", data["action"].where(kept, torch.nan))
 
 
 def refit(controller: InverseDynamics, data: TensorDictBase, task: Task) -> tuple[InverseDynamics, dict]:
-    """The closed form of a controller on other labels."""
+    """Repeats the closed-form fit of a copied controller on other labels; returns it and the fit's report."""
     controller = copy.deepcopy(controller)
     mode = Normalizer.fit(data["action"], mode="rms", mask=data["has_action"])
     controller.action_normalizer.load_state_dict(mode.state_dict())
@@ -108,22 +107,22 @@ def refit(controller: InverseDynamics, data: TensorDictBase, task: Task) -> tupl
 
 
 def choice_of(controller: InverseDynamics, found: dict) -> str:
-    """What the held-out labelled error chose."""
+    """Returns the block or the number of components chosen by the held-out error on labels."""
     gate = getattr(controller, "gate", None)
     return found.get("block", "") if gate is None else str(int(gate.sum()))
 
 
 def controllers(full: TensorDictBase, task: Task, numbers: torch.Tensor, seed: int, wanted: list[Cell]):
-    """Trained controllers by method and number of labelled trajectories, the first of ``numbers``.
+    """Trains a controller per method and number of labelled trajectories, the first of ``numbers``.
 
     Yields:
-        tuple: method, labelled trajectories, controller, what fitting it reported, updates.
+        tuple: method, labelled trajectories, controller, report of the fit, updates.
     """
     last, trained = None, None
     for method, labels in wanted:
         kind, preset, updates, reads_labels = METHODS[method]
         if preset == "semi_supervised" and full["state"].shape[-1] <= 8:
-            updates = 0  # the state is its own lifting: nothing that is trained would be read
+            updates = 0  # narrow states are their own lifting, so that no trained weight is used
         part = with_labels(full, numbers[:labels])
         if last != method or reads_labels:
             options = {"steps": updates} | ({"preset": preset} if preset else {})
@@ -135,20 +134,20 @@ def controllers(full: TensorDictBase, task: Task, numbers: torch.Tensor, seed: i
 
 
 def shuffled_trajectories(data: TensorDictBase, seed: int) -> torch.Tensor:
-    """Numbers of the trajectories in the order of a seed: the first ones get labels, the last ones are judged."""
+    """Shuffles the trajectory numbers by a seed: the first ones get labels, the last ones are for testing."""
     numbers, generator = data["episode"].unique(), torch.Generator().manual_seed(seed)
     return numbers[torch.randperm(len(numbers), generator=generator)]
 
 
 def error_row(controller: InverseDynamics, full: TensorDictBase, numbers: torch.Tensor, unit: str) -> tuple[str, str]:
-    """Error of one decoded action, and its unit."""
+    """Returns the error of one decoded action, and its unit."""
     predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
     shown, factor = thousandths(unit)
     return f"{factor * (predicted - true).square().mean().sqrt().item():.4f}", shown
 
 
 def padded(paths: list[torch.Tensor], length: int) -> torch.Tensor:
-    """Paths as ``[E, length, ...]``, their last row repeated."""
+    """Stacks paths as ``[E, length, ...]``, padded by their last row."""
     return torch.stack([path[torch.arange(length).clamp_max(len(path) - 1)] for path in paths])
 
 
@@ -165,17 +164,17 @@ def follow(
     """Rolls out one episode per demonstration.
 
     Args:
-        controller (InverseDynamics): reads windows of what the sensor shows.
-        sensor (RegimeSensor): of the regime.
-        shown (TensorDictBase): flat data with the recorded positions as ``observation``, what the sensor showed of them
-            as ``state``, and ``distractors`` where the regime has some.
-        task (Task): has the environment; the robot's position is what the sensor is asked for.
+        controller (InverseDynamics): controller that reads windows of sensor observations.
+        sensor (RegimeSensor): sensor of the regime.
+        shown (TensorDictBase): flat data with the recorded positions as ``observation``, their sensor observations as
+            ``state``, and ``distractors`` if the regime has any.
+        task (Task): task of the environment; the sensor observes the robot's position.
         episodes (Tensor): numbers of the demonstrations.
-        decay (float): with which plans are bent towards the present observation.
-        seed (int): of the noise on what is observed.
+        decay (float): decay of the blend of plans with the present observation.
+        seed (int): seed of the observation noise.
 
     Returns:
-        dict: successes, collisions, mean distance to the demonstration over the steps of running episodes (mm).
+        dict: successes, collisions, mean distance to the demonstration while episodes run (mm).
     """
     parts = [shown[shown["episode"] == number] for number in episodes]
     steps = max(len(part) for part in parts) + SPARE
@@ -216,16 +215,16 @@ def run_seed(data, source: Task, unit: str, regime: Regime, seed: int, judges, f
 
     Args:
         data (TensorDictBase): flat data with the recorded positions as ``state``.
-        source (Task): has the environment.
-        unit (str): of its actions.
-        regime (Regime): what is observed.
-        seed (int): of labels, noise and training.
-        judges (list of tuple): methods and numbers of labelled trajectories whose error is measured.
-        follows (list of tuple): those that are rolled out.
-        judged (int): demonstrations that are followed.
+        source (Task): task of the environment.
+        unit (str): unit of the actions.
+        regime (Regime): observation model.
+        seed (int): seed of labels, noise and training.
+        judges (list of tuple): cells (method, labelled trajectories) whose error is measured.
+        follows (list of tuple): cells that are rolled out.
+        judged (int): number of demonstrations to follow.
 
     Yields:
-        tuple: the cell, its columns of the table of errors or None, what :func:`follow` found or None.
+        tuple: the cell, its columns of the table of errors or None, the result of :func:`follow` or None.
     """
     wanted = list(dict.fromkeys([*judges, *follows]))  # each is trained once
     wanted.sort(key=lambda cell: (list(METHODS).index(cell[0]), cell[1]))
@@ -235,7 +234,7 @@ def run_seed(data, source: Task, unit: str, regime: Regime, seed: int, judges, f
     seen = data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
     full, task = as_own_data(seen)
     numbers = shuffled_trajectories(full, seed)
-    places = torch.unique(data["episode"], return_inverse=True)[1]  # as data of one's own are numbered
+    places = torch.unique(data["episode"], return_inverse=True)[1]  # as in as_own_data
     shown = seen.copy().set("observation", data["state"]).set("episode", places)
     if sensor.distractors is not None:
         shown["distractors"] = sensor.distractors
@@ -262,31 +261,31 @@ def main(
     trajectories: int = 96,
     folder: Path = RESULTS,
 ) -> None:
-    """Runs what the tables lack.
+    """Runs the cells that the tables lack.
 
     Args:
         dataset: folder written by koap demos.
-        observed: what is observed, names of benchmarks/regimes.py or joints_hidden.
-        methods: what is compared.
-        labels: labelled trajectories.
-        seeds: of labels, noise and training.
-        rollouts: roll the controllers out as well.
-        judged: demonstrations followed per seed.
-        trajectories: demonstrations used at most.
-        folder: of the tables.
+        observed: observation models: names of benchmarks/regimes.py or joints_hidden.
+        methods: methods to compare.
+        labels: numbers of labelled trajectories.
+        seeds: seeds of labels, noise and training.
+        rollouts: also roll the controllers out.
+        judged: demonstrations to follow per seed.
+        trajectories: maximum number of demonstrations.
+        folder: folder of the tables.
     """
     for name, known in ((name, METHODS) for name in methods):
         lookup(known, name, "method")
     regimes = [lookup(OBSERVED, name, "observation setting") for name in observed]
     source = find_task_of(dataset)
     if rollouts and source.name != "avoiding":
-        raise ValueError(f"{dataset} holds demonstrations of {source.name}: Avoiding's alone need no objects")
+        raise ValueError(f"{dataset} holds demonstrations of {source.name}: rollouts are for Avoiding alone")
     warnings.filterwarnings("ignore", category=UserWarning)
     torch.set_num_threads(1)
     data, unit = load_positions(str(dataset), trajectories)
     needed = max(JUDGED, judged if rollouts else 0) + max(labels)
     if len(data["episode"].unique()) < needed:
-        raise ValueError(f"{dataset} has fewer than {needed} demonstrations, those that are judged and labelled")
+        raise ValueError(f"{dataset} has fewer than {needed} demonstrations, the sum of tested and labelled ones")
     known, write_error = open_table(folder / "unlabelled_data.csv", ERRORS, KEYS)
     done, write = open_table(folder / "unlabelled_rollouts.csv", ROLLOUTS, KEYS) if rollouts else (set(), None)
     cells = list(product(methods, labels))

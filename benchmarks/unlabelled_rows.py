@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Tables and picture of docs/results/unlabelled_data.md: reductions of the error and successes in closed loop."""
+"""Formats tables and draws the picture of docs/results/unlabelled_data.md: errors and success in closed loop."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Cells = dict[tuple[str, int], dict[int, float]]  # method and labelled trajector
 
 
 def unlabelled_errors(regime: str) -> Cells:
-    """Action errors of an observation setting by method and number of labelled trajectories, then by seed."""
+    """Reads action errors of an observation setting by method and labelled trajectories, then by seed."""
     found: Cells = {}
     for row in read_rows("unlabelled_data", regime=regime):
         found.setdefault((row["method"], int(row["labels"])), {})[int(row["seed"])] = float(row["error"])
@@ -43,7 +43,7 @@ def unlabelled_errors(regime: str) -> Cells:
 
 
 def unlabelled_successes(regime: str) -> Cells:
-    """Shares of rollouts of an observation setting that succeed, by method and labelled trajectories, then by seed."""
+    """Reads success rates of an observation setting by method and labelled trajectories, then by seed."""
     found: Cells = {}
     for row in read_rows("unlabelled_rollouts", regime=regime):
         cell = found.setdefault((row["method"], int(row["labels"])), {})
@@ -52,11 +52,11 @@ def unlabelled_successes(regime: str) -> Cells:
 
 
 def gains_table(regimes: Sequence[str], **against: str) -> str:
-    """Formats how much smaller the error of ``semi_supervised`` is, in percent, paired by seed, with a 95 % t-interval.
+    """Formats the error reduction of ``semi_supervised`` in percent, paired by seed, with a 95 % t-interval.
 
     Args:
-        regimes (sequence of str): observation settings, a row for each and number of labelled trajectories.
-        **against: heading of a column to the method that it is compared with.
+        regimes (sequence of str): observation settings; each has a row per number of labelled trajectories.
+        **against: heading of a column to the method compared with.
     """
     body = []
     for regime in regimes:
@@ -71,7 +71,7 @@ def gains_table(regimes: Sequence[str], **against: str) -> str:
 
 
 def successes_table(methods: Sequence[str]) -> str:
-    """Formats successes in closed loop, and how much ``semi_supervised`` is ahead (percentage points, paired by seed).
+    """Formats success in closed loop, and the lead of ``semi_supervised`` in percentage points, paired by seed.
 
     Args:
         methods (sequence of str): columns besides ``semi_supervised``.
@@ -93,18 +93,18 @@ def successes_table(methods: Sequence[str]) -> str:
 
 
 def followed(regime: str, labels: int, method: str) -> str:
-    """Formats how often demonstrations not seen before were followed to the end, over all seeds."""
+    """Formats the share of held-out demonstrations followed to the end, over all seeds."""
     rows = read_rows("unlabelled_rollouts", regime=regime, labels=labels, method=method)
     counts = {key: sum(int(row[key]) for row in rows) for key in ("successes", "n")}
     return f"{percent(counts, 0)} of {counts['n']}"
 
 
 def paired_gain(gains: Sequence[float], unit: str = "%") -> str:
-    """Formats the mean of some gains with its 95 % t-interval; no interval below three.
+    """Formats the mean of gains with its 95 % t-interval; fewer than three gains have no interval.
 
     Args:
         gains (sequence of float): one per seed.
-        unit (str): what they are called, such as percentage ``"points"``.
+        unit (str): unit of the gains, such as percentage ``"points"``.
     """
     if len(gains) < 3:
         return f"{statistics.fmean(gains):+.0f} {unit} ({len(gains)} seeds)" if gains else "not run"
@@ -114,7 +114,7 @@ def paired_gain(gains: Sequence[float], unit: str = "%") -> str:
 
 
 def draw_unlabelled(path: Path) -> Path:
-    """Draws mean action errors above success in closed loop, a column per observation setting, as png."""
+    """Draws a png: mean action errors above success in closed loop, a column per observation setting."""
     errors, successes = ({name: cells(name) for name in REGIMES} for cells in (unlabelled_errors, unlabelled_successes))
     names = [name for name, cells in errors.items() if cells]
     figure = Figure(figsize=(2.5 * len(names), 5.2))
@@ -147,7 +147,7 @@ def draw_unlabelled(path: Path) -> Path:
 
 
 def _draw_lines(axis: Axes, cells: Cells) -> None:
-    """A line per method; the range over seeds for the method itself alone, or they would hide each other."""
+    """Draws a line per method; only ``semi_supervised`` has its range over seeds, as ranges would overlap."""
     for method, (color, line, marker) in _LOOKS.items():
         points = sorted((number, list(seeds.values())) for (name, number), seeds in cells.items() if name == method)
         if not points:

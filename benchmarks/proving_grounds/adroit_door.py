@@ -2,8 +2,8 @@
 """Adroit door: a hand of 28 actuators unlatches and opens a door; 25 human demonstrations with a data glove.
 
 The demonstrations are those of Rajeswaran et al. 2018 (Apache-2.0). Actions are normalised targets of the actuators.
-The hand's first joint is in no column; the place of the palm shows it. All demonstrations open the door by 1 rad; 7 of
-25 reach the 1.35 rad that the simulator calls success, 8 when their actions are replayed. A ground for each angle.
+No column holds the hand's first joint; the position of the palm reflects it. All demonstrations open the door by 1 rad.
+7 of 25 reach 1.35 rad, the simulator's success, 8 when their actions are replayed. Each angle is a separate ground.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchrl_koap.data import save_demonstrations
 
 DATA = SHARED / "adroit_door_human_25.npz"
 STEPS = 300
-COUNTED = {"adroit_door": 1.35, "adroit_door_1_rad": 1.0}  # rad that the door has to be open
+COUNTED = {"adroit_door": 1.35, "adroit_door_1_rad": 1.0}  # opening of the door that counts as success (rad)
 JOINTS, PALM = [f"joint_{number}" for number in range(1, 28)], ["palm_x", "palm_y", "palm_z"]
 DOOR = ["latch", "hinge"]
 HANDLE = ["handle_x", "handle_y", "handle_z", "to_palm_x", "to_palm_y", "to_palm_z", "is_open"]
@@ -34,7 +34,7 @@ def split(values: np.ndarray, ends: np.ndarray) -> list[np.ndarray]:
 
 
 def write(folder: Path) -> None:
-    """Writes the demonstrations as a data set; actions are cut to the range that the simulator executes."""
+    """Writes the demonstrations as a data set; actions are clipped to the range that the simulator executes."""
     raw = np.load(DATA)
     save_demonstrations(
         folder,
@@ -50,14 +50,14 @@ def write(folder: Path) -> None:
 
 
 class Opened(gymnasium.Wrapper):
-    """Success is a door that is open by an angle (rad)."""
+    """Reports success when the door is open by an angle (rad)."""
 
     def __init__(self, env: gymnasium.Env, angle: float):
         super().__init__(env)
         self.angle = angle
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """A control step."""
+        """Makes a control step; adds ``success`` to the info."""
         observation, reward, over, truncated, info = self.env.step(action)
         return observation, reward, over, truncated, info | {"success": bool(observation[HINGE] >= self.angle)}
 
@@ -71,7 +71,7 @@ def make_env(angle: float = COUNTED["adroit_door"], **options: Any) -> gymnasium
 
 
 def replay() -> list[bool]:
-    """Replays the human's actions from the recorded starts; returns which episodes open the door."""
+    """Replays the recorded actions from the recorded starts; returns for each episode whether the door opens."""
     raw, env, opened = np.load(DATA), make_env(), []
     for number, actions in enumerate(split(raw["actions"], raw["episode_ends"])):
         env.reset(seed=0)

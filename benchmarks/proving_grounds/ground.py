@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a proving ground is: demonstrations of others as a data set, where policies are judged, and how."""
+"""Defines proving grounds: external demonstrations as a data set, a simulator, and how policies are scored."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).resolve().parents[3] 
 
 @dataclass(frozen=True)
 class Ground:
-    """Demonstrations of others and how policies that learned from them are judged.
+    """External demonstrations and how policies trained on them are scored.
 
     Args:
         write (callable): writes all demonstrations with their actions into a folder, as a data set of ``koap train``.
-        score (str): ``"reward"``, the largest of a rollout, or ``"success"``, both in a simulator; ``"errors"`` of
+        score (str): ``"reward"``, the largest of a rollout, or ``"success"``, both in a simulator; or ``"errors"`` of
             plans and actions on recordings.
-        labels (tuple of int): demonstrations whose actions may be seen, unless told otherwise.
-        n (int): rollouts per cell; for ``"errors"`` all recordings, of which those without labels judge actions.
+        labels (tuple of int): default numbers of labelled demonstrations.
+        n (int): rollouts per cell; for ``"errors"`` the number of recordings; action errors use the unlabelled ones.
         env (str, optional): id of the simulator, which the module of the ground registers.
         max_steps (int): control steps of a rollout.
-        data (Path, optional): what has to be there.
+        data (Path, optional): file or folder that must exist.
         package (str, optional): module of the simulator.
-        install (str): the command that brings that package.
+        install (str): command that installs that package.
     """
 
     write: Callable[[Path], None]
@@ -41,7 +41,7 @@ class Ground:
     install: str = ""
 
     def missing(self) -> str | None:
-        """Says what has to be fetched before this ground can be run, and how; None if all is there."""
+        """Returns what is missing to run this ground and how to get it; None if nothing is missing."""
         if self.data is not None and not self.data.exists():
             return (
                 f"{self.data} is not there: set KOAP_SHARED to the folder that holds proving_grounds/{self.data.name}"

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Meta-World: seven tasks of an arm with a gripper, 100 demonstrations each of the scripted policies that it brings.
+"""Meta-World: seven tasks of an arm with a gripper, 100 demonstrations each by its own scripted policies.
 
-It pins another MuJoCo, which a folder before all others on PYTHONPATH brings without touching the package's own. States
-are the present frame and the goal: its observation's second frame is the one before. An episode ends with success.
+Meta-World pins another version of MuJoCo. A folder that comes first on PYTHONPATH provides it and leaves the installed
+one unchanged. States are the present frame and the goal, without the previous frame. Success ends an episode.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ INSTALL = "pip install --no-deps --target FOLDER metaworld==3.0.0 mujoco==3.3.0,
 
 
 class PresentFrame(gymnasium.Wrapper):
-    """One task with the columns of the present frame; a seed decides where things lie."""
+    """One task with the columns of the present frame; the seed determines the positions of objects and goal."""
 
     def __init__(self, env: gymnasium.Env):
         super().__init__(env)
         env.unwrapped.seeded_rand_vec, env.unwrapped._freeze_rand_vec = True, False
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(SEEN),), np.float32)
-        self.whole = np.zeros(39)  # what its scripted policy reads
+        self.whole = np.zeros(39)  # observation that the scripted policy reads
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begins an episode."""
@@ -51,7 +51,7 @@ class PresentFrame(gymnasium.Wrapper):
         return self.whole[SEEN].astype(np.float32), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """A control step; success ends the episode."""
+        """Makes a control step; success ends the episode."""
         self.whole, reward, over, truncated, info = self.env.step(action)
         return self.whole[SEEN].astype(np.float32), float(reward), bool(over or info["success"]), truncated, info
 
@@ -71,7 +71,7 @@ def record(task: str, count: int = DEMONSTRATIONS) -> tuple[list[np.ndarray], li
     for seed in range(2 * count):
         frames, taken, info = [env.reset(seed=seed)[0]], [], {"success": False}
         while len(taken) < STEPS - 1 and not info["success"]:
-            with warnings.catch_warnings():  # that it asks for more than is executed
+            with warnings.catch_warnings():  # the policy warns that its actions exceed the executed range
                 warnings.simplefilter("ignore")
                 taken.append(np.clip(policy.get_action(env.whole), -1, 1).astype(np.float32))
             frame, *_, info = env.step(taken[-1])

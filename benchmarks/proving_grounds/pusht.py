@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Push-T: a disc pushes a T-shaped block to a target; 206 human demonstrations of Chi et al. 2023 (MIT licence).
 
-Of states, of the agent's place and eight corners of the block, or of the agent's place and frames of 96 x 96 pixels.
-The simulator tells corners and draws frames of the recorded states. Frames need the extra ``vision``.
+There are grounds with states, with the agent's position and eight corners of the block, and with the agent's position
+and frames of 96 x 96 pixels. The simulator gives corners and frames of recorded states. Frames need extra ``vision``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STATE = {"agent_x": "px", "agent_y": "px", "block_x": "px", "block_y": "px", "bl
 
 
 def six_columns(state: np.ndarray) -> np.ndarray:
-    """States ``[*B, 5]`` (agent x, y, block x, y in px, angle in rad) to ``[*B, 6]``, the angle as cosine and sine."""
+    """Converts states ``[*B, 5]`` (agent x, y, block x, y in px, angle in rad) to ``[*B, 6]`` with cosine and sine."""
     angle = state[..., 4:]
     return np.concatenate([state[..., :4], np.cos(angle), np.sin(angle)], -1).astype(np.float32)
 
@@ -40,12 +40,12 @@ def read_episodes() -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def write_data_set(folder: Path, *, demonstrations: int | None = None) -> None:
-    """Writes all or the first demonstrations, with their actions, as a data set of ``koap train``."""
+    """Writes all or the first ``demonstrations``, with their actions, as a data set of ``koap train``."""
     save(folder, six_columns, STATE, demonstrations)
 
 
 def write_corners(folder: Path) -> None:
-    """Writes the same with the block's eight corners (px) in place of its position and angle."""
+    """Writes the demonstrations with the block's eight corners (px) in place of its position and angle."""
     env = make_corners().unwrapped
     env.reset(seed=0)
     names = [*AGENT, *(f"corner_{number}_{axis}" for number in range(8) for axis in "xy")]
@@ -63,7 +63,7 @@ def write_corners(folder: Path) -> None:
 def save(
     folder: Path, columns: Callable[[np.ndarray], np.ndarray], units: dict[str, str], most: int | None = None
 ) -> None:
-    """Writes the demonstrations with what is made of their states ``[T, 5]``."""
+    """Writes the demonstrations; ``columns`` converts their states ``[T, 5]``."""
     states, actions = (each[:most] for each in read_episodes())
     options = {"state_names": list(units), "state_units": list(units.values()), "action_names": TARGET}
     save_demonstrations(
@@ -72,7 +72,7 @@ def save(
 
 
 def write_pixels(folder: Path) -> None:
-    """Writes the same with the embeddings of frames in place of the block's columns."""
+    """Writes the demonstrations with embeddings of frames in place of the block's columns."""
     env, raw, own = make_pixels().unwrapped, folder / "raw", folder / "own"
     env.reset(seed=0)
     for number, (states, actions) in enumerate(zip(*read_episodes(), strict=True)):
@@ -92,15 +92,15 @@ def write_pixels(folder: Path) -> None:
 
 
 def draw(env: Any, state: np.ndarray) -> np.ndarray:
-    """Draws a state ``[5]`` as the environment sees it, marks of contacts included, uint8 ``[96, 96, 3]``."""
+    """Renders a state ``[5]`` as the environment does, contact marks included, uint8 ``[96, 96, 3]``."""
     place(env, state)
-    env.space.step(1e-9)  # contacts are found in a step, which must not move anything
+    env.space.step(1e-9)  # a step computes the contacts; it is short, so that nothing moves
     place(env, state)
     return env.get_obs()["pixels"]
 
 
 def place(env: Any, state: np.ndarray) -> None:
-    """Puts agent and block where a state ``[5]`` says, at rest."""
+    """Puts agent and block at the positions of a state ``[5]``, at rest."""
     env.block.angle = float(state[4])  # before the position, which depends on it
     env.block.position, env.agent.position = tuple(map(float, state[2:4])), tuple(map(float, state[:2]))
     for body in (env.agent, env.block):
@@ -109,31 +109,31 @@ def place(env: Any, state: np.ndarray) -> None:
 
 
 def join(observation: dict[str, np.ndarray]) -> np.ndarray:
-    """The agent's place and the corners of an observation, float32 ``[18]``."""
+    """Returns the agent's position and the corners of an observation, float32 ``[18]``."""
     return np.concatenate([observation["agent_pos"], observation["environment_state"]]).astype(np.float32)
 
 
 class SixColumns(gymnasium.ObservationWrapper):
-    """Observations as :func:`six_columns` makes them."""
+    """Converts observations by :func:`six_columns`."""
 
     def __init__(self, env: gymnasium.Env):
         super().__init__(env)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(STATE),), np.float32)
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """One state."""
+        """Converts one state."""
         return six_columns(np.asarray(observation))
 
 
 def make_env(**options: object) -> gymnasium.Env:
-    """Makes the simulator, which states as they are recorded come out of."""
+    """Makes the simulator with observations like the recorded states."""
     import gym_pusht  # noqa: F401  # registers it
 
     return SixColumns(gymnasium.make("gym_pusht/PushT-v0", obs_type="state", disable_env_checker=True, **options))
 
 
 def make_corners(**options: object) -> gymnasium.Env:
-    """Makes the simulator, which the block's corners and the agent's place come out of."""
+    """Makes the simulator with observations of the block's corners and the agent's position."""
     import gym_pusht  # noqa: F401  # registers it
 
     options |= {"obs_type": "environment_state_agent_pos", "disable_env_checker": True}
@@ -142,7 +142,7 @@ def make_corners(**options: object) -> gymnasium.Env:
 
 
 def make_pixels(**options: object) -> gymnasium.Env:
-    """Makes the simulator, which pictures and the agent's place come out of."""
+    """Makes the simulator with observations of pictures and the agent's position."""
     import gym_pusht  # noqa: F401  # registers it
 
     options |= {"obs_type": "pixels_agent_pos", "observation_width": 96, "observation_height": 96}

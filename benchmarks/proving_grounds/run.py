@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Proving grounds, demonstrations and simulators of others: the default command of each method, without any tuning.
+"""Runs every method with default options on external demonstrations and simulators (proving grounds).
 
     python benchmarks/proving_grounds/run.py pusht --labels 10 --seeds 3
-    python benchmarks/proving_grounds/run.py  # every ground whose packages and data are here
+    python benchmarks/proving_grounds/run.py  # every ground whose packages and data exist
 
-Trains and judges every method with every training seed, and appends rows to ``benchmarks/results/proving_grounds.csv``.
-What is there already is not run again. The planner is that of the first method. Seconds are those of one core, with the
-time to write the data set. A ground is a file beside this one with its ``GROUNDS``.
+Trains and scores every method with every training seed; appends rows to ``benchmarks/results/proving_grounds.csv``.
+Rows of the table are not run again. All methods share the planner of the first method. Seconds are those of one core.
+A ground is defined in ``GROUNDS`` of a file in this folder.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ EXECUTIONS = {
 
 
 def grounds() -> dict[str, Ground]:
-    """Every proving ground by its name."""
+    """Returns every proving ground by name."""
     found: dict[str, Ground] = {}
     for file in sorted(HERE.glob("*.py")):
         if file.stem not in ("run", "ground"):
@@ -70,7 +70,7 @@ def grounds() -> dict[str, Ground]:
 def roll(
     ground: Ground, trained: Trained, execution: ExecutionConfig, n: int, *, first_seed: int = FIRST_SEED
 ) -> dict[str, Any]:
-    """Scores a policy in the simulator of a ground."""
+    """Rolls a policy out in the simulator of a ground; returns columns of the table."""
     observe = Observer.of(trained.task, trained.cameras)
     episodes = roll_out(
         load_policy(trained, **{key: value for key, value in vars(execution).items() if value is not None}),
@@ -90,9 +90,9 @@ def roll(
 
 
 def judge(trained: Trained) -> dict[str, Any]:
-    """Scores a run on recordings: of plans as a share of standing still's, of actions as a share of the ridge's."""
+    """Scores a run on recordings: plan error relative to standing still, action error relative to the ridge."""
     result = evaluate(trained.folder, EvalConfig(threads=1))
-    action = result["action_errors"]["outside_budget"]  # both as shares of the error of the mean action
+    action = result["action_errors"]["outside_budget"]  # both errors are relative to that of the mean action
     errors = {
         "plan_error": result["relative_plan_error"],
         "action_error": action["relative"] / action["ridge_relative"],
@@ -103,7 +103,7 @@ def judge(trained: Trained) -> dict[str, Any]:
 def run_cell(
     name: str, ground: Ground, config: TrainConfig, executions: dict[str, ExecutionConfig], n: int
 ) -> list[tuple[object, ...]]:
-    """Trains one method and scores it in each way to execute its plans; returns the rows."""
+    """Trains one method and scores it with each execution; returns the rows."""
     began = time.process_time()
     trained = train(config)
     seconds = time.process_time() - began
@@ -136,15 +136,15 @@ def main(
     """Runs the cells that the table lacks.
 
     Args:
-        names: grounds; all of them if none is named.
-        methods: what is compared; those that plan share the planner of the first of them.
-        labels: numbers of demonstrations whose actions may be seen, one after the other. Default: the ground's own.
+        names: grounds. Default: all.
+        methods: methods to compare; those that plan share the planner of the first one that plans.
+        labels: numbers of labelled demonstrations. Default: the ground's own.
         seeds: number of training seeds, from 0.
-        executions: ways to execute plans: default, open_loop_8, temperature_1.
+        executions: executions of plans: default, open_loop_8, temperature_1.
         n: rollouts per cell, with the seeds from 100,000 on. Default: the ground's own.
-        steps: updates of planners and Diffusion Policy at most, with a folder and a table of their own. Default: the
+        steps: maximum updates of planners and Diffusion Policy; use another folder and table for them. Default: the
             library's.
-        folder: where to train.
+        folder: folder of the runs.
         results: the table.
     """
     known = grounds()
@@ -156,19 +156,19 @@ def main(
     except ValueError as error:
         sys.exit(str(error))
     torch.set_num_threads(1)
-    folder = folder.resolve()  # runs remember where their data set is
+    folder = folder.resolve()  # runs store the path of their data set
     done, write = open_table(results, COLUMNS, KEYS)
     planning = [method for method in methods if get_method(method).plans]
     for name, ground in asked.items():
-        if lacks := ground.missing():
-            print(f"{name} is skipped: {lacks}")
+        if missing := ground.missing():
+            print(f"{name} is skipped: {missing}")
             continue
         for seed in range(seeds):
             for count in labels or ground.labels:
                 trials = (n or ground.n) - count * (ground.env is None)
                 for method in methods:
                     cell = (name, method, count, seed)
-                    own = ways if get_method(method).plans else {"default": EXECUTIONS["default"]}  # sampled actions
+                    own = ways if get_method(method).plans else {"default": EXECUTIONS["default"]}  # no plans
                     own = {way: each for way, each in own.items() if tuple(map(str, (*cell, way, trials))) not in done}
                     if not own:
                         continue

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Unitree G1, recordings of a real humanoid: 26 joints of arms and hands, their targets as actions, no simulator.
+"""Unitree G1: recordings of a real humanoid without simulator; 26 joints of arms and hands, targets as actions.
 
 100 episodes at 30 Hz in LeRobot's format 2.1 (YifanTian07/G1-policy-train, MIT licence).
 """
