@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A page per room with the public classes and functions of its modules, from their docstrings."""
+"""Writes a page per subpackage with the public classes and functions of its modules, from their docstrings."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ BASE = ("keys", "lookup", "files")
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Registers the extension with Sphinx."""
     app.connect("builder-inited", lambda app: write_api_pages(quick=app.tags.has("quick")))
     return {"parallel_read_safe": True}
 
 
 def write_api_pages(quick: bool = False) -> None:
-    """Writes ``generated/api``: an index, a page per room, a page per module, the latter not if in a hurry."""
+    """Writes ``generated/api``: an index, a page per subpackage and, unless ``quick``, a page per module."""
     for room in ROOMS:
         files = [path for path in sorted((PACKAGE / room).rglob("*.py")) if path.name != "__init__.py"]
         modules = [path for path in files if public_names(path)]
@@ -53,17 +53,17 @@ def write_api_pages(quick: bool = False) -> None:
 
 
 def entry(page: str, prefix: str) -> str:
-    """A page in the navigation, by the part of its name that its room does not say."""
+    """Formats an entry of the navigation; its text is the name of the page without the prefix."""
     return f"{page.removeprefix(prefix)} <{page}>"
 
 
 def name_of(path: Path) -> str:
-    """Dotted name of a file."""
+    """Returns the dotted name of a file."""
     return ".".join(("torchrl_koap", *path.relative_to(PACKAGE).with_suffix("").parts))
 
 
 def public_names(path: Path) -> list[str]:
-    """Public classes and functions that a file defines and documents."""
+    """Returns the public classes and functions that a file defines and documents."""
     nodes = ast.parse(path.read_text(encoding="utf-8")).body
     kinds = (ast.ClassDef, ast.FunctionDef)
     return [n.name for n in nodes if isinstance(n, kinds) and not n.name.startswith("_") and ast.get_docstring(n)]

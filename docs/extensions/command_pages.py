@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A page per command from the parser of the command line itself."""
+"""Writes a page per command from the command line's parser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_koap.commands.subcommands import GROUPS, Subcommand, described
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Registers the extension with Sphinx."""
     app.connect("builder-inited", lambda app: write_command_pages())
     return {"parallel_read_safe": True}
 
@@ -41,7 +41,7 @@ def write_command_pages() -> None:
 
 
 def help_of(*words: str) -> str:
-    """What a help prints, without colours and lines."""
+    """Returns the printed help without colours and rules."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         parse(Subcommand, words)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The architecture: subpackages, their files, and who may import whom, as the test of the imports has it."""
+"""Writes the page of the architecture: subpackages, their files, and the imports that the test allows."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ WIDTH, ROW, BOX = 640, 64, 104
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Registers the extension with Sphinx."""
     app.connect("builder-inited", lambda app: write_design_page())
     return {"parallel_read_safe": True}
 
 
 def write_design_page() -> None:
-    """Writes ``generated/design``: the drawing, the rules and the files of every room."""
+    """Writes ``generated/design``: the drawing, the rules and the files of every subpackage."""
     allowed = may_import()
     write_file("rooms.svg", drawing(allowed))
     blocks = []
@@ -50,7 +50,7 @@ def write_design_page() -> None:
 
 
 def may_import() -> dict[str, set[str]]:
-    """The table of the test: only its assignments are run."""
+    """Returns the test's table of allowed imports; runs only the assignments of that file."""
     found: dict[str, Any] = {}
     for node in ast.parse(SOURCE.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) in ("BASE", "TRAINING", "MAY_IMPORT"):
@@ -59,12 +59,12 @@ def may_import() -> dict[str, set[str]]:
 
 
 def first_sentence(path: Path) -> str:
-    """First line of a file's docstring."""
+    """Returns the first line of a file's docstring."""
     return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n")[0]
 
 
 def floors(allowed: dict[str, set[str]]) -> dict[str, int]:
-    """Floor of every room: one above the highest that it stands on."""
+    """Returns the level of every subpackage: one above the highest level that it may import."""
     level: dict[str, int] = {}
     while len(level) < len(allowed):
         for room, others in allowed.items():
@@ -75,7 +75,7 @@ def floors(allowed: dict[str, set[str]]) -> dict[str, int]:
 
 
 def drawing(allowed: dict[str, set[str]]) -> str:
-    """An SVG in the colours of the page around it."""
+    """Returns an SVG in the colours of the surrounding page."""
     level = floors(allowed)
     top = max(level.values())
     place = {}

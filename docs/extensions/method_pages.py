@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A page per method from ``METHODS``: equation, what it may see, parameters, losses, measured rows."""
+"""Writes a page per method of ``METHODS``: equation, data that it may read, parameters, losses, results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.trained import build_networks
 
-# of networks whose docstring has no equation; "paper" is that of the preset
+# for networks whose docstring has no equation; "paper" is the name of a preset
 EQUATIONS = {
     "KoopmanInverseDynamics": (
         r"z_t = g(x_t), \quad u_t = f(x_{t-4:t}, x_{t+2:t+5}), \quad z_{t+1} = K z_t + B u_t, \quad a_t = D u_t"
@@ -35,7 +35,7 @@ WINDOWS = {
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Registers the extension with Sphinx."""
     app.connect("builder-inited", lambda app: write_method_pages())
     return {"parallel_read_safe": True}
 
@@ -87,13 +87,13 @@ def write_method(method: Method) -> None:
 
 
 def build(method: Method, task_name: str) -> Any:
-    """The network as ``koap train`` builds it, untrained."""
+    """Builds the untrained network as ``koap train`` does."""
     task = get_task(task_name)
     return build_networks(task, resolve(TrainConfig(out="unused", method=method.name), task))[1]
 
 
 def equation(method: Method, kind: type) -> str:
-    """What is decoded from what: the equation of the network's docstring, or the one listed above."""
+    """Returns the equation of the network's docstring, or else that of ``EQUATIONS``."""
     found = re.search(r"^\.\. math::\n((?:[ \t]+\S.*\n|\s*\n)+)", (inspect.getdoc(kind) or "") + "\n", re.MULTILINE)
     if found:
         return f".. math::\n\n{textwrap.indent(textwrap.dedent(found[1]).strip(), '   ')}"
@@ -102,7 +102,7 @@ def equation(method: Method, kind: type) -> str:
 
 
 def frames_read(network: Any) -> list[tuple[str, str]]:
-    """How many frames it reads, where it says so."""
+    """Returns a row with the number of frames that the network reads, if it declares that."""
     past, frames = getattr(network, "num_past", None), getattr(network, "num_window_frames", None)
     if past is None or frames is None:
         return []
@@ -110,7 +110,7 @@ def frames_read(network: Any) -> list[tuple[str, str]]:
 
 
 def states_seen(method: Method) -> str:
-    """Which states it may learn from."""
+    """Describes the states that the method may learn from."""
     if method.sees == "labelled":
         return "those of labelled windows, statistics included"
     if not method.phases:
@@ -120,7 +120,7 @@ def states_seen(method: Method) -> str:
 
 
 def phases(method: Method) -> str:
-    """Its phases, losses and windows."""
+    """Returns a table of the method's phases, losses and windows."""
     rows = []
     for phase in method.phases:
         loss = phase.loss.func if isinstance(phase.loss, partial) else phase.loss
@@ -132,5 +132,5 @@ def phases(method: Method) -> str:
 
 
 def measured(method: Method) -> str:
-    """Success in the current comparison."""
+    """Returns a table of the method's success in the current comparison."""
     return measured_table(benchmark_rows(method=method.name), "task") or "Not in the current comparison."

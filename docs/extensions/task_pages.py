@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A page per task from the registry: columns, units, limits, modes, pictures, expert, what was measured."""
+"""Writes a page per registered task: columns, units, limits, modes, picture, expert, results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UNITS = {"quaternion": "1 (quaternion w, x, y, z)", "tan_yaw": "1 (tangent of th
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Registers the extension with Sphinx."""
     app.connect("builder-inited", lambda app: (write_task_pages(), write_defaults()))
     return {"parallel_read_safe": True}
 
@@ -102,7 +102,7 @@ def write_task(task: Task) -> None:
 
 
 def observation_rows(task: Task) -> list[tuple[str, ...]]:
-    """Column, part, unit and what planner and controller see of it."""
+    """Returns rows of column, part, unit and the state columns made from it."""
     rows = []
     for part, columns in task.observation.items():
         names = task.observation_names[columns]
@@ -121,7 +121,7 @@ def observation_rows(task: Task) -> list[tuple[str, ...]]:
 
 
 def action_rows(task: Task) -> list[tuple[str, ...]]:
-    """Column, unit, least and greatest value that the environment takes, and whether it is a change."""
+    """Returns rows of column, unit, limits of the environment, and whether the action is a change."""
     low, high = action_limits(task)
     rows = []
     for index, (name, unit) in enumerate(zip(task.actions, task.action_units, strict=True)):
@@ -133,11 +133,11 @@ def action_rows(task: Task) -> list[tuple[str, ...]]:
 
 
 def action_limits(task: Task) -> tuple[list[float] | None, list[float] | None]:
-    """Bounds of the environment's actions, as its specification says."""
+    """Returns the bounds in the environment's action specification."""
     from torchrl_koap.envs.registry import make_env
 
     known = inspect.signature(resolve(task.env, "env").__init__).parameters
-    blind = {"embed": False} if "embed" in known else {}  # what is commanded is known without a camera
+    blind = {"embed": False} if "embed" in known else {}  # action bounds need no camera
     env = make_env(task.name, num_envs=1, num_threads=1, **blind)
     space = env.action_spec.space
     env.close()
@@ -147,7 +147,7 @@ def action_limits(task: Task) -> tuple[list[float] | None, list[float] | None]:
 
 
 def mode_blocks(task: Task) -> list[str]:
-    """The ways in which it can be done."""
+    """Returns the section on the modes of the task."""
     if not task.modes.choices:
         return []
     names = {"all": "all successful episodes", "contexts": "contexts", "solved_contexts": "contexts with a success"}
@@ -160,7 +160,7 @@ def mode_blocks(task: Task) -> list[str]:
 
 
 def body_blocks(task: Task) -> list[str]:
-    """What a context places, and where."""
+    """Returns the section on the start regions of bodies."""
     scene = task.scene
     if not scene.varies:
         return []
@@ -179,21 +179,21 @@ def body_blocks(task: Task) -> list[str]:
 
 
 def expert_blocks(expert: Any) -> list[str]:
-    """What the scripted player does, in its own words."""
+    """Returns the section on the scripted expert, with the first line of its docstring."""
     if expert is None or not expert.__doc__:
         return []
     return [heading("The expert", 1), expert.__doc__.strip().splitlines()[0]]
 
 
 def measured_blocks(task: Task) -> list[str]:
-    """Success of KOAP, of the default method and of the ridge, from the current comparison."""
+    """Returns the success of KOAP, the default method, `mpc` and the ridge in the current comparison."""
     shown = ("koap", task.defaults.method, "mpc", "linear_steps")
     rows = [row for row in benchmark_rows(task=task.name) if row["method"] in shown]
     return [heading("Measured", 1), measured_table(rows, "method"), "More: :doc:`/results`."]
 
 
 def write_defaults() -> None:
-    """Writes ``generated/defaults``: the options of a training of each task, and of your own data."""
+    """Writes ``generated/defaults``: default options of a training for each task and for a user's own data."""
     own = Task(name="your own data", observation_parts={"x": 4}, actions={"u": Action()}, position="x", robot=(0, 1))
     rows = []
     for task in (own, *TASKS.values()):
@@ -216,7 +216,7 @@ def write_defaults() -> None:
 
 
 def draw(task: Task) -> None:
-    """The scene from above, with the regions in which bodies start."""
+    """Draws the scene from above with the start regions of bodies."""
     path = GENERATED / "tasks" / f"{task.name}.png"
     if path.exists():
         return

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The time picture: which frames are observed, planned, executed and read, in the numbers of the code."""
+"""Draws which frames are observed, planned, executed and read, with the numbers of the code."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ LEFT, CELL, HIGH = 150, 30, 26
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Registers the extension with Sphinx."""
     app.connect("builder-inited", lambda app: write_file("time.svg", drawing()))
     return {"parallel_read_safe": True}
 
 
 def drawing() -> str:
-    """Rows of frames as an SVG in the colours of the page around it."""
+    """Returns rows of frames as an SVG in the colours of the surrounding page."""
     preset = PRESETS["default"]
     past, ahead = preset["num_past"], preset["look_ahead"]
-    first = past - HISTORY + 1  # frames that only the controller remembers
+    first = past - HISTORY + 1  # earlier frames are read by the controller alone
     columns = first + WINDOW
     now = past
     parts = [text(LEFT + CELL * (index + 0.5), 18, time_name(index - now), "small") for index in range(columns)]
@@ -59,10 +59,10 @@ def drawing() -> str:
 
 
 def time_name(offset: int) -> str:
-    """``now``, or the distance from it in frames."""
+    """Returns ``now``, or the offset from it in frames."""
     return "now" if offset == 0 else f"{offset:+d}"
 
 
 def text(x: float, y: float, words: str, kind: str) -> str:
-    """A piece of text."""
+    """Formats a text element."""
     return f'<text class="{kind}" x="{x:.0f}" y="{y:.0f}">{words}</text>'

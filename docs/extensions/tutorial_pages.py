@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A page per tutorial: its text and code, then the output and picture that ``make tutorials`` left.
+"""Writes a page per tutorial: its text and code, then the output and picture saved by ``make tutorials``.
 
-A tutorial is not run here: the site is built in a minute, the tutorials take longer. One whose output is older than its
-code is marked as such, by the hash of the code that stands in the output.
+Tutorials are not run here, because they take longer than building the site. The output holds a hash of the code. If the
+hashes differ, the page states that the code has changed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from pages import GENERATED, ROOT, code, heading, table, toctree, write_page
 
 FOLDER, OUTPUTS = ROOT / "tutorials", ROOT / "docs" / "outputs"
-# in the order in which they are read
+# reading order
 ORDER = (
     "few_labels",
     "own_robot",
@@ -30,21 +30,21 @@ ORDER = (
     "scooping",
     "label_curve",
 )
-FIRST = 4  # of them are the tutorials; the others are the gallery
+FIRST = 4  # number of tutorials; the others form the gallery
 DIGEST = "# code: "
 
 
 def setup(app: Any) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Registers the extension with Sphinx."""
     app.connect("builder-inited", lambda app: write_tutorial_pages())
     return {"parallel_read_safe": True}
 
 
 def write_tutorial_pages() -> None:
     """Writes ``generated/tutorials``: an index and a page per tutorial."""
-    there = {path.stem for path in FOLDER.glob("*.py")}
-    if there != set(ORDER):
-        raise ValueError(f"tutorials and their order differ: {sorted(there ^ set(ORDER))}")
+    found = {path.stem for path in FOLDER.glob("*.py")}
+    if found != set(ORDER):
+        raise ValueError(f"tutorials and their order differ: {sorted(found ^ set(ORDER))}")
     rows = []
     for name in ORDER:
         write_tutorial(FOLDER / f"{name}.py")
@@ -64,22 +64,22 @@ def write_tutorial_pages() -> None:
 
 
 def digest(path: Path) -> str:
-    """Short hash of a tutorial's code without docstring, comments and layout: text may change without a new run."""
+    """Returns a short hash of a tutorial's code without docstring, comments and layout, which need no new run."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     after = iter(lines[ast.parse("".join(lines)).body[0].end_lineno :])
     signs = {tokenize.COMMENT: "", tokenize.INDENT: "{", tokenize.DEDENT: "}"}
     kept = "".join(signs.get(kind, text) for kind, text, *_ in tokenize.generate_tokens(lambda: next(after, "")))
-    return hashlib.sha256("".join(kept.split()).encode()).hexdigest()[:12]  # Pythons part f-strings differently
+    return hashlib.sha256("".join(kept.split()).encode()).hexdigest()[:12]  # tokens of f-strings depend on the Python
 
 
 def introduction(path: Path) -> tuple[str, str]:
-    """Title and text of the docstring."""
+    """Returns title and text of the docstring."""
     lines = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").splitlines()
     return lines[0].rstrip("."), "\n".join(lines[2:]).strip()
 
 
 def cells(path: Path) -> list[tuple[str, str]]:
-    """Pieces of a script after its docstring: ``("text" or "code", content)``."""
+    """Splits a script after its docstring into pieces: ``("text" or "code", content)``."""
     source = path.read_text(encoding="utf-8")
     end = ast.parse(source).body[0].end_lineno or 0
     pieces: list[tuple[str, str]] = []
@@ -107,7 +107,7 @@ def write_tutorial(path: Path) -> None:
 
 
 def underlined(text: str) -> str:
-    """Headings of a cell, marked as those of generated pages are."""
+    """Adapts the underlines of a cell's headings to the length of their text."""
     lines = text.splitlines()
     for index, line in enumerate(lines):
         if line and set(line) == {"-"} and index:
@@ -116,7 +116,7 @@ def underlined(text: str) -> str:
 
 
 def output_of(path: Path) -> list[str]:
-    """What it printed and drew when ``make tutorials`` was last called."""
+    """Returns the output and picture that ``make tutorials`` saved last."""
     printed, picture = OUTPUTS / f"{path.stem}.txt", OUTPUTS / f"{path.stem}.png"
     blocks = []
     if not printed.exists():
