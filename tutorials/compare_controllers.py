@@ -47,8 +47,8 @@ def rmse_mm(predicted, true):
 # %%
 # A controller of your own
 # ------------------------
-# Any module with these four attributes is a controller for ``make_policy``. This one assumes that the command moves as
-# fast as the arm will. It fits one factor to the labels.
+# Any module with these four attributes is a controller for ``make_policy``. This one multiplies the arm's velocity over
+# three frames by a factor. It fits the factor to the labels.
 
 
 class Proportional(TensorDictModuleBase):
@@ -100,7 +100,7 @@ for name in titles:
             if name == "own":
                 controller = proportional(data)
             else:
-                options = {"planner": False, "controller": {"steps": 150}}  # controllers alone are compared here
+                options = {"planner": False, "controller": {"steps": 150}}  # only controllers are compared here
                 controller = fit(data, task, method=name, seed=seed, progress=False, **options).controller
             predicted, true, _ = first_actions(controller, demonstrations, episodes_outside(demonstrations, data))
             values.append(rmse_mm(predicted, true))
@@ -118,8 +118,8 @@ for name, title in titles.items():
 # %%
 # What did the unlabelled data add?
 # ---------------------------------
-# Compare the last lines draw by draw. ``koap_labelled_only`` is ``koap`` without the 47 unlabelled demonstrations.
-# ``koap_untrained`` has random features. Where an interval contains 0 there is no significant difference.
+# The next lines pair label draws. ``koap_labelled_only`` is ``koap`` without the 43 to 47 unlabelled demonstrations.
+# ``koap_untrained`` has random features. A range that contains 0 shows no clear difference.
 
 print("\ndifference to KOAP in mm, draw by draw (below 0: better than KOAP)")
 for name in ("koap_untrained", "koap_labelled_only", "linear_steps", "dd_lookahead"):
@@ -153,7 +153,7 @@ figure.savefig("compare_controllers.png", dpi=90)
 # Conclusion
 # ----------
 # The three lines of KOAP coincide. Random features do as well, and so does KOAP without the unlabelled demonstrations.
-# On Avoiding the scaled inputs, the Fourier features and the closed-form decoder decide. Trainings here have 150
+# On Avoiding the error depends on scaled inputs, Fourier features and the closed-form decoder. Trainings here have 150
 # updates; longer ones agree (``docs/results/few_labels.md``). Supervised networks and ridge regression on raw frames
 # need more labels. The error does not depend on the size of the actions.
 #

@@ -16,7 +16,7 @@ Run it with ``python tutorials/few_labels.py``; it takes about a minute and writ
 # Demonstrations, most of them without actions
 # --------------------------------------------
 # Scripted experts steer the rod around six cylinders. The label budget keeps the actions of two of the 48 trajectories.
-# Elsewhere the action is NaN and ``has_action`` is False, so a leak gives NaN losses.
+# Elsewhere the action is NaN and ``has_action`` is False, so a leak would give NaN losses.
 
 from pathlib import Path
 
@@ -73,7 +73,7 @@ for _ in range(200):
     optimizer.zero_grad()
 
 # %%
-# Last, the linear decoder is fitted to the labels in closed form.
+# Finally, the linear decoder is fitted to the labels in closed form.
 
 fit = fit_closed_form(inverse_dynamics, data, axes=task.moved_columns())
 print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
@@ -81,7 +81,7 @@ print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 # %%
 # A planner over states
 # ---------------------
-# It reads no action. The augmentation displaces observed states, and the planned states return to the demonstration.
+# The planner reads no action. The augmentation displaces observed states, so that plans return to the demonstration.
 
 planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, relative=False, num_steps=5)
 extended = extrapolate_ends(data, 13)
@@ -101,8 +101,8 @@ planner_loss.target_network_params.to_module(planner)
 # %%
 # Rollouts
 # --------
-# Every environment of the batch runs one episode with its own seed. The planner has 1,000 updates; ``make demo`` trains
-# longer.
+# Every environment of the batch runs one episode with its own seed. The planner has 1,000 updates; ``make demo`` has
+# more.
 
 policy = make_policy(planner, inverse_dynamics, state_of=task.state_columns)
 seeds = list(range(24))

@@ -155,4 +155,4 @@ figure.savefig("gymnasium_robot.png", dpi=90)
 # Conclusion
 # ----------
 # Only the orange paths had actions; the blue ones show the route. Any environment with a flat box of the task's columns
-# works. ``--success-key`` names what reports success.
+# works. ``--success-key`` names an entry of ``info``.

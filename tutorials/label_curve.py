@@ -47,7 +47,7 @@ if __name__ == "__main__":  # workers import this file
     print(f"launcher {launcher}: {result.counts['done']} cells done, {result.counts['failed']} failed")
 
     # %%
-    # A call with the same folder does what is missing, which now is nothing. More labels would add their cells only.
+    # Another call with the same folder runs only missing cells; now there are none. More labels would add cells.
 
     again = run_study(study, machines).counts
     print(f"called again: {again['done']} done, {again['missing']} missing")
@@ -55,8 +55,8 @@ if __name__ == "__main__":  # workers import this file
     # %%
     # The table
     # ---------
-    # Seeds are pooled: 24 rollouts per entry. An interval of that many is up to forty points wide, so only the large
-    # differences mean anything here. ``comparisons.csv`` pairs the methods rollout by rollout.
+    # Seeds are pooled: 24 rollouts per entry. Intervals are up to forty points wide, so only large differences are
+    # significant here. ``comparisons.csv`` pairs the methods rollout by rollout.
 
     pooled = defaultdict(list)
     for row in result.rows:

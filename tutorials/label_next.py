@@ -40,7 +40,7 @@ def labelled(episodes):
 
 def fit(episodes):
     data = labelled(episodes)
-    # the features stay as they are drawn: what is compared is the choice of labels, and a fit takes a moment
+    # untrained features: only the choice of labels is compared, and a fit is fast
     return torchrl_koap.fit(data, task, method="koap_untrained", planner=False, progress=False), data
 
 
@@ -48,8 +48,8 @@ def fit(episodes):
 # The choice reads no label
 # -------------------------
 # The uncertainty of a ridge regression depends on the labelled states, not on the *values* of labels. ``a_optimal``
-# takes the demonstration that lowers the decoder's mean uncertainty most. It then repeats this with the chosen ones
-# added. ``random`` takes any.
+# takes the demonstration that lowers the decoder's mean uncertainty most, then repeats this with the chosen ones
+# added. ``random`` chooses at random.
 
 
 def choose(criterion, first, count):
@@ -71,7 +71,7 @@ def choose(criterion, first, count):
 # %%
 # What it gains
 # -------------
-# Errors are measured on twelve demonstrations that no method has labels of. Six different first labels show the
+# Errors are measured on twelve demonstrations without labels for any method. Six different first labels show the
 # random variation.
 
 judged = every[-12:]

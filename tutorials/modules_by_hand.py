@@ -14,8 +14,8 @@ Run it with ``python tutorials/modules_by_hand.py``; it writes ``modules_by_hand
 # %%
 # Four parts and a model
 # ----------------------
-# The latent action ``u_t = f(x_{t-1}, x_t, x_{t+2}, x_{t+3})`` is computed from states. The loss asks lifting ``z =
-# g(x)`` and operator for ``z' = K z + u``. Only the decoder ``a = D u`` needs labels.
+# The latent action ``u_t = f(x_{t-1}, x_t, x_{t+2}, x_{t+3})`` is computed from states. The loss trains lifting ``z =
+# g(x)`` and operator to satisfy ``z' = K z + u``. Only the decoder ``a = D u`` needs labels.
 
 import torch
 from matplotlib.figure import Figure
@@ -86,7 +86,7 @@ for update in range(400):
 print(f"labels: {report.labelled_transitions} of {report.total_transitions} transitions")
 
 # %%
-# The latent actions of one window, and how well the operator predicts the next lifted state.
+# The latent actions and actions of one window, and the largest eigenvalues of the operator.
 
 with torch.no_grad():
     window = model(TensorDict({"state": windows["state"][:1]}, [1]))
@@ -103,7 +103,7 @@ print("largest eigenvalues of K:", [round(value, 3) for value in radii[:4].tolis
 planner = fit(data, task, method="linear", planner={"steps": 600}, progress=False).planner
 policy = make_policy(planner, model.eval(), state_of=task.state_columns)
 env = PolicyEnv(AvoidingEnv(num_envs=8, max_steps=task.max_steps), policy)
-env.set_seed(0)  # before the collector, which begins the first episodes
+env.set_seed(0)  # before the collector starts the first episodes
 collector = Collector(env, policy, frames_per_batch=8 * 100, total_frames=8 * 100)
 batch = next(iter(collector))
 collector.shutdown()
@@ -129,4 +129,4 @@ figure.savefig("modules_by_hand.png", dpi=90)
 # Conclusion
 # ----------
 # Every part can be replaced. ``make_koopman_inverse_dynamics`` builds the default model: Fourier features, a nearer
-# look-ahead and a decoder in closed form. It needs fewer labels than gradients do.
+# look-ahead and a decoder in closed form. This needs fewer labels than gradients.

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """
-Your robot's arrays to a control loop
-=====================================
+From your robot's arrays to a control loop
+==========================================
 
 **What you will learn**
 
@@ -81,13 +81,13 @@ for name in ("linear", "dd", "koap"):
     trained[name] = torchrl_koap.fit(
         data, task, method=name, planner=planner, controller={"steps": 200}, progress=False
     )
-    planner = trained[name].planner  # it looks at no command: all of them share it
+    planner = trained[name].planner  # reads no command: all controllers share it
 
 # %%
 # Before it moves
 # ---------------
-# Commands predicted from *recorded* joints are compared with recorded commands. The training had no labels of these
-# trajectories; in this example they are known.
+# Commands predicted from *recorded* joints are compared with recorded commands. The training did not read the commands
+# of these trajectories; the example knows them.
 
 columns = list(task.controller_columns("robot"))
 for name, controller in ((name, each.controller) for name, each in trained.items()):
@@ -117,7 +117,7 @@ for trial in range(20):
     arm, agent = Arm(1000 + trial), torchrl_koap.Agent(policy, seed=trial)
     agent.reset()
     path = [arm.joints]
-    for _ in range(90):  # in your loop: until the operator says stop, at 30 Hz
+    for _ in range(90):  # in your loop: at 30 Hz until the operator stops it
         arm.command(agent.act(arm.read()))
         path.append(arm.joints)
     paths.append(np.array(path))

@@ -15,8 +15,8 @@ Run it with ``python tutorials/own_task.py``; it writes ``own_task.png``.
 # %%
 # The task
 # --------
-# A robot pushes a puck past a post, on the left or on the right, into a goal. A task holds facts, no simulator. In a
-# package of yours this is ``my_package/task.py``, for ``koap train --plugin my_package.task``.
+# A robot pushes a puck past a post, on the left or on the right, into a goal. A task describes data and goal without a
+# simulator. In your package this is ``my_package/task.py``, for ``koap train --plugin my_package.task``.
 
 import sys
 import tempfile
@@ -41,7 +41,7 @@ GOAL, GOAL_RADIUS = (0.5, 0.4), 0.05  # m
 POST = (0.5, 0.2)
 PUCK_RADIUS, ROBOT_RADIUS = 0.03, 0.01
 START = ((0.4, 0.6), (0.05, 0.1))  # of the puck: x range, y range (m)
-HERE = "own_task"  # import strings name modules; this file stands for one
+HERE = "own_task"  # import strings need a module; this file is registered as one
 sys.modules[HERE] = sys.modules[__name__]
 
 
@@ -84,8 +84,8 @@ print(f"the planner sees {task.state_names}, the controller {[task.state_names[c
 # %%
 # The environment
 # ---------------
-# A native-batch TorchRL environment. It also writes ``success``, ``mode`` and the ``context`` of the episode, which is
-# the place of the puck. Contexts are drawn from the task's start regions or given.
+# This TorchRL environment has a native batch. It also writes ``success``, ``mode`` and the ``context`` of the episode,
+# the start of the puck. Contexts are drawn from the task's start regions or given.
 
 
 class PushEnv(EnvBase):
@@ -144,7 +144,7 @@ class PushEnv(EnvBase):
 # %%
 # The expert
 # ----------
-# It gets a mode per episode, returns actions and says when it is done. Failed episodes are discarded and counted.
+# It gets a mode per episode, returns actions and reports its end. Failed episodes are discarded and counted.
 
 
 class PushExpert(Expert):
@@ -165,11 +165,11 @@ class PushExpert(Expert):
         ahead = (target - puck) / max(np.linalg.norm(target - puck), 1e-9)
         across, off, reach = np.array([-ahead[1], ahead[0]]), robot - puck, PUCK_RADIUS + ROBOT_RADIUS
         along, aside = off @ ahead, off @ across
-        if along < -0.75 * reach and abs(aside) < 0.5 * reach:  # behind the puck: push, and come back to the line
+        if along < -0.75 * reach and abs(aside) < 0.5 * reach:  # behind the puck: push, and correct sideways
             wanted = ahead - np.clip(80 * aside, -3, 3) * across
-        elif along < -0.75 * reach:  # to a place behind it
+        elif along < -0.75 * reach:  # move to a point behind it
             wanted = -1.5 * reach * ahead - off
-        elif abs(aside) < 1.5 * reach:  # make room beside it first
+        elif abs(aside) < 1.5 * reach:  # first move sideways, away from it
             wanted = np.copysign(1.0, aside) * across - 0.2 * ahead
         else:
             wanted = -ahead
@@ -179,7 +179,7 @@ class PushExpert(Expert):
 # %%
 # Record, train, roll out
 # -----------------------
-# Now record demonstrations balanced over modes, train with 5 % of the labels and roll out from new places.
+# Now record demonstrations balanced over modes, train with 5 % of the labels and roll out from new starts.
 
 folder = Path(tempfile.mkdtemp())
 print(record_to_folder(folder / "demos", task, task.defaults.demonstrations))
@@ -190,7 +190,7 @@ print(f"labels: {labels['labelled_transitions']} of {labels['total_transitions']
 result = evaluate(run, EvalConfig(episodes=40, rollouts_per_context=2, seed=100))
 rate, low, high = (100 * result["rates"]["success"][name] for name in ("rate", "low", "high"))
 print(f"success {rate:.1f} % ({low:.0f}-{high:.0f}) of 40 rollouts")
-errors = result["action_errors"]["outside_budget"]["unit"][0]  # all actions are known: they serve evaluation alone
+errors = result["action_errors"]["outside_budget"]["unit"][0]  # the data hold all actions: only evaluation reads these
 print("action error, mm:", {name: round(1e3 * errors[name], 2) for name in ("controller", "ridge", "mean_action")})
 print(f"entropy of the sides {result['pooled_mode_entropy']:.2f}, 1 is an even choice")
 
@@ -210,5 +210,5 @@ figure.savefig("own_task.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# Write three files: task, environment and expert. For recordings without a simulator you need none:
-# ``save_demonstrations`` writes the task beside the data.
+# A simulated task needs three files: task, environment and expert. Recordings without a simulator need none:
+# ``save_demonstrations`` writes the task into the data set.

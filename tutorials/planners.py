@@ -7,7 +7,7 @@ Planners: solvers, steps, temperature, modes
 
 * how many solver steps a plan needs,
 * what a lower temperature does to success and to the variety of modes,
-* how to see without a simulator whether a planner knows several ways.
+* how to see without a simulator whether a planner has several modes.
 
 Run it with ``python tutorials/planners.py``; it writes ``planners.png``.
 """
@@ -100,7 +100,7 @@ figure = Figure(figsize=(9, 3.6), layout="constrained")
 few, many, curve = figure.subplots(1, 3, width_ratios=(1, 1, 1.2))
 for axes, steps in ((few, 1), (many, 10)):
     for words in draw_scene(axes, task).texts:
-        words.remove()  # beside the part that is shown
+        words.remove()  # labels outside the visible part
     for plan in plans_with("dpm++2m", steps)[0][:60].numpy():
         axes.plot(*plan.T, color="#1f6feb", linewidth=0.6, alpha=0.5)
     axes.set(title=f"60 plans, {steps} step{'s' * (steps > 1)}", xlim=(0.38, 0.62), ylim=(-0.08, 0.16))
@@ -114,6 +114,6 @@ figure.savefig("planners.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# One solver step gives the *mean* of all ways; with ten the plans differ. In closed loop, few steps lower the entropy
-# more than the success. The two solvers hardly differ. 24 rollouts are too few to see what the temperature does to
+# One solver step gives the *mean* of all modes; with ten the plans differ. In closed loop, few steps lower the entropy
+# more than the success. The two solvers hardly differ. 24 rollouts are too few to show the effect of temperature on
 # success: their intervals are 25 points wide. Times are those of the machine that made this page.

@@ -41,7 +41,7 @@ from torchrl_koap.vision.embedding import embed_recordings, read_sources
 
 torch.set_num_threads(1)
 NETWORK = "torchrl_koap.vision.backbones:lite0_cells"
-load_backbone(NETWORK)  # says at once what to install where its weights are missing
+load_backbone(NETWORK)  # an early error names the package of missing weights
 folder, task = Path(tempfile.mkdtemp()), get_task("scooping")
 EACH, LABELLED, TRIALS = 24, 5, 15
 for embodiment in ("robot", "hand"):
@@ -82,13 +82,13 @@ for name, steps in updates.items():
     trained[name] = torchrl_koap.fit(
         data, task, method=name, planner=planner, controller={"steps": steps}, progress=False
     )
-    planner = trained[name].planner  # one for all
+    planner = trained[name].planner  # shared by all controllers
 
 # %%
 # Scooping
 # --------
 # There are fifteen trials from the three start positions. Joint targets are decoded once per plan
-# (``task.defaults.execution``). Decoded at every frame, an error of a position would act as a velocity.
+# (``task.defaults.execution``). With decoding at every frame, a position error would act as a velocity.
 
 
 def trials(trained):
@@ -111,7 +111,7 @@ for name, each in trained.items():
     print(f"{name:14} over the rim {over} of {TRIALS}, with a piece {taken}: {rate:.0f} % ({low:.0f}-{high:.0f})")
 
 # %%
-# Above: films of a hand, of a robot and of KOAP. Below: success with 95 % intervals, and the height of KOAP's spoon.
+# Top: videos of a hand, of a robot and of KOAP. Bottom: success with 95 % intervals, and the height of KOAP's spoon.
 
 tried = sorted(episodes["koap"], key=lambda episode: not episode["next", "success"].any())
 videos = sources.cameras[CAMERA]
