@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""One thread per test process, and tiny demonstrations and runs shared by all tests."""
+"""Sets one thread per test process; provides tiny demonstrations and runs for all tests."""
 
 import multiprocessing
 import shutil
@@ -9,22 +9,22 @@ import pytest
 import torch
 from tiny_runs import TINY, koap, write_demonstrations
 
-# two processes with two threads each on two cores wait for each other most of the time
+# two processes with two threads each on two cores would mostly wait for each other
 torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
 def job_server():
-    """The server whose copies do the jobs of tests has imported what they need, whichever test starts it."""
+    """Starts the fork server of the tests' jobs after it has imported the packages that jobs need."""
     rooms = ("studies.launchers", "studies.cells", "evaluation.closed_loop", "envs.avoiding")
     forkserver.set_forkserver_preload(["torchrl.collectors", *(f"torchrl_koap.{room}" for room in rooms)])
     process = multiprocessing.get_context("forkserver").Process(target=len, args=("",))
-    process.start(), process.join()  # now it is there
+    process.start(), process.join()  # the first process starts the server
 
 
 @pytest.fixture
 def copied_processes(job_server):
-    """TorchRL's processes are copies of that server; what they are handed is pickled as for spawned ones."""
+    """Makes TorchRL fork its processes from that server; their arguments are pickled as for spawned processes."""
     before = torch.multiprocessing.get_start_method(allow_none=True)
     torch.multiprocessing.set_start_method("forkserver", force=True)
     yield
@@ -38,7 +38,7 @@ def demonstrations(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def trained_run(tmp_path_factory, demonstrations):
-    """A run directory of `koap train`; not to be written to."""
+    """Returns a run directory of `koap train`; tests must not write to it."""
     folder = tmp_path_factory.mktemp("runs") / "trained"
     assert koap("train", "--out", folder, "--dataset", demonstrations, *TINY) == 0
     return folder
@@ -46,5 +46,5 @@ def trained_run(tmp_path_factory, demonstrations):
 
 @pytest.fixture
 def copied_run(trained_run, tmp_path):
-    """The same, for a test that writes to it."""
+    """Returns a copy of that run for tests that write to it."""
     return shutil.copytree(trained_run, tmp_path / "run")

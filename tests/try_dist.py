@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Tries wheel and sdist as somebody who has no repository would: ``make dist`` calls this.
+"""Tries wheel and sdist outside of the repository; ``make dist`` calls this.
 
-In a fresh environment with the dependencies of this one, outside of the repository: the package is imported from the
-wheel, the command line runs, data files are found, and what belongs to the repository alone is refused in one line.
+In a fresh environment with the dependencies of this one, the package is imported from the wheel, the command line runs
+and data files are found. Commands that need the repository must fail with one line.
 """
 
 import subprocess
@@ -38,7 +38,7 @@ print(torchrl_koap.__version__)
 
 
 def check_files(dist: Path) -> Path:
-    """Looks into both files; returns the wheel."""
+    """Checks the contents of both files; returns the wheel."""
     (wheel,), (sdist,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
     with zipfile.ZipFile(wheel) as file:
         names = file.namelist()
@@ -63,13 +63,13 @@ def main(dist: Path) -> None:
         venv.create(home / "venv", with_pip=True)
         binary = home / "venv" / "bin"
         (site,) = (home / "venv" / "lib").glob("python*/site-packages")
-        # what is installed here counts as installed there, this repository does not
+        # makes the packages installed here available there, without this repository
         (site / "dependencies.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
         words = ("-m", "pip", "install", "--quiet", "--no-deps", "--no-index", wheel)
         subprocess.run([binary / "python", *words], check=True, cwd=home)
         version = call(home, binary / "python", "-c", SCRIPT)
         if version not in call(home, binary / "koap", "--version"):
-            raise SystemExit("koap --version is another one than the package's")
+            raise SystemExit("koap --version differs from the package's version")
         if "curve" not in call(home, binary / "koap", "--help"):
             raise SystemExit("koap --help does not list the commands")
         refused = subprocess.run(
@@ -81,7 +81,7 @@ def main(dist: Path) -> None:
 
 
 def call(home: Path, *command: object) -> str:
-    """Output of a command that has to succeed."""
+    """Runs a command that must succeed; returns its output."""
     done = subprocess.run([str(word) for word in command], cwd=home, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{command[0]} failed:\n{done.stderr[-3000:]}")

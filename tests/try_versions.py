@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Lowest and newest dependencies, on every Python that is here: ``make test-matrix`` calls this.
+"""Tries the lowest and newest dependencies on every installed Python; ``make test-matrix`` calls this.
 
     python tests/try_versions.py
     python tests/try_versions.py --pythons 3.11 --torch 2.13.0+cpu
 
-For each pair, ``uv`` looks for versions that fit together, wheels only. Where the torch among them is a CPU wheel
-(``UV_FIND_LINKS``, or ``UV_TORCH_BACKEND=cpu`` with a network that has it), they are installed and a fast part of the
-suite runs; where it would bring CUDA, gigabytes that no test needs, that pair is resolved only, and the table says so.
+For each pair, ``uv`` resolves compatible versions, wheels only. If torch resolves to a CPU wheel (``UV_FIND_LINKS``, or
+``UV_TORCH_BACKEND=cpu`` with network access), they are installed and a fast part of the suite runs. Otherwise the pair
+is only resolved, since CUDA is gigabytes that no test needs, and the table says so.
 """
 
 import argparse
@@ -32,13 +32,13 @@ COLUMNS = ("python", "versions", "outcome", "passed", "failed", *SHOWN)
 
 
 def uv(*words: object) -> subprocess.CompletedProcess[str]:
-    """Calls uv, which has to be there."""
+    """Calls uv, which must be installed."""
     found = shutil.which("uv") or str(Path(sys.executable).parent / "uv")
     return subprocess.run([found, *map(str, words)], cwd=ROOT, capture_output=True, text=True)
 
 
 def resolve(python: str, versions: str, torch: str | None, folder: Path) -> tuple[Path, dict[str, str], str]:
-    """A file of versions that fit together, the versions by name, and why there is none."""
+    """Returns a file of compatible versions, the versions by name, and the reason if there are none."""
     made, constraint = folder / "versions.txt", folder / "torch.txt"
     constraint.write_text(f"torch=={torch}\n" if torch else "")
     done = uv(
@@ -53,7 +53,7 @@ def resolve(python: str, versions: str, torch: str | None, folder: Path) -> tupl
 
 
 def run_tests(python: str, versions: Path, folder: Path) -> tuple[str, int, int]:
-    """Installs and runs; what came of it, tests passed and failed."""
+    """Installs the versions and runs tests; returns the outcome and the numbers of passed and failed tests."""
     home = folder / "venv"
     for words in (
         ("venv", "--quiet", "--python", python, home),
@@ -74,7 +74,7 @@ def run_tests(python: str, versions: Path, folder: Path) -> tuple[str, int, int]
 
 
 def main() -> int:
-    """All pairs; the exit status is 1 if a test failed or no versions fit together."""
+    """Tries all pairs; returns 1 if a test failed or no versions are compatible."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pythons", nargs="+", default=PYTHONS)
     parser.add_argument("--torch", help="version of the CPU wheels that are at hand (default: as resolved)")

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The scripts of ``benchmarks``, which import each other by their names."""
+"""Puts ``benchmarks`` on the import path, since its scripts import each other by name."""
 
 import importlib
 from pathlib import Path
@@ -11,7 +11,7 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 @pytest.fixture(scope="module")
 def benchmark_script():
-    """Imports a script of ``benchmarks`` by its name."""
+    """Returns a function that imports a script of ``benchmarks`` by name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(BENCHMARKS))
         yield importlib.import_module

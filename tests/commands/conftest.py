@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Evaluations without pictures, and recordings of a robot of one's own."""
+"""Fixtures of command tests: evaluations without pictures, and recordings of a user's own robot."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def no_report(monkeypatch):
 
 @pytest.fixture(scope="session")
 def arrays(tmp_path_factory):
-    """Six trajectories of a two-joint arm that reaches for a goal; two have actions."""
+    """Writes six trajectories of a two-joint arm that reaches a goal; two have actions."""
     folder = tmp_path_factory.mktemp("arrays")
     for index, (states, actions) in enumerate(zip(*record(6, 30, joints=2), strict=True)):
         content = {"states": states, "state_names": ["q1", "q2", "goal1", "goal2"], "control_hz": 20.0}

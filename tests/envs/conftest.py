@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What draws is skipped where nothing can be drawn."""
+"""Skips tests that draw on machines without OpenGL."""
 
 import mujoco
 import pytest

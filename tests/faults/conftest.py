@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all faults have in common: one template of everything that can be damaged."""
+"""Fixtures of all faults: one template of everything that can be damaged, and a folder per fault."""
 
 import pytest
 from fault_ledger import Place, make_template

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Small LeRobot data sets that a camera saw, and recordings of one's own robot with cameras that see a square."""
+"""Writes small LeRobot data sets with one camera, and recordings whose cameras show a moving square."""
 
 from pathlib import Path
 

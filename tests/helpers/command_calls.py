@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What the tests of commands share: what a folder holds, and the one line of a command that cannot be done."""
+"""Helper functions of command tests: contents of a folder, and the error line of a failing command."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def fails(capsys, *arguments) -> str:
-    """The one line that a command which cannot be done writes to stderr."""
+    """Runs a command that must fail; returns the single line that it writes to stderr."""
     capsys.readouterr()
     assert koap(*arguments) == 1
     out, err = capsys.readouterr()

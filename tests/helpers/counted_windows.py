@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Trajectories whose observations say which trajectory and step they are, and windows whose actions move the state."""
+"""Makes trajectories whose observations hold trajectory and step, and windows whose actions move the state."""
 
 import torch
 from tensordict import TensorDict
@@ -10,7 +10,7 @@ LENGTHS = (20, 33, 16, 40)
 
 
 def demonstrations(lengths=LENGTHS):
-    """Every observation is (trajectory, step, 0, 0); every action (trajectory, step)."""
+    """Returns flat data with observations (trajectory, step, 0, 0) and actions (trajectory, step)."""
     frames = [
         torch.stack([torch.full((n + 1,), float(i)), torch.arange(n + 1.0), torch.zeros(n + 1), torch.zeros(n + 1)], 1)
         for i, n in enumerate(lengths)
@@ -24,7 +24,7 @@ def seen(batch):
 
 
 def moving_windows():
-    """Windows of states, and actions that are the differences of their first two columns."""
+    """Returns windows of states, with the differences of their first two columns as actions."""
     torch.manual_seed(0)
     state = torch.randn(6, 16, 4).cumsum(1)
     action = torch.cat([state[..., :2].diff(dim=1), torch.full((6, 1, 2), torch.nan)], 1)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What the losses of planner and Diffusion Policy must do alike, as a base class, and the formula of the noise."""
+"""Base class of tests for the losses of planner and Diffusion Policy, and the formula of the noise."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from torchrl.objectives import HardUpdate, SoftUpdate
 
 
 def noised(network, clean, noise, time):
-    """Noised sequences by the formula of the schedule."""
+    """Returns noised sequences by the formula of the schedule."""
     signal = network.schedule.signal.to(clean.dtype)[time.long()][:, None, None]
     return signal * clean + (1 - signal**2).sqrt() * noise
 

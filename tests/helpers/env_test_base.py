@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What every environment of D3IL's tasks has to do; a test file per task subclasses it."""
+"""Base class of tests for the environments of D3IL's tasks; a test file per task subclasses it."""
 
 import os
 from pathlib import Path
@@ -14,13 +14,13 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
 from torchrl_koap.envs.mujoco.controller import FINGER_OPEN
 
-# recordings and human demonstrations that the package never ships; tests that need them skip without
+# recordings and human demonstrations that the package does not ship; tests that need them are skipped without
 SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).parents[3] / "shared"))
 HUMAN = SHARED / "d3il_avoiding_human"
 
 
 def act(env, action, mask=None):
-    """One control step of every environment, or of those in the mask."""
+    """Makes one control step of every environment, or of those in the mask."""
     action = torch.as_tensor(action, dtype=env._dtype).expand(env.batch_size[0], env.task.action_dim)
     tensordict = TensorDict({"action": action}, env.batch_size)
     if mask is not None:
@@ -29,7 +29,7 @@ def act(env, action, mask=None):
 
 
 def recordings_of(task):
-    """What the original simulator did in four episodes, see :func:`start_recorded` and :func:`replay`."""
+    """Loads four recorded episodes of the original simulator, see :func:`start_recorded` and :func:`replay`."""
     file = SHARED / "d3il_reference" / f"{task}.npz"
     if not file.exists():
         pytest.skip(f"no recordings at {file}")
@@ -37,21 +37,21 @@ def recordings_of(task):
 
 
 def contexts_of(recorded, objects):
-    """Contexts of the four recorded episodes, yaw in rad."""
+    """Returns the contexts of the four recorded episodes, yaw in rad."""
     contexts = np.stack([recorded[f"ep{episode}_context"][:objects, :3] for episode in range(4)]).astype(np.float64)
     contexts[..., 2] = np.radians(contexts[..., 2])
     return contexts
 
 
 def start_from(env, index, **state):
-    """Starts an episode of one environment from a physics state, its context and the controller's past left out."""
+    """Starts an episode of one environment from a physics state, without context and past of the controller."""
     data = env.sims.data[index]
     mujoco.mj_resetData(env.sims.model, data)
     for name, value in state.items():
         getattr(data, name)[:] = value
     data.time = 0.001
     mujoco.mj_forward(env.sims.model, data)
-    data.qacc_warmstart[:] = state.get("qacc_warmstart", data.qacc_warmstart)  # the forward pass has replaced it
+    data.qacc_warmstart[:] = state.get("qacc_warmstart", data.qacc_warmstart)  # mj_forward overwrites it
     env.sims.started[index], env.sims.widths[index] = False, FINGER_OPEN
     env._begin_episode(np.array([index]))
 
@@ -70,9 +70,9 @@ def assert_starts_as_recorded(env, recorded):
 
 
 def replay(env, recorded, check, moved):
-    """Sends the recorded commands, of which the first ``moved`` entries are changed by the actions.
+    """Replays the recorded commands; the first ``moved`` entries are sent as changes of the command.
 
-    ``check(episode, step, leaves, where)`` is called after every control step of an episode; the last leaves return.
+    Calls ``check(episode, step, leaves, where)`` after every control step of an episode; returns the last leaves.
     """
     lengths = recorded["n_steps"]
     for step in range(max(lengths)):
@@ -87,11 +87,11 @@ def replay(env, recorded, check, moved):
 
 
 class EnvTestBase:
-    """Batches, partial resets and steps, saved states, contexts and refusals."""
+    """Tests of batches, partial resets and steps, saved states, contexts and errors."""
 
     ENV: type  # the environment
-    PUSH: list  # an action under which something moves
-    STEPS = 20  # control steps after which it has
+    PUSH: list  # an action that moves something
+    STEPS = 20  # control steps until it has moved
 
     def make(self, num_envs=1, **options):
         return self.ENV(num_envs, **({"dtype": torch.float64, "seed": 0} | options))
@@ -106,7 +106,7 @@ class EnvTestBase:
         assert env.rollout(2)["next", "observation"].dtype == dtype
 
     def leaves(self, env):
-        """What a few steps of different pushes lead to."""
+        """Returns the leaves of a few steps with different pushes."""
         share = torch.linspace(0.5, 1, 5, dtype=torch.float64)[: env.batch_size[0], None]
         start = env.reset(**self.contexts(env))
         push = (share * torch.tensor(self.PUSH, dtype=torch.float64)).to(env._dtype)
@@ -206,7 +206,7 @@ class ContextTestBase(EnvTestBase):
         env, contexts = self.make(2), evaluation_contexts(self.make().task)[:2]
         with pytest.raises(ValueError, match="wanted 2, got 1"):
             env.reset(contexts=contexts[:1])
-        with pytest.raises(TypeError, match="'context'"):  # a misspelt keyword would leave them random
+        with pytest.raises(TypeError, match="'context'"):  # a misspelt keyword must not fall back to random contexts
             env.reset(context=contexts)
         contexts[1, -1, 0] = 9.0
         with pytest.raises(ValueError, match=f"context 1 puts '{env.task.objects[-1]}' at .*outside its region"):

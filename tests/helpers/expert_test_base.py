@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""First attempts of a scripted expert, and what every expert has to do; a test file per expert subclasses the base."""
+"""Plays first attempts of scripted experts; base class of their tests, which a test file per expert subclasses."""
 
 import numpy as np
 import pytest
@@ -13,19 +13,19 @@ from torchrl_koap.tasks import get_task
 
 
 def first_attempts(task, modes, contexts, seeds, max_steps=None):
-    """What becomes of the first attempt at every mode, and the environment as they leave it."""
+    """Plays the first attempt at every mode; returns the attempts and the environment in its final state."""
     task = get_task(task)
     env = make_env(task, len(modes), max_steps=max_steps or task.max_steps, dtype=torch.float64)
     return play(env, task, modes, contexts, seeds, lambda over: None), env
 
 
 class ExpertTestBase:
-    """An episode depends on its seed alone, and what does not fit is refused."""
+    """Tests that an episode depends on its seed alone, and that wrong arguments raise errors."""
 
     TASK: str
     EXPERT: type
     MODES = (0, 1)  # two different ones
-    TOLERANCE = 0.0  # by which actions may depend on the batch
+    TOLERANCE = 0.0  # largest allowed difference of actions between batches
 
     def actions(self, modes, seeds, contexts):
         found, _ = first_attempts(self.TASK, modes, contexts, seeds, max_steps=60)
@@ -45,7 +45,7 @@ class ExpertTestBase:
         assert torch.equal(torch.random.get_rng_state(), before[0])
         assert np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002
 
-    def test_what_does_not_fit_is_refused(self):
+    def test_wrong_arguments_raise_errors(self):
         task, (first, second) = get_task(self.TASK), self.MODES
         drawn, width = draw_contexts(task, 2, 0) if task.objects else None, task.observation_dim
 
@@ -66,9 +66,9 @@ class ExpertTestBase:
 
 
 class ContextExpertTestBase(ExpertTestBase):
-    """The same for a task with objects, and most first attempts are good."""
+    """Adds a test for tasks with objects: most first attempts succeed in the requested mode."""
 
-    VARIANTS: dict[str, float] = {}  # further tasks of the expert, and the share of first attempts that are good there
+    VARIANTS: dict[str, float] = {}  # further tasks of the expert, with the least share of good first attempts
 
     @pytest.mark.slow
     @pytest.mark.timeout(900)

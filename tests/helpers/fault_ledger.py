@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A ledger of faults: what is done wrong, and what is to be said of it. One fault is one line.
+"""Defines faults of a user and the error messages that they must give; one fault is one line of a test table.
 
-Every fault is met in this process: ``koap`` is called with its words, and must leave with status 1 and one line, or
-with 2 and the option named. A call that comes to the work itself (training, rollouts) was accepted: it is stopped
-there, so that hundreds of faults take seconds.
+Each fault calls ``koap`` in this process. The call must end with status 1 and one line, or with 2 and the name of the
+option. A call that reaches the work itself (training, rollouts) counts as accepted and is stopped there, so that
+hundreds of faults take seconds.
 """
 
 import contextlib
@@ -22,8 +22,8 @@ import pytest
 from tiny_runs import TINY, koap, write_demonstrations
 
 LONGEST = 60  # s; a fault that takes longer counts as a hang
-EVERY = 25  # of so many faults one is met in `make test`, all of them in `make faults`
-# where a call begins with what it was called for
+EVERY = 25  # `make test` runs one of this many faults, `make faults` all of them
+# functions with which the work of a command begins
 WORK = (
     "torchrl_koap.training.loop.warmup_cosine",
     "torchrl_koap.evaluation.closed_loop.roll_out",
@@ -32,7 +32,7 @@ WORK = (
     "torchrl_koap.commands.run_commands.export_policy",
     "torchrl_koap.data.demonstrations.save_ted",
 )
-# a call of `koap embed` that would do, without the weights of an extra
+# a valid call of `koap embed` that needs no weights of an extra
 EMBED = (
     *("{frames}", "--task", "scooping", "--out", "{out}", "--network", "tiny_network:random_layer"),
     *("--projection", "{network}/projection.safetensors"),
@@ -40,22 +40,22 @@ EMBED = (
 
 
 class AcceptedError(BaseException):
-    """The work was begun."""
+    """Raised when the work begins."""
 
 
 class HangError(BaseException):
-    """Nothing came in time."""
+    """Raised when a call takes longer than :data:`LONGEST`."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Folders of one fault below an empty ``root``, made anew for each from a ``template`` that is not written to."""
+    """Folders of one fault below an empty ``root``, copied from a ``template`` that is never written to."""
 
     root: Path
     template: Path
 
     def get(self, name: str) -> Path:
-        """A copy of a part of the template, or a path where nothing is yet."""
+        """Returns a copy of a part of the template, or a path that does not exist."""
         path, source = self.root / name, self.template / name
         if source.exists() and not path.exists():
             shutil.copytree(source, path)
@@ -64,10 +64,10 @@ class Place:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that goes wrong: a call, the damage done before it, and what its one line and its status must be.
+    """A call, the damage before it, the pattern of its error line and its exit status.
 
     In its words ``{run}``, ``{data}``, ``{ted}``, ``{arrays}``, ``{filmed}``, ``{frames}`` and ``{network}`` stand for
-    folders of the template, ``{out}`` for none. With ``accepted`` nothing is wrong after all.
+    folders of the template, ``{out}`` for a new one. With ``accepted`` the call must be accepted.
     """
 
     name: str
@@ -84,14 +84,14 @@ class Fault:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a call came to: its exit status, ``"accepted"``, ``"hang"`` or the error that escaped; what it printed."""
+    """Result of a call: its exit status, ``"accepted"``, ``"hang"`` or the escaped error; and its error output."""
 
     status: Any
     said: str
 
 
 def meet(fault: Fault, place: Place) -> Outcome:
-    """Does the damage and makes the call."""
+    """Does the damage, makes the call and returns its outcome."""
     words = [_filled(word, place) for word in fault.words]
     if fault.damage is not None:
         fault.damage(place)
@@ -128,7 +128,7 @@ def check(fault: Fault, outcome: Outcome) -> None:
 
 
 def table(faults: Iterable[Fault], every: int = EVERY) -> list[Any]:
-    """Parameters of a test: one fault each; most of them are left to ``make faults``."""
+    """Returns one test parameter per fault; most of them run only in ``make faults``."""
     faults = list(faults)
     names = [fault.id for fault in faults]
     assert len(set(names)) == len(names), f"twice: {sorted({name for name in names if names.count(name) > 1})}"
@@ -139,7 +139,7 @@ def table(faults: Iterable[Fault], every: int = EVERY) -> list[Any]:
 
 
 def make_template(root: Path) -> Path:
-    """A trained run with checkpoints, an evaluation and a log, and data of every kind."""
+    """Makes a trained run with checkpoints and data of every kind."""
     import numpy as np
 
     from torchrl_koap.data import open_dataset, save_ted
@@ -162,7 +162,7 @@ def make_template(root: Path) -> Path:
 
 
 def make_camera_template(root: Path) -> None:
-    """Demonstrations that a camera saw, and a projection fitted behind a network of one's own."""
+    """Makes demonstrations with cameras, and a projection for a custom network."""
     import numpy as np
     import torch
     from camera_sets import write_camera_set
@@ -190,7 +190,7 @@ def make_camera_template(root: Path) -> None:
 
 @contextlib.contextmanager
 def stopped_at_work() -> Iterator[None]:
-    """Inside the block no training and no rollout begins."""
+    """Raises :class:`AcceptedError` when work begins inside the block."""
 
     def stop(*arguments, **options):
         raise AcceptedError
@@ -235,7 +235,7 @@ def flip(path: Path) -> None:
 
 
 def grow(path: Path) -> None:
-    """More than any memory holds; the disk is not asked for it."""
+    """Grows a file beyond any memory; the file is sparse."""
     with path.open("r+b") as file:
         file.truncate(40 << 30)
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A page as its reader sees it: text, tags and links."""
+"""Parses an HTML page into text, tags and links."""
 
 import re
 from html.parser import HTMLParser
@@ -9,7 +9,7 @@ _VOID = {"meta", "img", "rect", "br"}
 
 
 class Page(HTMLParser):
-    """Fails on tags that do not close."""
+    """Parses a page; fails on tags that are not closed."""
 
     def __init__(self, path: Path):
         super().__init__()

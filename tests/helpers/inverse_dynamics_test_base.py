@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What every controller must do, as a base class: ``class TestMine(InverseDynamicsTestBase)`` inherits the tests.
+"""Base class of tests for controllers: ``class TestMine(InverseDynamicsTestBase)`` inherits the tests.
 
-A subclass says how to build its network, which frames an action may read and which frames count.
+A subclass builds its network and sets the frames that an action may read and the frames with full context.
 """
 
 import pytest
@@ -21,7 +21,7 @@ def normalizers():
 
 
 def partly_labelled(*batch, share=0.5, spread=1.0):
-    """Windows of which some frames have labels and some repeat an edge."""
+    """Returns windows in which some frames have labels and some are padding."""
     generator = torch.Generator().manual_seed(4)
     has_action = torch.rand(*batch, T, 1, generator=generator) < share
     action = torch.where(has_action, torch.randn(*batch, T, 2, generator=generator), torch.nan)
@@ -44,19 +44,19 @@ def reached(network, loss):
 
 
 class InverseDynamicsTestBase:
-    """Tests of a controller of states with three columns and actions with two; windows have nine frames."""
+    """Tests of a controller for three state columns and two action columns; windows have nine frames."""
 
     reads: tuple = (-2, -1, 0, 2, 3)  # offsets of the frames that an action may read
-    frames = range(2, 6)  # that count
-    latent = True  # whether it writes latents
-    vectorized = True  # torch.vmap has a rule for all it does
+    frames = range(2, 6)  # valid frames
+    latent = True  # whether it writes latent actions
+    vectorized = True  # whether torch.vmap supports all its operations
 
     def make_network(self, seed: int = 0, **options):
-        """The network with the normalisers above, the same for the same seed."""
+        """Returns the network with the normalisers above; equal seeds give equal networks."""
         raise NotImplementedError
 
     def fitted(self, network):
-        """The network with scales, and whatever it needs to have actions."""
+        """Prepares the network for predictions, such as its scales; returns it."""
         network.prepare(partly_labelled(20)["state"].to(network.state_normalizer.scale))
         return network
 

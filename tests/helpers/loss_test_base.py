@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What every loss module must do, as a base class: ``class TestMyLoss(LossTestBase)`` inherits the tests.
+"""Base class of tests for loss modules: ``class TestMyLoss(LossTestBase)`` inherits the tests.
 
-A subclass says how to build its loss and a batch, and what the defaults are. Batches must hold everything random
-(noise, times), so that a loss is a function of its input.
+A subclass builds its loss and a batch, and lists the defaults. Batches must hold all random values (noise, times), so
+that a loss is a function of its input.
 """
 
 import copy
@@ -15,25 +15,25 @@ from tensordict import TensorDict
 
 
 class LossTestBase:
-    """Tests of a loss module; override the two makers and the facts below them."""
+    """Tests of a loss module; a subclass overrides the class attributes, ``make_loss`` and ``make_batch``."""
 
     default_keys: dict = {}  # name in set_keys -> default entry
-    in_names: tuple = ()  # names (as in set_keys) of the entries that must be there, in the order of in_keys
+    in_names: tuple = ()  # names (as in set_keys) of mandatory entries, in the order of in_keys
     out_keys: tuple = ()
-    coefficients: dict = {}  # coefficient -> the loss that it scales
+    coefficients: dict = {}  # coefficient -> key of the loss that it scales
     learning_rate = 3e-3
-    decrease = 0.7  # of the first value, after 60 steps of Adam
+    decrease = 0.7  # largest allowed ratio of the value after 60 steps of Adam to the first
 
     def make_loss(self, seed: int = 0, **options):
-        """The loss, the same for the same seed."""
+        """Returns the loss; equal seeds give equal losses."""
         raise NotImplementedError
 
     def make_batch(self, *batch: int) -> TensorDict:
-        """A float32 batch of that shape, always the same."""
+        """Returns a float32 batch of that shape, always the same."""
         raise NotImplementedError
 
     def counted(self, batch: TensorDict, key: str, elements: torch.Tensor) -> int:
-        """How many elements the mean of a loss is taken over."""
+        """Returns the number of elements in the mean of a loss."""
         return elements.numel()
 
     def entry(self, name: str):
@@ -132,7 +132,7 @@ class LossTestBase:
         return "has_action" in self.in_names
 
     def test_hidden_actions_reach_neither_value_nor_gradient(self):
-        if not self.reads_labels:  # none is read at all
+        if not self.reads_labels:  # the loss reads no labels at all
             batch = self.make_batch(6)
             return self.assert_same(self.make_loss()(batch), self.make_loss()(batch.exclude("action", "has_action")))
         results = []
@@ -154,7 +154,7 @@ class LossTestBase:
         batch["has_action"] = torch.zeros_like(batch["has_action"])
         batch["action"] = torch.full_like(batch["action"], torch.nan)
         value = loss(batch)[self.out_keys[-1]]
-        assert value == 0 and value.requires_grad  # in the graph: distributed training needs that
+        assert value == 0 and value.requires_grad  # part of the graph, as distributed training needs
         value.backward()
         assert all((value.grad == 0).all() for value in loss.parameters() if value.grad is not None)
 
@@ -195,7 +195,7 @@ class LossTestBase:
             assert value.dtype == torch.float64
             torch.testing.assert_close(value.float(), single[key], rtol=1e-3, atol=1e-5)
 
-    def test_the_network_moves_with_its_loss_and_a_copy_has_one_of_its_own(self):
+    def test_moving_the_loss_moves_its_network_and_copies_have_their_own(self):
         loss = self.make_loss()
         for moved in (loss.double(), copy.deepcopy(loss), pickle.loads(pickle.dumps(loss))):
             assert (moved.network is loss.network) == (moved is loss)
@@ -244,7 +244,7 @@ class LossTestBase:
     # compilation
 
     def test_compiled_equals_eager(self):
-        torch._dynamo.reset()  # TorchRL wraps every loss in one function: their graphs share its recompilation limit
+        torch._dynamo.reset()  # TorchRL wraps all losses in one function, so they share its recompilation limit
         loss, batch = self.make_loss(), self.make_batch(4)
         compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
         self.total(loss(batch)).backward()

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A toy robot without an environment: joints that follow delta commands with a lag, few of them labelled."""
+"""Records and trains a toy robot without environment: joints follow delta commands with a lag, few are labelled."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ TINY = {"planner": {"steps": 20, "batch_size": 8, "width": 8}, "controller": {"s
 
 
 def record(count: int = 10, steps: int = 40, joints: int = 7, *, seed: int = 0):
-    """States ``[steps, 2 * joints]``, joints and where they are to go, and actions ``[steps, joints]``."""
+    """Returns states ``[steps, 2 * joints]`` (joints and their goals) and actions ``[steps, joints]``."""
     generator = np.random.default_rng(seed)
     states, actions = [], []
     for _ in range(count):
@@ -30,7 +30,7 @@ def record(count: int = 10, steps: int = 40, joints: int = 7, *, seed: int = 0):
 
 
 def fit_walks(columns: int, **description) -> Trained:
-    """Two updates on random walks; the robot is the first two columns, whose steps one walk has as actions."""
+    """Trains two updates on random walks of a robot with two columns; one walk has its steps as actions."""
     random = np.random.default_rng(0)
     states = [random.normal(size=(40, columns)).cumsum(0) for _ in range(3)]
     actions = [np.diff(states[0][:, :2], axis=0), None, None]
@@ -62,7 +62,7 @@ def save_arm(
 
 
 def train_arm(out: Path, dataset: Path, **options) -> Path:
-    """A tiny run on it; sections may be given as mappings, which leave the rest as it is."""
+    """Trains a tiny run; sections given as mappings override single options."""
     sections = {}
     for name, kind in {"planner": PlannerConfig, "controller": ControllerConfig}.items():
         asked = options.pop(name, {})

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A GPU that is none: its tensors say ``cuda:0``, compute on the processor, and mix with no others."""
+"""Simulates a GPU: its tensors report ``cuda:0``, compute on the CPU, and do not mix with CPU tensors."""
 
 from contextlib import contextmanager
 
@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 GPU = torch.device("cuda:0")
 FACTS = {"device": GPU, "is_cuda": True, "is_cpu": False}
-MIXING = ("to", "cpu", "copy_", "__getitem__", "__setitem__")  # what takes tensors of two devices, or is checked apart
+MIXING = ("to", "cpu", "copy_", "__getitem__", "__setitem__")  # may take tensors of two devices
 
 
 class GPUTensor(torch.Tensor):
@@ -84,7 +84,7 @@ def _module_to(module, device):
 
 @contextmanager
 def pretended_gpu(monkeypatch):
-    """While it is open tensors and modules can be moved to ``"cuda:0"``, without gradients."""
+    """Lets tensors and modules be moved to ``"cuda:0"`` inside the block, without gradients."""
     with monkeypatch.context() as patch, torch.no_grad(), _Mode():
         patch.setattr(nn.Module, "to", _module_to)
         patch.setattr(nn.Module, "cpu", lambda module: _module_to(module, "cpu"))

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations as D3IL's recorder writes them, for what reads them."""
+"""Writes demonstrations in the format of D3IL's recorder."""
 
 import pickle
 from pathlib import Path
@@ -11,7 +11,7 @@ from torchrl_koap.tasks import get_task
 
 
 def write_raw_episode(path, robot, objects=None, context=None):
-    """One pickle: arrays ``[T, ...]`` of the robot by name, and of every object."""
+    """Writes one pickle: arrays ``[T, ...]`` of the robot by name, and of every object."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     content = {"context": context, "robot": dict(robot), **(objects or {})}

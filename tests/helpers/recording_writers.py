@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The same recordings in every format that is read."""
+"""Writes the same recordings in every supported format."""
 
 import csv
 import json
@@ -15,7 +15,7 @@ LENGTH, RATE = 40, 20.0
 
 
 def columns(seed: int) -> tuple[Columns, Columns]:
-    """States with their time stamps, and actions."""
+    """Returns states with their time stamps, and actions."""
     path = np.random.default_rng(seed).normal(size=(LENGTH, 3)).cumsum(0)
     states = {"timestamp": np.arange(LENGTH) / RATE} | {f"q{index}": path[:, index] for index in range(3)}
     return states, {f"v{index}": 0.1 * path[:, index] for index in range(2)}
@@ -77,7 +77,7 @@ def write_hdf5(folder: Path, episodes: Episodes) -> str:
 
 
 def store_minari(root: Path, name: str, space, action_space, episodes: list[tuple]) -> str:
-    """Written through Minari's own storage: its collector needs packages that only recording needs."""
+    """Writes through Minari's own storage, since its collector needs further packages."""
     pytest.importorskip("minari")
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
@@ -96,7 +96,7 @@ def store_minari(root: Path, name: str, space, action_space, episodes: list[tupl
 
 
 def write_minari(folder: Path, episodes: Episodes) -> str:
-    """Writes where MINARI_DATASETS_PATH has to point to."""
+    """Writes a data set; MINARI_DATASETS_PATH must be the folder."""
     states, actions = episodes[0]
     space = Dict({name: Box(0, 1, (1,), values.dtype) for name, values in states.items()})
     stored = [

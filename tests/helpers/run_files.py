@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Small run directories for the tests of pictures and report."""
+"""Writes small run directories for the tests of pictures and report."""
 
 import json
 from pathlib import Path
@@ -51,7 +51,7 @@ def run_of(task: str | None, folder: Path = Path("run"), **numbers) -> RunFacts:
 
 
 def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, np.ndarray]:
-    """Straight paths from the start to the line, beside each other; the last two collide and run out of time."""
+    """Makes straight paths side by side from start to finish line; the last two collide and time out."""
     share = np.linspace(0, 1, steps)[:, None]
     start, goals = np.array([0.525, -0.28]), np.stack([np.linspace(0.26, 0.72, episodes), np.full(episodes, 0.36)], 1)
     position = start + share * (goals[:, None] - start)
@@ -76,7 +76,7 @@ def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, np.ndarray]:
 
 
 def make_object_rollouts(task: str, episodes: int = 4, steps: int = 20) -> dict[str, np.ndarray]:
-    """:func:`make_rollouts` with bodies that are pushed 0.3 m away from the robot's side, and contexts."""
+    """Extends :func:`make_rollouts` by contexts and by bodies that are pushed 0.3 m."""
     facts = get_task(task)
     rollouts = {key: value[:episodes] for key, value in make_rollouts(max(episodes, 4), steps).items()}
     number, generator = len(facts.bodies), np.random.default_rng(0)
@@ -90,7 +90,7 @@ def make_object_rollouts(task: str, episodes: int = 4, steps: int = 20) -> dict[
 
 
 def make_demonstrations() -> dict[str, np.ndarray]:
-    """Two straight demonstrations of 20 steps, the first one labelled."""
+    """Makes two straight demonstrations of 20 steps, the first one labelled."""
     y = np.linspace(-0.28, 0.36, 20)
     position = np.concatenate([np.stack([np.full(20, x), y], 1) for x in (0.3, 0.7)])
     episode = np.arange(2).repeat(20)
@@ -115,7 +115,7 @@ def write_run(folder: Path) -> Path:
 
 
 def titles(figure) -> list[str]:
-    """Titles of the panels of a figure."""
+    """Returns the titles of a figure's panels."""
     return [axes.get_title(loc="left") for axes in figure.axes]
 
 

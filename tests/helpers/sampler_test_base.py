@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What planner and Diffusion Policy must do alike, as a base class: keys, noise, statistics, shapes, batches."""
+"""Base class of tests for planner and Diffusion Policy: keys, noise, statistics, shapes, batches."""
 
 import copy
 
@@ -12,26 +12,26 @@ DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
 
 
 def walks(number: int, length: int = 16, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-    """Windows of random walks of two columns, ``[number, length, 2]``."""
+    """Returns windows of random walks with two columns, ``[number, length, 2]``."""
     generator = torch.Generator().manual_seed(3)
     return (0.01 * torch.randn(number, length, 2, generator=generator, dtype=dtype)).cumsum(1)
 
 
 class SamplerTestBase:
-    """Tests of a sampler; a subclass says how it is made and fitted, which entry it writes and how wide it is."""
+    """Tests of a sampler; a subclass makes and fits it and sets its output entry and width."""
 
     out_key, width = "", 0
 
     def make(self, **options):
-        """A small one, always with the same weights."""
+        """Returns a small sampler, always with the same weights."""
         raise NotImplementedError
 
     def make_unet(self, **options):
-        """One with a U-Net, for any horizon."""
+        """Returns a sampler with a U-Net, for any horizon."""
         raise NotImplementedError
 
     def fit(self, sampler, dtype=torch.float32):
-        """Fits its statistics to windows of its horizon."""
+        """Fits the sampler's statistics to windows of its horizon; returns it."""
         raise NotImplementedError
 
     def test_encoding_is_undone_by_decoding(self):
@@ -55,10 +55,10 @@ class SamplerTestBase:
 
     def test_states_of_another_type_are_refused(self):
         with pytest.raises(ValueError, match=r"'history' is torch.float64, .* torch.float32: cast one of them"):
-            self.make().sample(torch.zeros(3, 2, 2, dtype=torch.float64))  # as MuJoCo's are in Gymnasium
+            self.make().sample(torch.zeros(3, 2, 2, dtype=torch.float64))  # like states of MuJoCo in Gymnasium
 
     @pytest.mark.parametrize("exploration", ExplorationType)
-    def test_without_noise_every_sample_is_another(self, exploration):
+    def test_samples_differ_if_no_noise_is_given(self, exploration):
         sampler, history = self.make(), torch.randn(3, 2, 2)
         with set_exploration_type(exploration):
             assert not torch.equal(sampler.sample(history), sampler.sample(history))
@@ -94,7 +94,7 @@ class SamplerTestBase:
         with pytest.raises(ValueError, match="one in_key and one out_key"):
             self.make(in_keys=["a", "b"])
 
-    def test_statistics_travel_in_the_state_dict(self):
+    def test_state_dict_holds_the_statistics(self):
         sampler, fresh = self.fit(self.make(num_steps=3)), self.make(num_steps=3)
         with torch.device("meta"):  # networks without storage
             bare = self.make_unet(num_steps=3), self.make(num_steps=3)

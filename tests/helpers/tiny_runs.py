@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations and options with which `koap` is through in a second."""
+"""Demonstrations and options with which `koap train` takes a second."""
 
 import csv
 from pathlib import Path
@@ -17,7 +17,7 @@ START = np.array([0.525, -0.28])
 
 
 def koap(*arguments) -> int:
-    """The exit status of a command run in this process."""
+    """Runs a command in this process; returns its exit status."""
     return main([str(argument) for argument in arguments])
 
 
@@ -26,7 +26,7 @@ def grid(values: np.ndarray) -> np.ndarray:
 
 
 def demonstration(index: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Commanded and measured path (rows, 2): upwards in an arc of its own; the arm follows the command with a lag."""
+    """Returns commanded and measured path (rows, 2): an upward arc per index, followed with a lag."""
     time = np.linspace(0, 1, rows)
     bend = np.sin(np.pi * time) * (index - 3.5) / 40 + 0.004 * np.sin(9 * time + index)
     commanded = grid(START + np.stack([bend, 0.6 * time**1.5], 1))

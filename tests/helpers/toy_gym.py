@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A robot of two joints in Gymnasium, that reports success in different ways."""
+"""Gymnasium environments of a two-joint robot that report success in different ways."""
 
 import gymnasium
 import numpy as np
@@ -9,9 +9,9 @@ NAMES = ("q1", "q2", "goal_1", "goal_2")
 
 
 class Reach(gymnasium.Env):
-    """Joints follow delta commands with a lag; an episode begins anywhere, and lasts ``length`` steps.
+    """Joints follow delta commands with a lag; an episode starts at random and lasts ``length`` steps.
 
-    With ``count`` the task counts as done in step ``count`` of every episode, whatever the robot does.
+    The task succeeds in step ``count`` of every episode, whatever the robot does.
     """
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64)
@@ -75,7 +75,7 @@ for _id, _options in {
     "ToyReachOwnKey-v0": {"key": "arrived"},
     "ToyReachWon-v0": {"terminates": "won"},
     "ToyReachLost-v0": {"terminates": "lost"},
-    "ToyReachFell-v0": {"terminates": "fell"},  # rewarded in every step, as walkers are
+    "ToyReachFell-v0": {"terminates": "fell"},  # a reward in every step, as for walking robots
 }.items():
     gymnasium.register(_id, entry_point=Reach, kwargs=_options)
 gymnasium.register("ToyBreaks-v0", Breaks)
@@ -83,7 +83,7 @@ gymnasium.register("ToyDrawn-v0", Drawn)
 
 
 def reach(robots: int | None = None, **options) -> EnvBase:
-    """The robot in TorchRL, in float32; of several a batch."""
+    """Returns the robot as a TorchRL environment in float32; a batch of ``robots`` if given."""
 
     def one():
         return TransformedEnv(GymEnv("ToyReach-v0", **options), DoubleToFloat(in_keys=["observation"]))

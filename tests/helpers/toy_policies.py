@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Planners, controllers and environments whose outputs say where they are from, and made-up episodes."""
+"""Planners, controllers and environments whose outputs identify their inputs, and synthetic episodes."""
 
 import torch
 from tensordict import TensorDict
@@ -14,7 +14,7 @@ from torchrl_koap.tasks import Modes
 
 
 class CountingPlanner(nn.Module):
-    """Planned frame ``i`` of a plan made at state ``x`` is ``(x + 1000 (i + 1), x)``."""
+    """Plans ``(x + 1000 (i + 1), x)`` as frame ``i`` at state ``x``."""
 
     history, horizon, state_dim = 2, 6, 2
     noise_shape = (6, 2)
@@ -33,7 +33,7 @@ class CountingPlanner(nn.Module):
 
 
 class CountingSampler(CountingPlanner):
-    """Entry ``k`` of a chunk sampled at state ``x`` is ``(k, x, x of the frame before, second column of x)``."""
+    """Samples ``(k, x, previous x, second column of x)`` as entry ``k`` of a chunk at state ``x``."""
 
     noise_shape = (6, 4)
 
@@ -46,7 +46,7 @@ class CountingSampler(CountingPlanner):
 
 
 class EchoController(TensorDictModuleBase):
-    """The action of frame ``t`` is what the window holds: ``x_{t-1}``, ``x_t`` and both columns of ``x_{t+1}``."""
+    """Returns entries of the window as action of frame ``t``: ``x_{t-1}``, ``x_t``, both columns of ``x_{t+1}``."""
 
     def __init__(self, num_past=1, in_key="state", out_key="action"):
         super().__init__()
@@ -60,16 +60,16 @@ class EchoController(TensorDictModuleBase):
 
 
 def state_number(env, episode, step):
-    """The first state column: another number for every environment, episode and step, below 1000."""
+    """Returns the first state column: a number below 1000, unique per environment, episode and step."""
     return float(100 * env + 20 * episode + step)
 
 
 class EpisodesOfRandomLength(EnvBase):
-    """Observations count environment, episode and step; episodes end after a number of steps of their own."""
+    """Observations encode environment, episode and step; each episode has its own number of steps."""
 
     def __init__(self, num_envs, lengths, action_dim=4):
         super().__init__(batch_size=[num_envs])
-        self.lengths = lengths  # [env][episode], repeated from the beginning when used up
+        self.lengths = lengths  # [env][episode], used cyclically
         self.episode = [-1] * num_envs
         self.step_number = [0] * num_envs
         shape = (num_envs,)
@@ -112,7 +112,7 @@ class EpisodesOfRandomLength(EnvBase):
 
 
 class Wandering(nn.Module):
-    """A denoiser whose plan is straight ahead, away from the next cylinder, and to a side read off the noise."""
+    """A denoiser that plans straight ahead, away from the next cylinder, to a side given by the noise."""
 
     def forward(self, x, time, condition):
         now = condition[..., -2:]
@@ -127,12 +127,12 @@ class Wandering(nn.Module):
 
 
 def wandering_planner():
-    """Plans that lead into different gaps, or into cylinders, depending on the noise alone."""
+    """Returns a planner whose plans lead into different gaps or cylinders, depending on the noise alone."""
     return StatePlanner(Wandering(), state_dim=2, horizon=14, relative=False, num_steps=1)
 
 
 class PlannedStep(TensorDictModuleBase):
-    """The action is the difference of the next two frames: a controller without parameters."""
+    """A controller without parameters: its action is the difference of the next two frames."""
 
     def __init__(self):
         super().__init__()
@@ -145,7 +145,7 @@ class PlannedStep(TensorDictModuleBase):
 
 
 def episode_of(steps, *, success=False, collision=False, mode=3, start=0.0, plans=True):
-    """An episode whose position counts its steps; the mode flag is a plain number here."""
+    """Returns an episode whose position counts its steps and whose mode flag is a plain number."""
     count = start + torch.arange(steps + 1.0)[:, None].expand(-1, 4).contiguous()
     flags = {"success": success, "collision": collision}
     nested = {key: torch.zeros(steps, 1, dtype=torch.bool) for key in flags}
@@ -164,5 +164,5 @@ def episode_of(steps, *, success=False, collision=False, mode=3, start=0.0, plan
 
 
 def numbered_modes(number, **options):
-    """Modes whose flag in :func:`episode_of` is their number."""
+    """Returns modes whose flag in :func:`episode_of` is their number."""
     return Modes((("way", tuple(map(str, range(number)))),), tuple((mode,) for mode in range(number)), **options)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Facts of a small task: a tool that is commanded, and a box."""
+"""Arguments of a small task with a commanded tool and a box."""
 
 from torchrl_koap.tasks import Action
 

@@ -1,4 +1,4 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The module here is imported by the tests that need it, not collected: importing registers a method."""
+"""Keeps pytest from collecting the plugin module, since importing it registers a method."""
 
 collect_ignore = ["nearest_neighbour.py"]
