@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Public functions tell what they take, public classes show how they are used."""
+"""Tests that public functions document their arguments and public classes show their use."""
 
 import ast
 import importlib

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Locks between processes, saving that loses nothing, and errors that list every fault."""
+"""Tests locks between processes, saving without loss, and errors that list every fault."""
 
 import errno
 import os

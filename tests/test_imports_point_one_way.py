@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which room may import which; a value that needs another arrow belongs into another room."""
+"""Tests which subpackage may import which; code that needs another import belongs into another subpackage."""
 
 import ast
 import importlib

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The validator accepts the layout and names every departure from it, all at once."""
+"""Tests that the validator accepts the layout and names all departures from it in one error."""
 
 import pytest
 import torch

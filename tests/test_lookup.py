@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Names in tables: what is found, and what is said of a name that is not there."""
+"""Tests the lookup of names in tables, and the errors of unknown names."""
 
 import pytest
 

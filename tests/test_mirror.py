@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Every file of the package has its test file at the same place, or stands here beside the one that covers it."""
+"""Tests that every file of the package has a test file at the same place, or is listed here with another."""
 
 from pathlib import Path
 

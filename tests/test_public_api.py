@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What `import torchrl_koap` offers, and that Python and shell do the same."""
+"""Tests the names of `import torchrl_koap`, and that Python and shell do the same."""
 
 import json
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What the README says can be done: its commands parse, its code runs, its links lead somewhere."""
+"""Tests the README: commands parse, code runs, links exist."""
 
 import importlib.util
 import re

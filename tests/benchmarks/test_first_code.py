@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The networks of the first public code as a plugin: their sizes, what they read, and that they are trained."""
+"""Tests the networks of the first public code as a plugin: sizes, frames read, training."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pages of results are what the committed figures give; tests/docs/test_results_form.py has the form of their text."""
+"""Tests that pages of results match the committed figures; tests/docs/test_results_form.py tests their form."""
 
 import csv
 import re

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Committed cells as tables, and the settings that methods declare."""
+"""Tests tables of committed cells, and that methods declare their tuned settings."""
 
 
 def cell(method, fraction, successes):

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The study of scores: what a row of it holds, and how scores are ranked."""
+"""Tests the study of planner scores: the contents of a row, and rank correlations."""
 
 from functools import partial
 from pathlib import Path

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Grounds become data sets; rows of the table are those of rollouts, or of errors on recordings."""
+"""Tests proving grounds: data sets, and rows of rollouts or of errors on recordings."""
 
 import csv
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Regimes of observation: sizes, seeds, noise, what stays as it was."""
+"""Tests observation models: sizes, seeds, noise, unchanged actions."""
 
 import sys
 from pathlib import Path

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The study of Scooping: options, rows and cells, with planted answers."""
+"""Tests the study of Scooping: options, rows and cells, with known answers."""
 
 import re
 

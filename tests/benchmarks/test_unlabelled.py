@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Controllers that follow demonstrations in a regime: who reads the plan arrives, who stands still does not."""
+"""Tests the study of unlabelled data: rollouts along demonstrations, noise, rows that are not run again."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all commands share: calls, versions, logging to wandb, one command at a time in a folder."""
+"""Tests what all commands share: calls, versions, logging to wandb, one command at a time in a folder."""
 
 import re
 import socket

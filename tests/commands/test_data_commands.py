@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap convert`` and ``koap validate``: what is written, what is said of it, what is refused."""
+"""Tests ``koap convert`` and ``koap validate``: written files, messages, errors."""
 
 import re
 import shutil

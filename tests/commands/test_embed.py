@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From frames beside recordings to actions: convert, embed, train, and what takes frames after it."""
+"""Tests the path from camera frames to actions: convert, embed, train, and commands that read frames afterwards."""
 
 import json
 import shlex

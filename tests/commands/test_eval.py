@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap eval``: what it writes, and what its options change."""
+"""Tests ``koap eval``: the files that it writes and the effects of its options."""
 
 import json
 import re

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From a folder of arrays with few labels to a trained, exported policy by commands alone."""
+"""Tests the commands from a folder of arrays with few labels to a trained, exported policy."""
 
 import json
 import re

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What cannot be done, and disks that are full: one line, nothing left behind, and nothing lost that was there."""
+"""Tests failing commands and full disks: one error line, no new files, no damage to existing ones."""
 
 import errno
 import json

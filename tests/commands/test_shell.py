@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Signals, full devices and odd settings: one line, and the exit status that shells expect."""
+"""Tests signals, full devices and unusual settings: one line, and the exit status that shells expect."""
 
 import os
 import signal

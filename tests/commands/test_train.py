@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap train``: what it writes, what the seed fixes, planners that are taken over, finished runs."""
+"""Tests ``koap train``: written files, effects of the seed, reused planners, finished runs."""
 
 import json
 import shutil

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Actions of another kind than declared are told of, and those of the declared kind are not."""
+"""Tests warnings about actions of another kind than declared, and their absence for correct ones."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A user's own arrays as a data set that holds its whole task."""
+"""Tests a user's own arrays as a data set that holds its whole task."""
 
 import warnings
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The label budget spends what it reports, hides everything else, and nothing downstream can see what it hid."""
+"""Tests that the label budget reports the labels it keeps and hides all others from later steps."""
 
 import json
 import math

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Labels that are logged after the motion that they cause, and robots that respond late."""
+"""Tests the detection of labels logged after the motion that they cause, and of robots that respond late."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Leaps, marks, other units and signs: each is told with its cause."""
+"""Tests warnings about leaps, marks of missing values, other units and signs, each with its cause."""
 
 import re
 

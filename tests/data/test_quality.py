@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations that are right in form and unlikely: each warning names its trajectory."""
+"""Tests warnings about valid but unlikely demonstrations; each names its trajectory."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recovery in closed form: of the robot, of a gripper that closed on nothing, and along differences of windows."""
+"""Tests recovery augmentation in closed form: of the robot, of grippers, and along differences of windows."""
 
 import math
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations as a TorchRL data set."""
+"""Tests demonstrations as a TorchRL data set."""
 
 import pytest
 from torchrl.data.datasets import load_dataset

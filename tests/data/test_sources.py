@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""One way in for every folder of demonstrations: right numbers, right task, noise of its own."""
+"""Tests the loading of demonstration folders: values, task, noise."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scenes are moved and turned as a whole, and alike objects exchanged."""
+"""Tests augmentation that moves and turns whole scenes and exchanges equal objects."""
 
 import functools
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Data sets on disk: what is saved is loaded, with its task; damage and code are refused."""
+"""Tests data sets on disk: saved data are loaded with their task; damage and code raise errors."""
 
 import json
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Trajectories with and without actions become one flat tensordict that says which steps have a label."""
+"""Tests the conversion of trajectories with and without actions to a flat tensordict with label marks."""
 
 import math
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Windows stay inside their trajectory, are padded by its ends, are stored rows, and are drawn as promised."""
+"""Tests windows: they stay inside their trajectory, are padded by its ends, and are sampled as documented."""
 
 import pytest
 import torch

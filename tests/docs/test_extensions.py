@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pages that are made from the code: every tutorial, command, room and frame is on one."""
+"""Tests that every tutorial, command, subpackage and frame is on a generated page."""
 
 import ast
 import re

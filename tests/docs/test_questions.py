@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a newcomer asks is answered on a page that a search for its words finds."""
+"""Tests that a search for a newcomer's question finds a page that answers it."""
 
 import re
 from pathlib import Path

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Every page of results has one form, and every number of its text is one of the CSV files that it links."""
+"""Tests that pages of results have one form, and that each number in their text is in a CSV file they link."""
 
 import csv
 import re

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pages are short and plain: a budget of words, short sentences, no words that are old or hide what is meant."""
+"""Tests that pages are short and plain: number of words, length of sentences, forbidden words."""
 
 import ast
 import re

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""AligningEnv: parity with recordings of the original, contexts, success rule, partial resets, pictures."""
+"""Tests AligningEnv: parity with recordings of the original, contexts, success rule, partial resets, pictures."""
 
 import math
 

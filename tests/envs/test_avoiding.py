@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""AvoidingEnv: parity with recordings of the original, order of events, bad actions."""
+"""Tests AvoidingEnv: parity with recordings of the original, order of events, invalid actions."""
 
 import json
 import pickle

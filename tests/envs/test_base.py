@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Simulated actions come true, and the present is left as it was."""
+"""Tests that simulated actions match later execution and leave the environment unchanged."""
 
 import copy
 import pickle

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Contexts: ranges, repeatability, the shipped table, D3IL's own files, and what is said about wrong ones."""
+"""Tests contexts: ranges, repeatability, the shipped table, D3IL's files, errors of wrong ones."""
 
 import hashlib
 import json

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Environments of Gymnasium side by side: seeds, ends and successes of their own."""
+"""Tests batches of Gymnasium environments with separate seeds, ends and successes."""
 
 import functools
 from dataclasses import replace

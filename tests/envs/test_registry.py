@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Gymnasium registration behaves like the batched environment it wraps."""
+"""Tests that the registered Gymnasium environments behave like the batched environments they wrap."""
 
 import warnings
 

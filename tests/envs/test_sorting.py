@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""SortingEnv: parity with recordings of the original, contexts, rules of success and order, numbers of boxes."""
+"""Tests SortingEnv: parity with recordings of the original, contexts, success, order, numbers of boxes."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""StackingEnv: parity with recordings of the original, what counts as success, gripper, contexts, partial steps."""
+"""Tests StackingEnv: parity with recordings of the original, success, gripper, contexts, partial steps."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Partial observability: dropped parts, noise of a stated size, the same in specs, rollouts and any batch."""
+"""Tests partial observability: dropped columns and noise of a given size in specs, rollouts and batches."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which demonstrations to label next: against brute force, and blind to every label."""
+"""Tests the choice of the next demonstrations to label: against brute force, and without reading labels."""
 
 import json
 import re

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scores of plans on recorded trajectories, and errors on hidden actions, never on a trajectory of the budget."""
+"""Tests plan scores and action errors on recorded trajectories outside the label budget."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Planner alone, controller alone, both: the figures that `koap inspect` tells them apart by."""
+"""Tests the figures of `koap inspect` for planner alone, controller alone, and both."""
 
 import json
 import math

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What is said about a run follows from its numbers."""
+"""Tests that findings about a run follow from its numbers."""
 
 import math
 

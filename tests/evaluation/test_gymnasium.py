@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A run on a robot of one's own is evaluated in an environment of Gymnasium."""
+"""Tests the evaluation of a user's own robot in a Gymnasium environment."""
 
 import json
 import sys

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Spectrum, multi-step errors and linear probe: against systems whose answers are known."""
+"""Tests spectrum, multi-step errors and linear probe on systems with known answers."""
 
 import json
 import math

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A closed loop on the labels finds a policy whose commands grow, and says where labels do not allow one."""
+"""Tests the closed loop on labels: it finds policies with growing commands, and names unsuitable labels."""
 
 import copy
 import json

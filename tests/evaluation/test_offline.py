@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Runs of a robot without an environment, from data to a report."""
+"""Tests runs of a robot without an environment, from data to a report."""
 
 import json
 import math

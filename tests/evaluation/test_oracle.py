@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The oracle controller: the tool goes where the plan says, whatever the batch, and only in a simulation."""
+"""Tests the oracle controller: the tool follows the plan in any batch, and only in a simulation."""
 
 import json
 from dataclasses import replace

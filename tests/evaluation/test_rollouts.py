@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Rollouts that depend on nothing but their seed, and the numbers made of them."""
+"""Tests that rollouts depend on their seed alone, and the numbers computed from them."""
 
 import math
 from dataclasses import replace

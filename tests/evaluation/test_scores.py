@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scores of made-up episodes, computed by hand."""
+"""Tests the scores of synthetic episodes against values computed by hand."""
 
 import pytest
 import torch

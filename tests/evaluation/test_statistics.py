@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Wilson interval and mode entropy against their definitions."""
+"""Tests Wilson interval and mode entropy against their definitions."""
 
 import math
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The example without ``koap train`` is short, names the parts that it shows, and runs."""
+"""Tests that the example without ``koap train`` is short, names its parts and runs."""
 
 import runpy
 import sys

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Camera demonstrations, networks and projections that ``koap embed`` is given, damaged in every way."""
+"""Tests ``koap embed`` on damaged camera demonstrations, networks and projections."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Every option of every command with values that no option of its type can have."""
+"""Tests every option of every command with values that its type does not allow."""
 
 import re
 import types

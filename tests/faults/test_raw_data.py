@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Raw demonstrations and data sets on disk: every entry, every file, damaged in every way; and hostile ones."""
+"""Tests damage to every entry and file of raw demonstrations and data sets, and hostile files."""
 
 import os
 import pickle

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings of one's own robot in every format, with what would mislead a policy: each is told by `koap convert`."""
+"""Tests that `koap convert` warns of recordings, in every format, that would mislead a policy."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Every file of a run, damaged in every way, and every entry of its options with a value of another type."""
+"""Tests damage to every file of a run, and values of another type for every entry of its options."""
 
 import json
 from collections.abc import Callable, Iterator

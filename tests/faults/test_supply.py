@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What the package never does: unpickle, call a shell, look for something on the network."""
+"""Tests that the package never unpickles, calls a shell or reads from the network."""
 
 import re
 import subprocess

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Statistics against closed forms; constant columns, masks, state dicts, and missing statistics."""
+"""Tests statistics against closed forms; constant columns, masks, state dicts, missing statistics."""
 
 import pytest
 import torch

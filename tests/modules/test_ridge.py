@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Ridge regression in closed form: against numpy, and its held-out errors against brute-force refits."""
+"""Tests closed-form ridge regression against numpy, and its held-out errors against refits."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Time alignment: which frames are read, which count, and the scales of steps."""
+"""Tests time alignment: frames read, valid frames, and the scales of steps."""
 
 import pytest
 import torch

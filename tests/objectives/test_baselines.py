@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The loss of predicted actions: a plain loop, padding, and the shared base."""
+"""Tests the loss of predicted actions: a plain loop, padding, and the tests of all losses."""
 
 import pytest
 import torch

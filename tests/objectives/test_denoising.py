@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner's loss, and all that is a denoising loss's: closed forms, keys, reductions, averages, compilation."""
+"""Tests the planner's loss: closed forms, compilation, and the tests of denoising losses."""
 
 import pytest
 import torch

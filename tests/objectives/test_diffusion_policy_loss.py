@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Diffusion Policy's loss: closed forms, alignment in time, labels and padding, and what it learns."""
+"""Tests the Diffusion Policy's loss: closed forms, time alignment, labels, padding, statistics."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Koopman losses: closed forms in plain loops, masks, labels that must not leak, and the shared base."""
+"""Tests the Koopman losses: plain loops, masks, hidden labels, and the tests of all losses."""
 
 import pytest
 import torch

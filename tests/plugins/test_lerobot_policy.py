@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""LeRobot's own functions load the folder, roll it out and ask it for actions; in an environment that has LeRobot."""
+"""Tests the exported folder with LeRobot's own functions, in an environment that has LeRobot."""
 
 import json
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A task from outside the package with simulator and expert, the tutorial's, and one with data alone."""
+"""Tests tasks from outside the package: the tutorial's, with simulator and expert, and one with data alone."""
 
 import sys
 import types

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What to try next follows from the numbers, and nothing is said where they are absent or good."""
+"""Tests that advice follows from the numbers, and that absent or good numbers give none."""
 
 import shlex
 from pathlib import Path

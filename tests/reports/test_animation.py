@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Moving pictures: what is in them, how many frames, where films start, and how they are written."""
+"""Tests animations and films: contents, number of frames, start, and files."""
 
 from pathlib import Path
 

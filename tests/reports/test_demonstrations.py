@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The picture of the demonstrations: which steps it shows as labelled, and the objects beside it."""
+"""Tests the picture of demonstrations: labelled steps and objects."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Losses and predicted actions: what is in the figures, what is said in their titles, and what bad input gets."""
+"""Tests plots of losses and predicted actions: contents, titles, errors of wrong input."""
 
 import math
 from dataclasses import replace

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Spectrum, latent space and experiments: figures say what the numbers say."""
+"""Tests plots of spectrum, latent space and experiments against their numbers."""
 
 import pytest
 from run_files import run_of, titles

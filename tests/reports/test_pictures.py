@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The register of pictures: one decorated function is all that a picture needs, from outside the package too."""
+"""Tests the registry of pictures, also with pictures from outside the package."""
 
 import os
 import subprocess

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Modes as bars, ticks and colours; executed paths and plans, cut, coloured and counted; bodies beside them."""
+"""Tests plots of modes, executed paths, plans and bodies."""
 
 import math
 from pathlib import Path

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a training says at its end: the labels it read, how its parts were trained, why that ended."""
+"""Tests the summary of a training: labels read, training of each part, reason of its end."""
 
 import pytest
 from run_files import LABELS, run_of

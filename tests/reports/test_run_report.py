@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The report: right numbers, nothing dropped, everything escaped, absent and damaged files said."""
+"""Tests the report: numbers, completeness, escaping, absent and damaged files."""
 
 import json
 from pathlib import Path

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scenes and bodies are drawn to scale and where the environments have them."""
+"""Tests that scenes and bodies are drawn to scale and at the positions of the environments."""
 
 import mujoco
 import numpy as np

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Options as JSON: what is written may be read, and anything else is refused by file and name."""
+"""Tests options as JSON: written files are read back, and errors name file and option."""
 
 import json
 

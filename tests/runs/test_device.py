@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Matrix products in bfloat16 only where the machine has units for them, unless asked for by name; GPUs."""
+"""Tests devices and precision: bfloat16 only with hardware units unless requested by name, and GPUs."""
 
 import warnings
 from itertools import cycle

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Methods from outside the package, by name: in a run, in what reads it, in cells, and what is said when not."""
+"""Tests methods from outside the package in runs, in readers of runs, in cells, and in errors."""
 
 import json
 import shutil

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Trained policies of the repository: found by name, written small, evaluated in a folder of one's own."""
+"""Tests the repository's trained policies: lookup by name, compact files, evaluation in the user's folder."""
 
 import json
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Bars are never in the way of the work; loggers write into the run directory, and what is missing is named before."""
+"""Tests that progress bars never stop the work, and that loggers write into the run directory."""
 
 import importlib.util
 import io

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A run goes on as what it was begun as."""
+"""Tests that a resumed run keeps its original options."""
 
 from dataclasses import replace
 

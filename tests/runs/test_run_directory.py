@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Plain files of a run: read back as written, rewound exactly, never half-written."""
+"""Tests files of a run: read back as written, rewound exactly, never half-written."""
 
 import errno
 import tempfile

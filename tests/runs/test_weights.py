@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Weights: complete, refused when they do not fit, never damaged by a failed save."""
+"""Tests weight files: complete, checked when loaded, never damaged by a failed save."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Planners and cells of a study: labels reach no planner, results that cannot be read are made again or named."""
+"""Tests planners and cells of a study: no labels in planners; unreadable results are made again or named."""
 
 import json
 import math

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Jobs in processes: their order, every way in which one can die, what they print, and none that stays behind."""
+"""Tests jobs in processes: order, all ways of dying, output, and no leftover processes."""
 
 import importlib.util
 import multiprocessing

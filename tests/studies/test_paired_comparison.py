@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Paired comparison: exact cases by hand, coverage of a known difference, unequal pairs, correction."""
+"""Tests the paired comparison: exact cases, coverage of a known difference, unequal pairs, correction."""
 
 import itertools
 

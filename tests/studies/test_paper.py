@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The paper's tables as data, measured cells in their layout beside them, averages over whole rows of tasks alone."""
+"""Tests the paper's tables as data, measured cells in their layout, averages over complete tasks."""
 
 import pytest
 

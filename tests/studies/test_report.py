@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Report and pictures of a curve: written whatever is absent, right comparisons, everything said and escaped."""
+"""Tests report and pictures of a curve: written with missing parts, correct comparisons, escaping."""
 
 import random
 import re

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap curve``: what it writes, that it grows and goes on without redoing, and that nothing takes it down."""
+"""Tests ``koap curve``: written files, added cells, resuming, and errors of single cells."""
 
 import json
 import os

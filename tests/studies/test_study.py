@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a study asks of its cells: shared planners, defaults of methods, presets of the paper; nothing is trained."""
+"""Tests the cells that a study defines: shared planners, defaults of methods, presets of the paper."""
 
 from dataclasses import replace
 from pathlib import Path

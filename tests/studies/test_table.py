@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Cells as a file, pooled and as a table: nothing dropped, types kept, damage named."""
+"""Tests cells as a file, pooled and as a table: complete rows, types, errors of damage."""
 
 import math
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The gripper's number from widths: labels of recordings and commands of plans follow one rule."""
+"""Tests the gripper's number from widths: recordings and plans follow one rule."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Facts of a task that do not fit each other are named, all at once."""
+"""Tests that all inconsistent arguments of a task are named in one error."""
 
 from dataclasses import replace
 

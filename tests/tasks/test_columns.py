@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Observation columns to state columns, the layouts of all tasks, and angles as points on the unit circle."""
+"""Tests state columns of observations, the layouts of all tasks, and angles on the unit circle."""
 
 import math
 

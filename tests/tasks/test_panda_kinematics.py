@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Kinematics in torch equal those of the simulator."""
+"""Tests that kinematics in torch equal those of the simulator."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Tasks are found by name: registered ones, and those of installed packages."""
+"""Tests that tasks are found by name: registered ones, and those of installed packages."""
 
 import importlib.metadata
 from unittest.mock import patch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Facts of the tasks are those of docs/appendix/d3il.md, survive JSON, and name modes and goals as environments do."""
+"""Tests that tasks match docs/appendix/d3il.md, survive JSON, and name modes and goals as environments do."""
 
 import itertools
 import json

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The weights that score best on held-out trajectories are kept, and a training ends when they are found."""
+"""Tests that weights with the best held-out score are kept, and that training then ends."""
 
 import pytest
 import torch

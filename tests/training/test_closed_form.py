@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The closed-form fit of a finished controller: which labels it sees, and how often."""
+"""Tests the closed-form fit of a controller: which labels it uses, and how often."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations of a task, and trajectories that the planner never sees."""
+"""Tests demonstrations of a task, and trajectories held out from the planner."""
 
 import json
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What is trained where nothing is asked for: asked > method > task > network > library."""
+"""Tests the order of defaults: given > method > task > network > library."""
 
 from dataclasses import fields, replace
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Gradients far longer than those before are shortened."""
+"""Tests that gradients far longer than earlier ones are shortened."""
 
 import math
 

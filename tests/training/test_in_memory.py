@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Fitting in memory does what `koap train` does, on data that lack labels."""
+"""Tests that fitting in memory does what `koap train` does, on data with missing labels."""
 
 from pathlib import Path
 

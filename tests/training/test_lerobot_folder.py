@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The folder that LeRobot reads; that LeRobot runs it is tested beside its plugin."""
+"""Tests the folder that LeRobot reads; tests of its plugin run it with LeRobot."""
 
 import json
 from dataclasses import replace

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The training loop: what one update is, what is logged, resuming bit for bit, and gradients that are outliers."""
+"""Tests the training loop: updates, logging, exact resuming, and gradients that are outliers."""
 
 import math
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The table of methods: every entry can be built, its losses train it, and unknown names are answered."""
+"""Tests the table of methods: entries can be built and trained, unknown names raise errors."""
 
 import warnings
 from pathlib import Path

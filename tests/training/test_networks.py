@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From options to planners and controllers."""
+"""Tests the construction of planners and controllers from options."""
 
 import numpy as np
 import pytest

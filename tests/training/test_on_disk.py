@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Every method through ``koap train``: hidden labels reach no weight, and a killed run ends as if it was not."""
+"""Tests every method through ``koap train``: no weight depends on hidden labels; killed runs resume exactly."""
 
 import json
 from dataclasses import replace

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a planner's training decides by itself: how often it is scored, and what its columns count."""
+"""Tests a planner's training: number of scores, weights of columns, augmentation."""
 
 from dataclasses import replace
 

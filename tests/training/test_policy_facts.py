@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What labels are learned as: changes of a command, or the command itself where a task asks for it."""
+"""Tests what labels are learned as: changes of a command, or the command itself if the task requires it."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Relabelling: which window an action is read from, what stays, and that no hidden action is read."""
+"""Tests relabelling: the window of each action, unchanged labels, no hidden action is read."""
 
 import pytest
 import torch

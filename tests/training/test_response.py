@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Fitting the response on labelled steps: known systems are found, hidden labels are not read, predictions count."""
+"""Tests the fit of the response on labelled steps: known systems, hidden labels, prediction errors."""
 
 import math
 

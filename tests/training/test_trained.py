@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A training as one file acts as it did, and files that cannot be used are named."""
+"""Tests that a training saved as one file acts the same, and that unusable files raise errors."""
 
 import json
 import shutil

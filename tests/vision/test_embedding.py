@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Camera frames as columns of a data set: which ones, fitted to what, resumed, and what is refused."""
+"""Tests camera frames as columns of a data set: choice, fitting, resuming, errors."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Frozen encoders: what is kept, what is refused."""
+"""Tests frozen encoders: their features, files and errors."""
 
 import importlib.util
 import warnings

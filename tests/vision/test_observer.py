@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a robot gives, with frames, as the observation that a policy reads: columns in order, and what is refused."""
+"""Tests observations from a robot's numbers and frames: order of columns, and errors."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Raw episodes become the columns of docs/appendix/d3il.md; D3IL's folders and lists; files of another task."""
+"""Tests the conversion of raw episodes to the columns of docs/appendix/d3il.md, D3IL's folders, wrong files."""
 
 import dataclasses
 import os

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Hostile and damaged pickles are refused by name; arrays of every kind and protocol survive."""
+"""Tests that hostile and damaged pickles raise named errors, and that arrays of every kind are read."""
 
 import collections
 import copyreg

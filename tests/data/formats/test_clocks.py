@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Time stamps: the rate that they say, and columns that are clocks by what they do."""
+"""Tests time stamps: the rate computed from them, and the detection of clock columns."""
 
 import re
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Named columns as recordings: what is no state, where episodes end, and the rate by the time stamps."""
+"""Tests named columns as recordings: columns that are not states, ends of episodes, the rate by time stamps."""
 
 from dataclasses import replace
 

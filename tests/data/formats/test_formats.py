@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The format of a folder, file or name decides who reads it; what is written is read back."""
+"""Tests that the format of a folder, file or name selects the reader, and that written data are read back."""
 
 import re
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Camera frames stay where they are: what a reference reads is what was recorded, and what is missing is named."""
+"""Tests references to camera frames: they return the recorded frames and name what is missing."""
 
 import json
 

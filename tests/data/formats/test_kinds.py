@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a column is: by its name, and by what it holds."""
+"""Tests the classification of columns by their name and content."""
 
 import numpy as np
 import pytest

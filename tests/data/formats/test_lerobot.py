@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""LeRobot data sets of robots that no task describes, with labels for a part of the rows or none."""
+"""Tests LeRobot data sets of unregistered robots, with labels for some rows or none."""
 
 import importlib.util
 import io

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Minari data sets on this machine."""
+"""Tests local Minari data sets."""
 
 import numpy as np
 import pytest

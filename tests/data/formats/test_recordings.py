@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Arrays as recordings: what is a label, and one clear message per fault."""
+"""Tests arrays as recordings: which rows are labels, and one clear message per fault."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings at another rate: states between frames, and what becomes of actions."""
+"""Tests recordings at another rate: states between frames, and resampled actions."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""HDF5 files in robomimic's layout."""
+"""Tests HDF5 files in robomimic's layout."""
 
 import io
 import json

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Folders of NumPy archives, CSV and parquet files."""
+"""Tests folders of NumPy archives, CSV and parquet files."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a LeRobot data set looks like on disk; reading it back is tested with the readers."""
+"""Tests the files of a written LeRobot data set; the readers' tests read it back."""
 
 import json
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The simulated player for Aligning: it succeeds in the asked mode and moves like a hand."""
+"""Tests the scripted expert of Aligning: success in the requested mode, smooth motion."""
 
 import math
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The simulated player: takes the asked mode, and lets go behind the finish line."""
+"""Tests the scripted expert of Avoiding: it takes the requested mode and stops behind the finish line."""
 
 import numpy as np
 from expert_test_base import ExpertTestBase, first_attempts

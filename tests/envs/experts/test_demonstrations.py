@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recorded demonstrations: right modes, right rows, repeatable; written as they come, interrupted at no cost."""
+"""Tests recorded demonstrations: modes, rows, repeatability, resuming after an interruption."""
 
 import json
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Disturbances of scripted operators: what they do to actions, who is disturbed, what the recording says of it."""
+"""Tests disturbances of scripted experts: effects on actions, share of episodes, notes in the recording."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The simulated player of Sorting: brings the boxes in the asked order."""
+"""Tests the scripted expert of Sorting: it sorts the boxes in the requested order."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""StackingExpert: takes the wanted order and plays through the environment alone."""
+"""Tests StackingExpert: it stacks in the requested order and acts through the environment alone."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The compiled controller against MuJoCo's kinematics, NumPy's linear algebra and the recorded substeps."""
+"""Tests the compiled controller against MuJoCo's kinematics, NumPy's linear algebra and recorded substeps."""
 
 import mujoco
 import numpy as np

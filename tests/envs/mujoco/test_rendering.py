@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pictures, their cameras, and what is said where none can be drawn."""
+"""Tests pictures, their cameras, and the errors of machines that cannot draw."""
 
 import os
 import subprocess

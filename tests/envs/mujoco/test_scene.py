@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The arm's numbers, its variants and the errors of a missing mesh package."""
+"""Tests the arm's numbers, its variants and the errors of a missing mesh package."""
 
 import importlib
 import importlib.util

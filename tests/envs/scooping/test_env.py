@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scooping: physics, outcome, absolute targets, an expert that succeeds, and a bowl that stands anywhere."""
+"""Tests Scooping: physics, outcome, absolute targets, the expert, and a bowl at random positions."""
 
 import functools
 

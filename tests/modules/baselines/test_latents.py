@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latents without labels: codes, and the auto-encoder of windows, in plain loops; what each stage trains."""
+"""Tests latents without labels against plain loops: codes, the window auto-encoder, trained weights per stage."""
 
 import math
 

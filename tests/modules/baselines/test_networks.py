@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The supervised perceptron, and KOAP with nonlinear maps: frames read, plain loops, which term trains what."""
+"""Tests the supervised perceptron and nonlinear KOAP: frames read, plain loops, gradients of each term."""
 
 import torch
 from inverse_dynamics_test_base import ACTION, STATE, InverseDynamicsTestBase, T, normalizers, partly_labelled

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Ridge regressions: exact on a linear system, blind to hidden labels; components of windows, and their number."""
+"""Tests ridge regressions on linear systems and hidden labels; components of windows, and their number."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A policy in a control loop: the actions of a rollout, one robot or a batch, and clear refusals."""
+"""Tests a policy in a control loop: equal actions as in rollouts, one robot or a batch, clear errors."""
 
 import warnings
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Plans made while the one before is executed."""
+"""Tests planning in a thread while the previous plan is executed."""
 
 import threading
 import warnings

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Range, gain and lead: commands stay in range and near their robot, actions that do are left alone, policies agree."""
+"""Tests range, gain and lead: they limit commands, leave valid actions unchanged, and agree between policies."""
 
 import math
 

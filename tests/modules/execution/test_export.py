@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Exported policies give the numbers of the policy."""
+"""Tests that exported policies return the numbers of the policy."""
 
 import importlib.util
 import json

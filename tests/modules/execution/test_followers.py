@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A plan becomes actions: it is bent into the present state, decoded, and a rule has the last word."""
+"""Tests plan followers: blending with the present state, decoding, and a final rule for actions."""
 
 import pytest
 import torch

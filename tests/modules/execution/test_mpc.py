@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The response to commands, that a fit finds it, and plans that are followed by it."""
+"""Tests the response to commands: fitting it, and following plans with it."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The noise of an episode depends on its seed and step alone; agents, environments and evaluations draw the same."""
+"""Tests that an episode's noise depends on seed and step alone, equally in agents, environments and evaluations."""
 
 import pytest
 import torch

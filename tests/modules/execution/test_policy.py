@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which frame of which plan is used at which step, against a reference loop."""
+"""Tests which frame of which plan is used at each step, against a reference loop."""
 
 import pickle
 

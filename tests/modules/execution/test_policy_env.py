@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The seed of an environment fixes whole rollouts, alone, in batches of environments and in collectors."""
+"""Tests that the seed of an environment fixes rollouts, alone, in batches and in collectors."""
 
 from functools import partial
 

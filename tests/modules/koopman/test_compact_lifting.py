@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Components in units of the noise, coordinates along curved surfaces, and a lifting that finds their number."""
+"""Tests the compact lifting: components in units of noise, coordinates of curved surfaces, their number."""
 
 import copy
 

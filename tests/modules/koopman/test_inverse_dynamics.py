@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The inverse dynamics model: inference path, normalisers, keys, fitting, saving, composition."""
+"""Tests the inverse dynamics model: inference, normalisers, keys, fitting, saving, composition."""
 
 import inverse_dynamics_test_base as base
 import pytest

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latent-action networks: what they gather, how it is scaled, and the kernel behind the Fourier observables."""
+"""Tests latent-action networks: frames read, scaling, and the kernel of the Fourier features."""
 
 import math
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Lifting: observables that are the state, linear maps of principal components, and the operator."""
+"""Tests lifting and operator: states as observables, and linear maps by principal components."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Presets: every weight of each is trained, options are checked and reach the parts."""
+"""Tests presets: every weight is trained, and options are checked and passed to the parts."""
 
 import pytest
 import torch

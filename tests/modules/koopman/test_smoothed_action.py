@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latent actions of a lifted, smoothed window, the choice of the raw one, and the smoother itself."""
+"""Tests latent actions of smoothed windows, the choice of the raw window, and the smoother."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Denoisers: shapes, dependence on time and condition; features that are right when the scene is moved and turned."""
+"""Tests denoisers: shapes, dependence on time and condition, features invariant to moved and turned scenes."""
 
 import math
 

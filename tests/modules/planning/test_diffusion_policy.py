@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Diffusion Policy as a module: units, condition, hidden labels, and all that is a sampler's."""
+"""Tests the Diffusion Policy as a module: units, condition, hidden labels, and the tests of samplers."""
 
 import pytest
 import torch

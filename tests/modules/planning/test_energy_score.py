@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Scores of sampled sequences against recorded ones."""
+"""Tests scores of sampled sequences against recorded ones."""
 
 import math
 

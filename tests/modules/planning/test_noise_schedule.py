@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Schedule and solvers: closed forms, and agreement with an independent implementation."""
+"""Tests schedule and solvers against closed forms and an independent implementation."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner as a module: coordinates, modes of a bimodal future, and all that is a sampler's."""
+"""Tests the planner as a module: coordinates, modes of a bimodal future, and the tests of samplers."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The U-Net: any horizon, padding, conditions with edges, impossible sizes."""
+"""Tests the U-Net: any horizon, padding, conditions with edges, impossible sizes."""
 
 import pytest
 import torch
