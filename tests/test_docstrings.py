@@ -61,7 +61,7 @@ def is_no_record_or_error(node):
     ],
     ids=["arguments", "results", "errors", "examples"],
 )
-def test_what_is_exported_tells_its(concerns, sections, least):
+def test_exported_definitions_document(concerns, sections, least):
     concerned = [(name, text) for name, node, text in exported_definitions() if concerns(node)]
     assert [name for name, text in concerned if not any(section in text for section in sections)] == []
     assert len(concerned) > least

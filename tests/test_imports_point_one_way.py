@@ -70,7 +70,7 @@ def test_imports_point_one_way(room):
             assert name in allowed, f"{file.relative_to(PACKAGE)} imports {name}"
 
 
-def test_nobody_names_the_commands():
+def test_no_other_subpackage_names_the_commands():
     files = [file for file in PACKAGE.rglob("*.py") if file.parent.name != "commands"]
     assert len(files) > 50 and not [file for file in files if "torchrl_koap.commands" in file.read_text()]
 

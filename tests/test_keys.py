@@ -100,7 +100,7 @@ def test_widths_must_agree():
     assert problems(data) == ["'observation' has 4 columns, ('next', 'observation') has 3"]
 
 
-def test_a_half_poisoned_label_is_a_fault():
+def test_an_unlabelled_action_that_is_partly_nan_is_a_fault():
     data = flat()
     data["action"][1, 0] = float("nan")
     data["has_action"][1] = False

@@ -64,7 +64,7 @@ def test_every_command_is_shown():
     assert len(CALLS) >= 8  # the three of `make demo` among them
 
 
-def test_the_demo_is_the_contract():
+def test_the_demo_has_the_documented_labels_and_rollouts():
     """`make demo` trains on 2 % of the trajectories and rolls out 60 times."""
     demos, train, evaluation = (parsed(words[1:]) for words in RECIPES)
     assert train.config.labels == LabelConfig(fraction=0.02)
@@ -144,5 +144,5 @@ def test_options_named_in_the_text_exist():
         ), option
 
 
-def test_nothing_is_left_to_fill_in():
+def test_no_placeholders_remain():
     assert not re.findall(r"@@|TODO|XXX|FIXME", TEXT)

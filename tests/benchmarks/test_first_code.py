@@ -35,7 +35,7 @@ def test_parts_have_its_sizes_and_read_its_frames(first_code):
 
 
 @pytest.mark.parametrize("method", ["first_code", "first_code_dd"])
-def test_they_are_methods_like_all_others(first_code, method):
+def test_fit_trains_both_methods(first_code, method):
     states = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(3)]
     data, task = make_demonstrations(states, [np.diff(states[0], axis=0), None, None], control_hz=30)
     results = fit(data, task, method=method, planner=False, controller={"steps": 2}, progress=False).results

@@ -56,7 +56,7 @@ def wilson(successes, n, z=1.959963984540054):
 
 
 @pytest.mark.parametrize("path", sorted(SOURCE.glob("*.csv")), ids=lambda path: path.stem)
-def test_figures_are_whole(path):
+def test_rows_are_complete_and_within_range(path):
     """Every row has all columns; successes lie within n, means within their range, and each comes from a command."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file, restkey="more", restval=None, strict=True))

@@ -11,7 +11,7 @@ from torchrl_koap import fit
 from torchrl_koap.data import save_demonstrations
 
 
-def test_a_row_says_how_a_planner_scored_and_how_often_it_succeeded(tmp_path, monkeypatch, capsys):
+def test_a_row_holds_scores_and_successes_of_a_planner(tmp_path, monkeypatch, capsys):
     states = [torch.randn(30, 4, generator=torch.Generator().manual_seed(i)).cumsum(0).numpy() for i in range(6)]
 
     def write(folder: Path) -> None:
@@ -32,7 +32,7 @@ def test_a_row_says_how_a_planner_scored_and_how_often_it_succeeded(tmp_path, mo
     assert all(float(number) > 0 for number in first.split(",")[6:8])
 
 
-def test_a_score_that_orders_planners_as_their_failures_has_rank_correlation_one(monkeypatch, capsys):
+def test_a_score_that_ranks_planners_like_their_failures_has_rank_correlation_one(monkeypatch, capsys):
     keys = ("plan_score", "energy_score", "successes")
     scored = [(0.2, 0.3, 9), (0.3, 0.2, 7), (0.9, 0.1, 1)]
     rows = [{"ground": "toy", "seed": "0", "n": "10", **dict(zip(keys, map(str, row), strict=True))} for row in scored]

@@ -70,7 +70,7 @@ def test_frames_of_recorded_states_become_columns(monkeypatch, tmp_path):
     torch.testing.assert_close(seen.float(), steps["observation"][29 + 4], rtol=1e-4, atol=1e-4)
 
 
-def test_what_is_missing_is_skipped_by_name(monkeypatch, capsys, tmp_path):
+def test_grounds_with_missing_data_or_packages_are_skipped_by_name(monkeypatch, capsys, tmp_path):
     away = Ground(lambda folder: None, "success", (5,), 1, data=tmp_path / "away.npz")
     bare = Ground(lambda folder: None, "success", (5,), 1, package="no_such_simulator", install="pip install it")
     monkeypatch.setattr(run, "grounds", lambda: {"away": away, "bare": bare})

@@ -34,7 +34,7 @@ def test_a_seed_fixes_a_regime_and_actions_stay(name):
     assert torch.equal(seen["state"], apply_regime(data, name, seed=4)["state"]) == (not random)
 
 
-def test_hidden_columns_are_gone():
+def test_hidden_columns_are_not_observed():
     data = make_data(columns=4)
     seen = apply_regime(data, Regime("dark", "", hidden=(0, 2)))["state"]
     assert torch.equal(seen, data["state"][:, [1, 3]])
@@ -45,14 +45,14 @@ def test_hidden_columns_are_gone():
 
 
 class TestRegimeSensor:
-    def test_shows_other_states_as_it_showed_the_recorded_ones(self):
+    def test_other_states_are_observed_like_recorded_ones(self):
         data = make_data()
         sensor = RegimeSensor(data, "wide_64")
         torch.testing.assert_close(sensor.show(data["state"][40:50]), sensor.recorded[40:50])
         middle = (data["state"][3] + data["state"][4]) / 2
         assert (sensor.show(middle[None]) - sensor.recorded[3]).abs().max() > 0
 
-    def test_noise_is_new_at_every_call_and_as_strong_as_in_the_data(self):
+    def test_noise_is_drawn_anew_and_scaled_by_the_steps_of_the_data(self):
         data = make_data(6000)
         sensor = RegimeSensor(data, "noise", seed=2)
         recorded, later = (sensor.noisy(sensor.recorded) - sensor.recorded for _ in range(2))

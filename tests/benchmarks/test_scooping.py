@@ -15,7 +15,7 @@ from tiny_runs import read_csv
         ({"labels": (5,), "demonstrations": 3}, "labels must be from 1 to the 3 demonstrations, got 5"),
     ],
 )
-def test_what_cannot_be_run_is_refused_before_anything_is_recorded(benchmark_script, asked, said, tmp_path):
+def test_wrong_options_raise_errors_before_anything_is_recorded(benchmark_script, asked, said, tmp_path):
     with pytest.raises(ValueError, match=re.escape(said)):
         benchmark_script("scooping").main(folder=tmp_path / "none", **asked)
     assert not (tmp_path / "none").exists()
@@ -87,7 +87,7 @@ def test_hand_alone_has_a_planner_per_number_of_labels_and_dp_none(study, tmp_pa
         ("none", [("robot", 2)]),
     ],
 )
-def test_a_data_set_holds_the_demonstrations_it_is_called_after(study, monkeypatch, tmp_path, unlabelled, whose):
+def test_a_data_set_holds_the_demonstrations_of_its_name(study, monkeypatch, tmp_path, unlabelled, whose):
     asked = []
     monkeypatch.setattr(study, "embed_recordings", lambda *given, **how: asked.append((given, how)))
     study.data_set(tmp_path, unlabelled, 2)

@@ -45,7 +45,7 @@ def shown(script, demonstrations, regime):
     return sensor, seen.set("episode", torch.unique(data["episode"], return_inverse=True)[1])
 
 
-def test_who_follows_arrives_and_who_stands_still_does_not(script, demonstrations):
+def test_a_controller_that_follows_the_plan_succeeds_and_one_that_stands_still_fails(script, demonstrations):
     sensor, seen = shown(script, demonstrations, "plain")
     episodes, task = torch.arange(6), get_task("avoiding")
     moved, stood = (script.follow(Next(gain), sensor, seen, task, episodes, 0.0, 0) for gain in (1.0, 0.0))
@@ -54,16 +54,14 @@ def test_who_follows_arrives_and_who_stands_still_does_not(script, demonstration
     assert moved["distance_mm"] < 40 < stood["distance_mm"]
 
 
-def test_noise_is_that_of_the_seed_whatever_ran_before(script, demonstrations):
+def test_noise_depends_on_the_seed_alone(script, demonstrations):
     task, episodes = get_task("avoiding"), torch.arange(2)
     sensor, seen = shown(script, demonstrations, "noise")
     first, second, other = (script.follow(Next(1.0), sensor, seen, task, episodes, 0.8, seed) for seed in (3, 3, 4))
     assert first == second != other
 
 
-def test_rows_are_not_run_again_and_of_two_tables_that_alone_which_lacks_some(
-    script, demonstrations, tmp_path, monkeypatch
-):
+def test_only_missing_rows_of_each_table_are_run(script, demonstrations, tmp_path, monkeypatch):
     monkeypatch.setattr(script, "JUDGED", 2)
     asked = {"dataset": demonstrations, "observed": ("wide_64",), "methods": ("linear_steps",), "labels": (1, 2)}
     asked |= {"seeds": (1,), "judged": 2, "folder": tmp_path}

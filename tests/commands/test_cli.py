@@ -27,7 +27,7 @@ from torchrl_koap.runs.run_directory import RunDirectory
         (["train", "--out", "x", "--device"], "--device"),
     ],
 )
-def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
+def test_a_wrong_call_exits_with_2_and_a_hint(arguments, hint, capsys):
     with pytest.raises(SystemExit) as left:
         koap(*arguments)
     assert left.value.code == 2
@@ -58,13 +58,13 @@ def test_a_wrong_call_leaves_with_2_and_a_hint(arguments, hint, capsys):
         ("curve --out x --labels 0.1 few", "--labels must be a number, got 'few'"),
     ],
 )
-def test_a_wrong_word_gets_one_line(call, said, capsys):
+def test_a_wrong_argument_gets_one_line(call, said, capsys):
     with pytest.raises(SystemExit) as left:
         koap(*call.split())
     assert left.value.code == 2 and capsys.readouterr().err == f"koap: {said}\n"
 
 
-def test_no_word_at_all_shows_every_command(capsys):
+def test_a_call_without_arguments_lists_every_command(capsys):
     assert koap() == 2
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("usage: koap COMMAND") and "koap bench --table 1" in err
@@ -103,7 +103,7 @@ def test_a_curve_takes_the_environment_as_an_evaluation_does():
 
 
 @pytest.mark.parametrize("command", [kind.__name__.lower() for group in GROUPS.values() for kind in group])
-def test_every_default_is_shown_once_and_where_it_says_something(command, capsys, monkeypatch):
+def test_defaults_are_shown_once_and_only_if_informative(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     text = help_of(capsys, command, "--help-all" if command == "train" else "--help")
     assert not re.findall(r"\{None\}|default: None|default: False|default: \)|--no-quiet|\[\w+ \[", text)
@@ -113,7 +113,7 @@ def test_every_default_is_shown_once_and_where_it_says_something(command, capsys
     assert max(map(len, text.splitlines()[1:])) <= 80
 
 
-def test_as_a_program():
+def test_the_installed_program_gives_its_exit_status_and_one_line():
     """Through the installed entry point: exit status, and one line on stderr."""
     program = Path(sys.executable).with_name("koap")
     command = [str(program)] if program.exists() else [sys.executable, "-m", "torchrl_koap.commands.cli"]
@@ -134,7 +134,7 @@ def test_doctor_lists_versions(capsys):
     assert "installed" in lines["extra wandb"]
 
 
-def test_demonstrations_are_recorded_once_and_are_sound(tmp_path, capsys):
+def test_demonstrations_are_recorded_once_and_are_valid(tmp_path, capsys):
     assert koap("demos", "--out", tmp_path / "demos", "--episodes", 2, "--seed", 4) == 0
     assert "2 demonstrations of avoiding" in capsys.readouterr().out
     assert "holds a data set, recordings or a run already; choose another --out" in fails(
@@ -173,7 +173,7 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"koap {torchrl_koap.__version__}\n"
 
 
-def test_quiet_says_nothing_but_what_went_wrong(demonstrations, tmp_path, capsys):
+def test_quiet_prints_only_errors(demonstrations, tmp_path, capsys):
     command = ("train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--quiet")
     assert koap(*command) == 0
     assert capsys.readouterr() == ("", "")

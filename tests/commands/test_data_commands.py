@@ -49,7 +49,7 @@ def test_without_labels_no_training_is_proposed(tmp_path, capsys):
     assert re.search("next +add actions to a few recordings", capsys.readouterr().out)
 
 
-def test_a_rate_against_the_stamps_is_a_warning_of_the_table(tmp_path, capsys):
+def test_a_rate_that_contradicts_the_time_stamps_gives_a_warning(tmp_path, capsys):
     rows = "".join(f"{frame / 100},{frame % 7}\n" for frame in range(30))
     (tmp_path / "raw").mkdir()
     (tmp_path / "raw" / "a.csv").write_text(f"time,x\n{rows}")

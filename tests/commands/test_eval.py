@@ -60,7 +60,7 @@ def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstration
     assert "is not there" in result["action_errors"]["outside_budget"]["note"]
 
 
-def test_a_film_that_cannot_be_made_is_left_out(copied_run, monkeypatch):
+def test_an_animation_that_cannot_be_made_is_skipped(copied_run, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "n0nsense")
     with pytest.warns(UserWarning, match="^film.gif was not made: .*n0nsense"):
         assert koap("eval", copied_run, "--episodes", 1, "--threads", 1, "--quiet") == 0
@@ -75,7 +75,7 @@ def test_rollouts_of_a_context_follow_each_other():
 
 
 @pytest.mark.parametrize(("name", "noisy"), [("avoiding", False), ("po_sorting", True)])
-def test_policies_are_judged_with_the_noise_of_the_task(name, noisy):
+def test_evaluation_uses_the_noise_of_the_task(name, noisy):
     env = find_environment(get_task(name), EvalConfig()).make_env(1)
     assert isinstance(env, TransformedEnv) == noisy
 

@@ -123,7 +123,7 @@ def test_a_full_disk_damages_no_earlier_evaluation(copied_run, monkeypatch, caps
     assert contents(copied_run) == before
 
 
-def test_where_an_error_is_from_is_shown_on_request(monkeypatch):
+def test_the_traceback_of_an_error_is_shown_on_request(monkeypatch):
     monkeypatch.setenv("KOAP_TRACEBACK", "1")
     with pytest.raises(ValueError, match="no demonstrations to learn from"):
         koap("train", "--out", "x")

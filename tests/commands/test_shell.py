@@ -45,7 +45,7 @@ def test_only_a_command_that_goes_on_when_called_again_says_so(command, monkeypa
     assert capsys.readouterr().err == f"koap: interrupted{goes_on}\n"
 
 
-def test_what_is_ignored_stays_ignored():
+def test_ignored_signals_stay_ignored():
     earlier = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with handling_signals(interrupt):
@@ -73,7 +73,7 @@ def test_out_of_memory_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("koap: out of memory; try fewer episodes")
 
 
-def test_a_fault_of_ours_keeps_its_traceback(monkeypatch):
+def test_an_internal_error_shows_its_traceback(monkeypatch):
     monkeypatch.setattr(cli, "_run", Mock(side_effect=TypeError("ours")))
     with pytest.raises(TypeError, match="ours"):
         cli.main(["doctor"])
@@ -113,7 +113,7 @@ def test_settings_with_which_nothing_can_be_imported(settings, says):
 @pytest.mark.faults
 @pytest.mark.parametrize("chosen", ["bogus", "osmesa", "glfw", "egl", "off"])
 @pytest.mark.parametrize("command", ["doctor", "eval"])
-def test_a_back_end_that_may_not_be_there_costs_a_film_at_most(command, chosen, copied_run):
+def test_a_missing_rendering_backend_only_skips_the_animation(command, chosen, copied_run):
     words = ("eval", str(copied_run), "--episodes", "1", "--threads", "1") if command == "eval" else ("doctor",)
     status, said = ended(*words, "--quiet", settings={"MUJOCO_GL": chosen, "DISPLAY": "", "WAYLAND_DISPLAY": ""})
     assert status == 0 and "Traceback" not in said
@@ -143,7 +143,7 @@ with open(sys.argv[1], "w") as file:
 """
 
 
-def test_a_process_without_streams_prints_nowhere_and_into_no_file(tmp_path):
+def test_output_of_a_process_without_streams_goes_into_no_file(tmp_path):
     """A file that is opened with one of the three numbers would get what a library prints."""
     closed = lambda: [os.close(number) for number in range(3)]  # noqa: E731
     done = subprocess.run([sys.executable, "-c", CLOSED, tmp_path / "file"], preexec_fn=closed, close_fds=True)

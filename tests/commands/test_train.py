@@ -54,7 +54,7 @@ def test_another_seed_gives_another_run(trained_run, demonstrations, tmp_path):
         assert (tmp_path / "other" / name).read_bytes() != (trained_run / name).read_bytes()
 
 
-def test_a_planner_taken_over_changes_nothing_in_the_controller(trained_run, demonstrations, tmp_path):
+def test_a_reused_planner_does_not_change_the_controller(trained_run, demonstrations, tmp_path):
     out = tmp_path / "run"
     assert koap("train", "--out", out, "--dataset", demonstrations, *TINY, "--planner.source", trained_run) == 0
     for name in WEIGHTS:
@@ -86,7 +86,7 @@ def test_the_call_is_kept_as_a_shell_reads_it(tmp_path, monkeypatch):
     assert train.call_args.kwargs["command"] == "koap train --out 'my arm'"
 
 
-def test_a_finished_run_may_be_resumed_and_stays_what_it_is(copied_run, monkeypatch):
+def test_resuming_a_finished_run_does_not_change_it(copied_run, monkeypatch):
     before = contents(copied_run)
     began = RunDirectory(copied_run).read_json("config.json")["command"]
     monkeypatch.setattr(sys, "argv", ["koap", "train", "--resume"])

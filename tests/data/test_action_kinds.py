@@ -70,7 +70,7 @@ def test_a_width_of_two_values_is_said_to_be_one_kind():
     assert said.startswith("b: an action with two values") and said.endswith("--action-kind delta raw")
 
 
-def test_targets_and_a_gripper_have_one_cure():
+def test_targets_and_a_gripper_get_one_remedy():
     steps = [np.column_stack([aims, aims[:, 0] > 0]) for aims in TARGETS]
     said = warnings(PATHS, steps, acting=("a", "b", "grip"))
     cure = "again with --action-kind absolute absolute raw --targets shoulder.pos 'elbow pos'"
@@ -133,7 +133,7 @@ def test_an_action_that_never_changes_is_of_no_kind():
     assert list(likely_kinds(*demonstrations(PATHS, steps))) == ["a"]
 
 
-def test_beside_targets_what_is_near_nothing_is_raw():
+def test_an_action_near_no_column_is_raw_if_others_are_targets():
     """Such as a thrust beside body rates: advice that leaves it a change is followed."""
     random = np.random.default_rng(0)
     steps = [np.column_stack([step[:, 0], random.normal(size=len(step))]) for step in TARGETS]
@@ -185,7 +185,7 @@ def test_normalised_targets_of_columns_in_degrees_are_raw_however_they_are_decla
     assert said.endswith("--action-kind absolute --targets shoulder.pos 'elbow pos'")
 
 
-def test_raw_actions_that_are_something_better():
+def test_raw_actions_that_match_another_kind_are_named():
     assert warnings(PATHS, TARGETS, action_kind="raw")[0].endswith(
         "they look like absolute targets; convert again with --action-kind absolute --targets shoulder.pos 'elbow pos'"
     )
@@ -198,12 +198,12 @@ def test_targets_that_are_the_robots_columns_need_not_be_named():
     assert warnings(PATHS, TARGETS, robot=[0, 1])[0].endswith("convert again with --action-kind absolute")
 
 
-def test_few_labels_say_nothing():
+def test_few_labels_give_no_warning_about_kinds():
     assert not warnings([PATHS[0][:10]], [TARGETS[0][:9]])
     assert not likely_kinds(*demonstrations([PATHS[0][:10]], [TARGETS[0][:9]]))
 
 
-def test_a_joystick_is_no_command():
+def test_a_joystick_column_is_not_a_command():
     """It would be hidden from planner and controller."""
     sticks = [np.column_stack([path[:, :2], np.sin(0.3 * np.arange(len(path)))]) for path in PATHS]
     names = (*JOINTS[:2], "stick")

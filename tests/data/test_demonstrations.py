@@ -61,7 +61,7 @@ def test_commands_are_never_seen_by_what_learns():
     assert task.robot == (1,)  # of the state, which lacks the commands
 
 
-def test_columns_of_one_role_may_lie_apart():
+def test_columns_of_one_role_need_not_be_adjacent():
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, robot=[0, 3])
     assert list(task.observation_parts) == ["robot", "surroundings", "robot_2"] and task.robot == (0, 3)
 
@@ -82,7 +82,7 @@ def test_every_action_may_be_of_its_own_kind():
         make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds)
 
 
-def test_joints_beside_a_switch_are_learnt_as_distances():
+def test_joint_targets_with_a_switch_are_learned_as_distances():
     """A hand that is told 0 or 1 must not make the joints be decoded as places."""
     steps, opens = ACTIONS[0][:, :1], STATES[0][1:, 2:3] > 0
     aims = [np.hstack([STATES[0][:-1, :1] + steps, opens]), None, None]
@@ -94,7 +94,7 @@ def test_joints_beside_a_switch_are_learnt_as_distances():
     torch.testing.assert_close(task.action_rule(data["state"][:29], view), data["action"][:29])
 
 
-def test_raw_actions_are_about_no_column():
+def test_raw_actions_refer_to_no_column():
     data, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="raw", robot=[0, 1], command=[2, 3])
     assert {(action.kind, action.column) for action in task.actions.values()} == {("raw", None)}
     assert not task.targets and not task.delta_actions and task.action_rule is None
@@ -203,7 +203,7 @@ def test_small_offsets_stay():
     assert make_demonstrations([frames + 100 for frames in STATES], ACTIONS, control_hz=20)[1].origins is None
 
 
-def test_offsets_that_nothing_could_subtract():
+def test_offsets_that_cannot_be_subtracted():
     far = [frames + 1e8 for frames in STATES]
     with pytest.raises(DataError, match="command column 'cup_x' is at 1e.08: subtract this value"):
         make_demonstrations(far, ACTIONS, control_hz=20, state_names=NAMES, command=["cup_x"])
@@ -212,7 +212,7 @@ def test_offsets_that_nothing_could_subtract():
 
 
 @pytest.mark.parametrize("scale", [1e300, 1e40, 1e-300, 1e-42])
-def test_what_no_number_holds_is_refused(scale, recwarn):
+def test_numbers_that_float32_cannot_hold_raise_errors(scale, recwarn):
     with pytest.raises(DataError, match="state column 'q1' lies in .* too coarsely: change its unit"):
         make_demonstrations([frames * [scale, 1, 1, 1] for frames in STATES], ACTIONS, control_hz=20, state_names=NAMES)
     with pytest.raises(DataError, match="action column 'action_1' lies in .* too coarsely"):

@@ -53,7 +53,7 @@ def same_bits(left, right):
     st.one_of(st.integers(1, 60), st.floats(0.01, 1.0)),
     st.integers(0, 5),
 )
-def test_the_account_is_right(lengths, unit, amount, seed):
+def test_the_report_counts_the_labels(lengths, unit, amount, seed):
     data = demonstrations(lengths)
     totals = {"trajectory": len(lengths), "window": sum(n - 15 for n in lengths), "transition": sum(lengths)}
     expected = amount if isinstance(amount, int) else math.floor(amount * totals[unit] + 0.5)
@@ -116,7 +116,7 @@ def test_larger_budgets_contain_smaller_ones(unit):
     ("amount", "total", "expected"),
     [(0.02, 96, 2), (0.005, 100, 1), (0.145, 100, 15), (0.01, 96, 1), (1.0, 7, 7), (1, 7, 1), (0.5, 3, 2), (0.3, 5, 2)],
 )
-def test_rounding_is_half_up_in_decimals(amount, total, expected):
+def test_shares_are_rounded_half_up(amount, total, expected):
     assert budget_of(amount).apply(demonstrations((2,) * total))[1].selected_units == expected
 
 
@@ -332,6 +332,6 @@ def test_a_smaller_share_is_part_of_every_larger_one():
         (None, 0.04, "share of 0.04 of the trajectories keeps 0 of 10"),
     ],
 )
-def test_a_share_that_cannot_be_kept_is_named(labelled, fraction, message):
+def test_an_impossible_share_is_named(labelled, fraction, message):
     with pytest.raises(ValueError, match=message):
         subsample_trajectories(numbered(labelled), fraction)

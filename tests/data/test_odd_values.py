@@ -52,7 +52,7 @@ def test_leaps_are_named_with_their_cause(columns, message):
     assert re.search(message, warning)
 
 
-def test_a_shove_is_no_wrapped_count():
+def test_a_sudden_push_is_not_a_wrapped_counter():
     """Unwrapped by its height, all that follows would be wrong."""
     columns = 0.1 * np.sin(np.arange(600.0)[:, None] + np.arange(3))
     columns[300:303, 0] = [11, 10, 9]

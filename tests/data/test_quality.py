@@ -38,7 +38,7 @@ def warnings(states, actions=None, *, columns=("x", "y"), units=("m", "m"), name
     return find_warnings(data.set("state", data["observation"]), task, names)
 
 
-def test_sound_demonstrations_raise_none():
+def test_valid_demonstrations_give_no_warnings():
     assert warnings([MOVED, MOVED + 1, MOVED + 2], [STEPS, STEPS, 2 * STEPS]) == []
 
 
@@ -68,7 +68,7 @@ def test_columns_that_errors_hardly_show_need_units(units, number):
         assert all(words in warning for warning in said)
 
 
-def test_columns_that_say_nothing_are_named():
+def test_constant_and_duplicate_columns_are_named():
     states = [torch.cat([path, path[:, :1], torch.full((20, 1), 3.0)], -1) for path in (PATH, PATH + 1)]
     assert warnings(states, columns=["x", "y", "again", "shelf"], units=()) == [
         "columns 'x' and 'again' are the same in every step",
@@ -98,7 +98,7 @@ def test_clocks_and_rates_are_told():
     assert "control_hz is 0.03: frames per second" in find_warnings(data.set("state", data["observation"]), task)[0]
 
 
-def test_labels_that_stand_alone():
+def test_isolated_labels():
     alone = torch.where(torch.arange(19)[:, None] % 4 == 1, STEPS, torch.nan)
     (warning,) = warnings([MOVED, MOVED + 1], [alone, STEPS])
     assert warning.startswith("most labels are isolated in 1 trajectories: trajectory 0 (5 of 19 steps)")

@@ -54,7 +54,7 @@ def test_shifted_columns_may_be_chosen():
     assert found[..., [0, 2]].any() and not found[..., [1, 3]].any()
 
 
-def test_joints_follow_the_tool_aside_and_come_back_with_it():
+def test_joints_follow_the_shifted_tool_and_return_with_it():
     bent = torch.tensor([0.0, 0.3, 0.0, -2.0, 0.0, 2.2, 0.8], dtype=torch.float64)  # rad, over a table
     joints = bent + 0.1 * torch.rand(30, 16, 7, dtype=torch.float64)
     state = torch.cat([joints, torch.rand(30, 16, 1).double(), tool_position(joints)], -1)
@@ -94,7 +94,7 @@ def test_open_fingers_are_seen_closed_and_open_again():
         [0.0, 0.03] + [OPEN] * 14,  # opens by itself, at the start of an episode
     ],
 )
-def test_fingers_that_hold_or_move_are_left_alone(widths):
+def test_fingers_that_hold_or_move_are_not_shifted(widths):
     torch.testing.assert_close(changed(widths)[:, 1], torch.tensor(widths))
 
 

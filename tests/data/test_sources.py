@@ -112,7 +112,7 @@ def test_a_registered_task_that_the_data_set_overrules_is_said(tmp_path, monkeyp
         assert find_task_of(folder, "arm") == own
 
 
-def test_a_call_without_data_names_both_commands():
+def test_an_error_about_missing_data_names_both_commands():
     with pytest.raises(
         ValueError, match="koap demos --task sorting --out DEMOS.*koap train --task sorting --dataset DEMOS"
     ):

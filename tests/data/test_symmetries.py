@@ -36,7 +36,7 @@ def test_a_moved_scene_keeps_every_distance_and_angle():
     assert 0.2 < shift.std() < 0.4
 
 
-def test_a_scene_may_stay_where_it_is():
+def test_a_scene_may_stay_unchanged():
     state = windows()
     same = RandomPlanarTransform([(0, 1)], [(4, 5)], shift=0.0, turn=0.0)(TensorDict({"state": state}, [64]))["state"]
     torch.testing.assert_close(same, state)
@@ -44,7 +44,7 @@ def test_a_scene_may_stay_where_it_is():
         RandomPlanarTransform([(0, 1)], [], shift=-1, turn=0)
 
 
-def test_alike_objects_are_exchanged_whole_and_all_the_time_of_a_window():
+def test_equal_objects_are_exchanged_completely_for_a_whole_window():
     state = windows(count=400)
     augment = ObjectPermutation([[(1, 2), (3, 4)], [(5,), (6,), (7,)]])
     found = augment(TensorDict({"state": state}, [400]))["state"]

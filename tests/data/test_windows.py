@@ -89,7 +89,7 @@ def test_labelled_windows_by_the_definition(seed, number, before, after, counted
     assert table.labelled.tolist() == expected
 
 
-def test_labels_on_inner_frames_count_unasked():
+def test_labels_on_inner_frames_count_by_default():
     data = demonstrations((16, 16))
     data["has_action"] = torch.isin(data["step_count"], torch.tensor([0, 15])).unsqueeze(-1)
     assert not WindowTable.build(data, 16).labelled.any()
@@ -133,7 +133,7 @@ def test_short_trajectories_are_named():
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
-def test_batches_live_with_the_data(device):
+def test_batches_are_on_the_device_of_the_data(device):
     batch = make_window_buffer(demonstrations().to(device), 16, 4, labelled_share=0.5).sample()
     assert batch["action"].device.type == device
     assert set(seen(batch)) <= set(by_hand(LENGTHS, 16))

@@ -45,7 +45,7 @@ def test_draws_fill_the_ranges_of_the_task(task, ranges):
 
 
 @pytest.mark.parametrize("task", ["sorting_2", "sorting", "sorting_6"])
-def test_sorting_deals_six_regions_out(task):
+def test_sorting_assigns_six_regions_at_random(task):
     drawn = draw_contexts(task, 600, 1)
     right, row = drawn[..., 0] > 0.525, np.digitize(drawn[..., 1], (-0.075, 0.025))
     region = 3 * right + row

@@ -102,7 +102,7 @@ def test_what_counts_as_success(name, key, wanted):
     assert over == ([False, False, True, True, True, True] if ends else [False] * 5 + [True])
 
 
-def test_who_is_done_waits():
+def test_finished_environments_wait_for_their_reset():
     env = GymnasiumBatch("ToyReach-v0", TASK, 2, max_steps=4)
     assert env.max_steps == 4
     rollout = run(env, 6, [0, 1])

@@ -41,7 +41,7 @@ def test_noise_has_the_stated_size_and_touches_nothing_else():
     assert not found[:, rest].any() and not clean.any()
 
 
-def test_noise_is_of_its_own_unless_seeds_are_given():
+def test_noise_is_independent_unless_seeds_are_given():
     first, second = EndEffectorNoise("aligning", sigma=1.0), EndEffectorNoise("aligning", sigma=1.0)
     zeros = TensorDict({"observation": torch.zeros(2, 20)}, [2])
     assert not torch.equal(first(zeros.copy())["observation"], second(zeros.copy())["observation"])

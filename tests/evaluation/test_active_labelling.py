@@ -187,12 +187,12 @@ def test_suggest_from_the_shell(copied_run, capsys):
     assert "count must be in 1..6" in capsys.readouterr().err
 
 
-def test_unasked_no_more_are_suggested_than_are_left(copied_run, monkeypatch):
+def test_the_default_count_is_limited_by_the_remaining_trajectories(copied_run, monkeypatch):
     monkeypatch.setattr(active_labelling, "_DEFAULT_COUNT", 10)
     assert len(suggest(copied_run)["suggestions"]) == 6
 
 
-def test_no_hidden_label_has_a_say(copied_run, monkeypatch):
+def test_hidden_labels_do_not_change_the_suggestions(copied_run, monkeypatch):
     load = trained.open_dataset
     first = suggest(copied_run, SuggestConfig(count=6))
 
@@ -231,7 +231,7 @@ def test_the_choice_is_made_for_the_decoder_of_the_run(demonstrations, copied_ru
         assert seen["bias"] is bias and seen["penalty"] == fit["penalty"]
 
 
-def test_runs_that_cannot_be_asked(demonstrations, copied_run, tmp_path, capsys):
+def test_runs_without_suggestions_raise_errors(demonstrations, copied_run, tmp_path, capsys):
     linear = ("--out", tmp_path / "linear", "--dataset", demonstrations, *TINY, "--method", "linear")
     assert koap("train", *linear) == 0
     assert "suggestions need latent actions" in fails(capsys, "suggest", tmp_path / "linear")

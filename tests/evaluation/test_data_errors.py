@@ -86,7 +86,7 @@ def test_the_same_hidden_steps_for_every_controller(num_past, amount, unit):
     assert rmse(*hidden_action_errors(Copy(num_past, shift=2), data, labelled)) == pytest.approx(2)
 
 
-def test_actions_of_the_budget_are_not_even_looked_at():
+def test_actions_of_the_budget_are_not_read():
     data = counting()
     labelled, _ = LabelBudget(count=2).apply(data)
     poisoned = data.clone()
@@ -178,7 +178,7 @@ def forked(count=20, steps=30):
     return select_state(flatten_trajectories(paths, [torch.zeros(steps - 1, 1)] * count), (0, 1))
 
 
-def test_both_ways_of_a_fork_are_no_mistake_and_units_stay_apart():
+def test_both_modes_of_a_fork_count_as_correct_and_units_are_not_mixed():
     found = plan_errors(Planner(1.0), forked(), ARM)
     joint, force = found["unit"]
     assert (joint["unit"], joint["columns"], force["unit"]) == ("rad", ["q"], "N")

@@ -53,7 +53,7 @@ def test_findings(rates, words):
     ("left", "words"),
     [(1, "planner and controller work alone"), (2, "the controller leaves 2 of 10 recorded tool paths by more than")],
 )
-def test_a_blind_push_is_not_held_against_the_controller(left, words):
+def test_the_controller_is_named_only_if_it_leaves_several_recorded_tool_paths(left, words):
     rates = {"planner_alone": 1.0, "controller_alone": 0.0, "both": 0.4}
     result = {name: {"rate": value} for name, value in rates.items()}
     result |= {"distance_to_demonstrations": {}, "recordings_left": {"count": left, "episodes": 10}}

@@ -92,7 +92,7 @@ def test_an_exactly_linear_system_is_predicted_without_error(normalizer):
         assert errors["copy_last"]["second"][step - 1] == pytest.approx(gaps[:, 1].square().mean().sqrt().item())
 
 
-def test_a_wrong_operator_errs_by_what_it_adds():
+def test_the_error_of_a_wrong_operator_is_its_deviation():
     data, controller = blown(), knowing()
     controller.operator.weight.data.add_(0.1 * torch.eye(2, dtype=torch.float64))
     errors = prediction_errors(controller, data, torch.tensor([0]), PARTS, horizon=1)
@@ -178,7 +178,7 @@ def test_the_decoder_of_the_run_is_judged_beside_the_probe():
     assert max(worse["decoder_r2"]) < 0.1 and worse["held_out_in_budget"] == 2
 
 
-def test_what_blew_up_is_drawn_all_the_same(tmp_path):
+def test_diverged_predictions_are_drawn(tmp_path):
     controller = knowing()
     controller.operator.weight.data.mul_(1e200)
     data = blown((20, 20, 20, 20))
@@ -190,7 +190,7 @@ def test_what_blew_up_is_drawn_all_the_same(tmp_path):
     assert not math.isfinite(koopman.get_ydata()[-1]) and math.isfinite(linear.get_ydata()[-1])
 
 
-def test_findings_without_experiments_says_whose_labels_were_read():
+def test_findings_without_experiments_name_the_labels_that_were_read():
     controller, data = knowing(), blown((20, 20, 20, 20))
     latent = analyse_latent(controller, data, data["episode"] == 0, {"measured_xy": [0, 1]})
     text = describe_inspection({"latent": latent}, get_task("avoiding"))

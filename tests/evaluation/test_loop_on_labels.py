@@ -112,7 +112,7 @@ def test_rollouts_of_noise_stand_still_and_short_ones_are_not_judged(trained):
     assert standing_faults(failed, data[data["episode"] == 0][:5]) == []  # nor do short recordings judge
 
 
-def test_goals_are_no_inputs_of_the_robot():
+def test_goals_do_not_enter_the_response_of_the_robot():
     """Three joints follow commands with a lag and less than they are told; goals differ by recording alone."""
     random, states, actions = np.random.default_rng(0), [], []
     for _ in range(30):

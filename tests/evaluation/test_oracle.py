@@ -83,7 +83,7 @@ def test_the_command(copied_run, tmp_path):
     assert execution["strategy"] == "oracle" and execution["blend"] == 0.8 and result["plan_ms"] > 0
 
 
-def test_where_there_is_nothing_to_follow(demonstrations, copied_run, tmp_path, capsys):
+def test_methods_without_plans_and_other_environments_raise_errors(demonstrations, copied_run, tmp_path, capsys):
     dp = ("--out", tmp_path / "dp", "--dataset", demonstrations, "--method", "dp", *TINY)
     assert koap("train", *dp) == 0
     for run, option, message in (

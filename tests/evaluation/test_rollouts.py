@@ -46,7 +46,7 @@ def facts(episodes, seeds=SEEDS):
     return [(row["seed"], row["outcome"], row["mode"], row["steps"]) for row in rows]
 
 
-def test_the_episodes_are_worth_comparing(together):
+def test_the_compared_episodes_differ(together):
     outcomes = [outcome for _, outcome, _, _ in facts(together)]
     assert {"success", "collision"} <= set(outcomes), outcomes
     assert len({steps for *_, steps in facts(together)}) >= 4
@@ -77,7 +77,7 @@ def test_observation_noise_of_an_episode_depends_on_its_seed_alone():
     assert 1e-4 < (paths[0][0] - clean[0])[2:].abs().max() < 0.02
 
 
-def test_the_seed_decides_not_the_place_and_not_the_global_generator(together):
+def test_rollouts_depend_on_the_seed_not_on_batch_position_or_global_generator(together):
     torch.manual_seed(123)
     before = torch.get_rng_state()
     other = toy_rollouts([107, 7, 100])

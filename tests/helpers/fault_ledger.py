@@ -111,20 +111,20 @@ def meet(fault: Fault, place: Place) -> Outcome:
 
 
 def check(fault: Fault, outcome: Outcome) -> None:
-    told = f"{fault.id}: status {outcome.status}, said {outcome.said[-500:]!r}"
+    details = f"{fault.id}: status {outcome.status}, said {outcome.said[-500:]!r}"
     if fault.accepted:
-        assert outcome.status in (0, "accepted"), told
+        assert outcome.status in (0, "accepted"), details
         return
     wanted = fault.status if isinstance(fault.status, tuple) else (fault.status,)
-    assert outcome.status in wanted, told
-    assert "Traceback" not in outcome.said, told
+    assert outcome.status in wanted, details
+    assert "Traceback" not in outcome.said, details
     if outcome.status == 2:  # the parser frames what it says
         plain = re.sub(r"[│╭╮╰╯─\s]+", " ", outcome.said)
     else:
         lines = [line for line in outcome.said.replace("\r", "\n").splitlines() if line.startswith("koap: ")]
-        assert len(lines) == 1 and outcome.said.rstrip().endswith(lines[0]), told
+        assert len(lines) == 1 and outcome.said.rstrip().endswith(lines[0]), details
         plain = lines[0]
-    assert re.search(fault.says, plain), f"{told}\nwanted {fault.says!r}"
+    assert re.search(fault.says, plain), f"{details}\nwanted {fault.says!r}"
 
 
 def table(faults: Iterable[Fault], every: int = EVERY) -> list[Any]:

@@ -115,7 +115,7 @@ def test_few_groups():
     assert list(labelled.errors) == [0.05]
 
 
-def test_one_label_fits_the_mean_and_claims_nothing():
+def test_one_label_fits_the_mean_with_infinite_error():
     latent, action = make_data(1)
     result = fit(latent, action)
     np.testing.assert_allclose(result.predict(torch.from_numpy(latent)), action)
@@ -215,7 +215,7 @@ def decompose(matrix):
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(90, 4), (9, 4), (4, 9), (3, 2100)])
-def test_decomposition_is_one(rows, columns):
+def test_decomposition_equals_the_singular_value_decomposition(rows, columns):
     torch.manual_seed(0)
     matrix = torch.randn(rows, columns, dtype=torch.float64)
     left, singular, right = decompose(matrix)

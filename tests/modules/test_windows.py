@@ -53,7 +53,7 @@ def test_the_shortest_window_holds_one_frame_and_one_less_is_an_error(num_past, 
 
 
 @pytest.mark.parametrize("look_ahead", [1, 0, -3, (8, 1), ()])
-def test_offsets_that_would_read_the_answer_are_refused(look_ahead):
+def test_offsets_that_would_read_the_action_raise_errors(look_ahead):
     with pytest.raises(ValueError, match=r"x_\(t\+1\) is never an input"):
         reader_of(1, look_ahead)
 

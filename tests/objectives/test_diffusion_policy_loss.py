@@ -86,7 +86,7 @@ def test_value_in_closed_form(dtype, history):
     assert value.dtype == dtype and 0 < counts.sum() < counts.numel()
 
 
-def test_what_counts_are_labelled_recorded_transitions_from_now_on():
+def test_only_labelled_recorded_transitions_from_the_present_on_count():
     data = batch_of(1)
     data["has_action"] = torch.ones(1, 8, 1, dtype=torch.bool)
     data["action"] = torch.randn(1, 8, ACT)

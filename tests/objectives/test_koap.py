@@ -185,7 +185,7 @@ def test_a_subclass_adds_errors_that_count_where_those_of_the_dynamics_do():
 # labels
 
 
-def test_a_labelled_action_that_is_nan_is_loud():
+def test_a_labelled_action_that_is_nan_gives_a_nan_loss():
     batch = make_batch(4, share=1.0)
     batch["action"][0, 2] = torch.nan
     assert LatentActionLoss(make_network())(batch)["loss_action"].isnan()

@@ -167,7 +167,7 @@ def test_bad_rollouts(change, message):
         draw_plans(rollouts, run_of("avoiding"))
 
 
-def test_plans_over_time_where_nobody_knows_a_plane():
+def test_plans_are_drawn_over_time_without_planar_positions():
     parts, acting, units = {"hand": ("thumb", "finger", "palm")}, {"a": Action(), "b": Action()}, ("", "rad", "")
     task = Task(name="hand", observation_parts=parts, actions=acting, position="hand", observation_units=units)
     run = RunFacts(Path("run"), task)

@@ -60,7 +60,7 @@ def test_no_number_of_threads_leaves_torch_alone():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("replay", [False, True])
-def test_a_gpu_learns_what_a_processor_learns(replay):
+def test_training_on_a_gpu_equals_training_on_the_cpu(replay):
     def losses(device):
         torch.manual_seed(0)
         planner, logged = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=64), state_dim=2), []

@@ -72,7 +72,7 @@ def test_what_reads_the_run_imports_the_plugin_by_itself(run, tmp_path, monkeypa
     assert (out / "controller.safetensors").read_bytes() == weights
 
 
-def test_a_plugin_that_is_nowhere_is_named_with_where_it_was_looked_for(run, tmp_path, monkeypatch, capsys):
+def test_a_missing_plugin_is_named_with_the_searched_places(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     line = fails(capsys, "eval", run, "--episodes", 1)
     assert line.startswith(f"koap: there is no plugin {NAME!r}; looked for it in ")

@@ -107,6 +107,6 @@ def test_another_run_is_not_overwritten(trained_run, tmp_path):
     assert json.loads((tmp_path / "mine" / "config.json").read_text())["run"]["seed"] == 9
 
 
-def test_what_is_no_path_is_no_run():
+def test_objects_that_are_not_paths_raise_errors():
     with pytest.raises(TypeError, match=r"must be named by its folder, got dict: train\(TrainConfig"):
         find_run({})

@@ -28,7 +28,7 @@ def run(tmp_path):
     return run
 
 
-def test_what_is_left_out_is_as_it_was(run):
+def test_omitted_options_keep_their_value(run):
     config = begun_with(run, TrainConfig(dataset=".", out="elsewhere", run=RESUME))
     assert config == replace(SAVED, dataset=".", out=config.out, run=replace(SAVED.run, resume=True))
     with pytest.raises(RunDirectoryError, match="'/no/longer/there' of .*run is not there .* with --dataset"):
@@ -47,7 +47,7 @@ def test_a_folder_without_a_run_is_not_resumed(tmp_path):
     assert begun_with(nowhere, fresh) is fresh
 
 
-def test_other_places_and_threads_will_do(run, tmp_path):
+def test_moved_folders_and_other_thread_counts_can_be_resumed(run, tmp_path):
     check_resume(run, replace(SAVED, dataset="/moved", run=replace(SAVED.run, resume=True, threads=1)))
     run.write_json("config.json", to_json(replace(SAVED, dataset=str(tmp_path))))  # a copy: both are there
     check_resume(run, replace(SAVED, dataset="/scratch/copy", run=replace(SAVED.run, resume=True)))
@@ -56,7 +56,7 @@ def test_other_places_and_threads_will_do(run, tmp_path):
     check_resume(run, replace(built_on, planner=PlannerConfig(source="/moved"), run=replace(SAVED.run, resume=True)))
 
 
-def test_rests_without_options_are_refused(tmp_path):
+def test_checkpoints_without_options_raise_errors(tmp_path):
     check_resume(RunDirectory(tmp_path), SAVED)
     (tmp_path / "checkpoints").mkdir()
     with pytest.raises(RunDirectoryError, match="holds checkpoints but no config.json"):

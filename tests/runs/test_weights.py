@@ -46,7 +46,7 @@ def test_weights_keep_their_type(tmp_path):
     assert other.layer.weight.dtype == torch.float64 and torch.equal(other.layer.weight, model.layer.weight)
 
 
-def test_files_of_tensors_may_be_read_by_whom_other_files_may(tmp_path):
+def test_files_of_tensors_have_the_usual_permissions(tmp_path):
     (tmp_path / "plain").touch()
     save_tensors(tmp_path / "tensors", {"x": torch.zeros(2)})
     assert (tmp_path / "tensors").stat().st_mode == (tmp_path / "plain").stat().st_mode

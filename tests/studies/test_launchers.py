@@ -146,7 +146,7 @@ def test_a_job_without_a_place_for_its_log_fails_with_a_reason(tmp_path, capfd):
         ({"address": "10.0.0.1:6379"}, "launcher 'local' uses only this machine"),
     ],
 )
-def test_machines_that_there_are_not_are_refused(options, message):
+def test_wrong_options_of_machines_raise_errors(options, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         Machines(**options)
 

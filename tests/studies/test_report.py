@@ -169,7 +169,7 @@ def test_methods_differ_without_colour():
     assert len({(style["color"], str(style["linestyle"])) for style in styles[:12]}) == 12
 
 
-def test_whiskers_are_a_little_beside_each_other_however_short_the_axis_is(monkeypatch, tmp_path):
+def test_intervals_are_drawn_side_by_side_on_any_axis(monkeypatch, tmp_path):
     rows = make_cells(methods=dict.fromkeys("abcde", 0.5), seeds=1)
     for row in rows:
         row["labelled_transitions"] = 880 if row["labels"] == 0.1 else 800

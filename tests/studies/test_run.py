@@ -281,7 +281,7 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
         assert (out / cell / name).read_bytes() == (whole_curve / cell / name).read_bytes()
 
 
-def test_fewer_seeds_take_nothing_back(tmp_path):
+def test_fewer_seeds_remove_no_cells(tmp_path):
     study = run_module.complete(Study(out=tmp_path, seeds=3))
     RunDirectory(tmp_path).write_json("study.json", to_json(replace(study, out=Path())))
     assert run_module._together(replace(study, seeds=1)) == study

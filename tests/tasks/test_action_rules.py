@@ -16,7 +16,7 @@ STILL = [0.0801] * 6  # fingers that stay open
 @pytest.mark.parametrize(
     ("widths", "wanted"), [(OPENS, [0.08] * 7), *((own, own[1:]) for own in (CLOSES, PARTLY, HELD, STILL))]
 )
-def test_fingers_on_the_way_to_open_are_told_to_open_and_others_their_next_width(widths, wanted):
+def test_opening_fingers_get_the_open_command_and_others_their_next_width(widths, wanted):
     found = gripper_command(torch.tensor(widths))
     torch.testing.assert_close(found, torch.tensor(wanted), rtol=0, atol=0)
     assert (found > OPEN_ABOVE).all() == (widths in (OPENS, STILL))

@@ -132,7 +132,7 @@ def test_a_policy_without_plans_learns_from_the_last_steps_too(monkeypatch):
     assert first.unique().tolist() == [*range(39)]  # steps that another one follows
 
 
-def test_a_teacher_tells_targets_where_actions_are_targets():
+def test_a_teacher_predicts_targets_if_actions_are_targets():
     states = [50 + rows for rows in record()[0]]
     targets = [states[0][1:, :2], *[None] * 5]
     data, task = make_demonstrations(**few_labels(states=states, actions=targets), action_kind="absolute")
@@ -208,7 +208,7 @@ def test_a_method_that_cannot_act_is_refused_before_the_planner_is_trained(netwo
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_asked_of_a_method_before_its_training_leaves_random_numbers_as_they_are(method):
+def test_checks_before_training_do_not_change_random_numbers(method):
     data, task = make_demonstrations(**few_labels())
     before = torch.get_rng_state()
     check_lengths(task, resolve(TrainConfig(out=Path(), method=method), task), data)

@@ -241,7 +241,7 @@ def test_divergence_is_found_and_the_last_good_checkpoint_kept(tmp_path, log_eve
 
 
 @pytest.mark.parametrize("kind", [Planner, Controller])
-def test_ctrl_c_within_a_loss_is_ctrl_c(kind):
+def test_ctrl_c_inside_a_loss_raises_keyboard_interrupt(kind):
     parts = kind()
     before = {key: value.clone() for key, value in parts.loss.state_dict().items()}
 
@@ -287,7 +287,7 @@ def test_the_average_is_stepped_every_fourth_update_and_at_the_end(updates, aver
     assert average.seen == averaged
 
 
-def test_four_updates_weigh_as_much_as_ever():
+def test_the_average_over_four_updates_has_the_same_decay():
     module = Planner().loss
     assert moving_average(module, 90).eps == pytest.approx(0.9**4)
     assert moving_average(module, 10**6).eps == pytest.approx(0.998**4)

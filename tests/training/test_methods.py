@@ -96,7 +96,7 @@ def test_statistics_are_those_of_what_a_method_may_see(name, data):
 
 
 @pytest.mark.parametrize(("brake_at", "told"), [(25, True), (15, False)])
-def test_a_switch_so_late_that_no_controller_is_fitted_to_it_is_told(brake_at, told):
+def test_a_switch_too_late_for_any_controller_is_named(brake_at, told):
     states = [np.random.default_rng(i).normal(size=(31, 2)).cumsum(0) for i in range(4)]
     brake = (np.arange(30) >= brake_at)[:, None]
     actions = [np.concatenate([np.diff(path, axis=0), brake], 1) if i < 3 else None for i, path in enumerate(states)]

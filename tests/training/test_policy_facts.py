@@ -47,7 +47,7 @@ def test_a_labelled_step_whose_command_is_not_known_is_none():
     assert labelled["has_action"].any() and not with_commands(TASK, labelled)["has_action"].any()
 
 
-def test_which_commands_are_decoded_and_who_is_told():
+def test_which_commands_are_decoded_and_which_methods_get_them():
     assert decoded_commands(TASK) == {"commands": [0, 1], "actions": [0, 1]} and decoded_commands(CHANGES) is None
     assert TASK.distances == ((0, 0), (1, 1)) and CHANGES.distances == ()
     assert decoded_commands(get_task("stacking"))["actions"] == list(range(7))

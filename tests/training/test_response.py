@@ -48,7 +48,7 @@ def test_the_system_is_found_from_one_labelled_trajectory():
     torch.testing.assert_close(response.double().impulse_matrix(8), a_system().impulse_matrix(8), atol=5e-3, rtol=0)
 
 
-def test_stretches_with_hidden_commands_have_offsets_of_their_own():
+def test_segments_with_hidden_commands_have_their_own_offsets():
     data, response = recordings(), columns()
     labelled = (torch.arange(len(data)) % 30 < 16).unsqueeze(-1)
     data["has_action"] = labelled
@@ -127,7 +127,7 @@ def test_a_task_without_commands_is_refused_before_any_work():
 # ---- the fit of predictions over many steps
 
 
-def test_a_model_that_single_steps_get_wrong_is_put_right(monkeypatch):
+def test_a_multi_step_fit_corrects_a_biased_single_step_fit(monkeypatch):
     """A sensor that errs by a little makes a regression of single steps forget momentum; predictions do not."""
     data, answers = recordings(episodes=8, noise=0.003), []
     for many in (True, False):

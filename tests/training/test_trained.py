@@ -55,7 +55,7 @@ def test_a_run_as_one_file(trained_run, tmp_path):
     assert load_policy(str(path)).execution == Execution()
 
 
-def test_an_unfinished_training_is_told_from_a_damaged_one(trained_run, tmp_path):
+def test_errors_distinguish_unfinished_from_damaged_trainings(trained_run, tmp_path):
     run = copy_run(trained_run, tmp_path / "run")
     (run / "planner.safetensors").unlink()
     with pytest.raises(CheckpointError, match="planner.safetensors is missing"):
@@ -89,7 +89,7 @@ def test_a_method_that_samples_actions(demonstrations, tmp_path):
     np.testing.assert_array_equal(actions(loaded), actions(load_policy(tmp_path / "dp", replan_interval=3)))
 
 
-def test_a_robot_that_nobody_registered(own, tmp_path):
+def test_an_unregistered_robot(own, tmp_path):
     loaded = Trained.load(own.save(tmp_path / "arm.safetensors"))
     assert loaded.task.name == "my_arm" and loaded.columns == (0, 1) and loaded.execution == own.execution
     np.testing.assert_array_equal(actions(loaded.policy(), PATH[:, :3]), actions(own.policy(), PATH[:, :3]))

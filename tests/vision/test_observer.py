@@ -34,7 +34,7 @@ def test_columns_are_those_of_the_task():
     assert observe(observe.example()).shape == (11,) and observe.example()["top"].shape == (16, 24, 3)
 
 
-def test_what_is_masked_beside_frames_is_no_number():
+def test_masked_numbers_with_frames_become_nan():
     observe, _ = make()
     masked = np.ma.masked_array([1.0, 2.0, 3.0, 4.0], mask=[0, 1, 0, 0])
     seen = observe({"wrist": FRAME, "top": FRAME, "state": masked})[[3, 4, 9, 10]]

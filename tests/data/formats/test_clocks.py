@@ -31,14 +31,14 @@ def test_the_usual_step_is_the_rate():
         (TIME, 20, "gives 30 frames per second, the source declares 20: pass control_hz"),
     ],
 )
-def test_stamps_that_cannot_be_are_told(times, declared, message):
+def test_impossible_time_stamps_are_named(times, declared, message):
     problems: list[str] = []
     scale = 1e3 if times[-1] > 99 else 1
     find_rate(clock(TIME * scale, times), declared, problems)
     assert re.search(message, problems[0])
 
 
-def test_what_is_not_looked_at():
+def test_messages_on_the_rate_of_regular_and_irregular_time_stamps():
     assert told_rate(clock(TIME), 20) == " (it says 30 frames per second)"
     assert told_rate(clock(TIME), 31) == ""
     assert told_rate(clock(TIME, 2 * TIME[:9]), 30) == " (its frames are 1 to 2 usual steps apart)"

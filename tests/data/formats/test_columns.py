@@ -41,7 +41,7 @@ def test_a_counter_splits_and_sorts():
         read(frame_index=[0, 1, 1, 2, 3, 4])
 
 
-def test_all_that_tells_episodes_apart_counts():
+def test_all_columns_that_separate_episodes_are_used():
     both = read(session=[0, 0, 0, 0, 1, 1], trial=[0, 0, 1, 1, 0, 0])
     assert [frames[:, 0].tolist() for frames in both.states] == X.reshape(3, 2).tolist()
     assert [len(frames) for frames in read(session=[0, 0, 0, 0, 1, 1], done=[0, 1, 0, 1, 0, 1]).states] == [2, 2, 2]
@@ -52,7 +52,7 @@ def test_all_that_tells_episodes_apart_counts():
 @pytest.mark.parametrize(
     "name", ["Timestamp", "time_s", "stamp", "Time [ms]", "__index_level_0__", "Unnamed: 0", "reward"]
 )
-def test_what_is_no_state_is_left_out_and_listed(name):
+def test_columns_that_are_not_states_are_dropped_and_listed(name):
     found = read(**{name: X})
     assert found.state_names == ("x",) and [said.partition(" (its")[0] for said in found.skipped] == [name]
 
@@ -121,7 +121,7 @@ def test_the_order_of_columns_does_not_count_but_their_names_do():
     assert all(assemble(pieces, "data", control_hz=20, action_dim=1, **only).state_names == ("x",) for only in chosen)
 
 
-def test_what_splits_can_be_dropped():
+def test_columns_that_split_episodes_can_be_dropped():
     assert len(read(timeouts=ENDS).states) == 2
     pieces = [Piece("run", {"x": X, "timeouts": ENDS, "frame_index": np.array([0, 1, 1, 2, 2, 9])}, {"v": X})]
     assert len(assemble(pieces, "data", control_hz=20, drop_columns=["timeouts", "frame_index"]).states) == 1

@@ -89,7 +89,7 @@ def test_refusals_of_writing(recordings, tmp_path):
 
 @pytest.mark.parametrize("kind", WRITERS)
 @pytest.mark.parametrize("dtype", ["float16", "int64", "uint8", "bool"])
-def test_numbers_of_every_type_mean_what_they_are(kind, dtype, tmp_path, monkeypatch):
+def test_numbers_of_every_type_keep_their_value(kind, dtype, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     episodes = []
     for seed in range(2):

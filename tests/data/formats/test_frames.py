@@ -80,7 +80,7 @@ def test_a_camera_with_fewer_than_two_times_is_refused_unless_its_recording_is_a
         read_recordings(tmp_path)
 
 
-def test_what_is_cut_is_cut_from_the_cameras_too(tmp_path):
+def test_cameras_are_cut_together_with_states(tmp_path):
     states = np.r_[np.zeros(5), np.arange(20.0), np.full(5, 19.0)][:, None]
     (tmp_path / "a").mkdir()
     np.savez(tmp_path / "a.npz", states=states, actions=states[:-1], control_hz=10.0)

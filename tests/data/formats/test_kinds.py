@@ -20,7 +20,7 @@ from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, numb
         None: "q restart length return_spring left_arm_time_constant step_height q_s run_speed take_off trial_force",
     }.items(),
 )
-def test_names_say_what_is_no_state(kind, names):
+def test_names_identify_columns_that_are_not_states(kind, names):
     assert {name: kind_of(name)[0] for name in names.split()} == dict.fromkeys(names.split(), kind)
 
 

@@ -198,7 +198,7 @@ def test_another_width_than_described_is_told(tmp_path):
         read_lerobot(write(tmp_path, features=features))
 
 
-def test_descriptions_that_are_none(tmp_path):
+def test_invalid_descriptions(tmp_path):
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta/info.json").write_text(json.dumps({"features": FEATURES}))
     with pytest.raises(FileNotFoundError, match=r"no \*\.parquet below"):

@@ -36,7 +36,7 @@ def test_no_labels_at_all_needs_their_width():
         make_recordings([FRAMES])
 
 
-def test_what_is_masked_or_none_is_unknown():
+def test_masked_and_none_entries_are_unknown():
     """A mask that is not looked at would make labels of what its owner has ruled out."""
     hidden = np.ma.masked_array(np.ones((4, 2)), mask=np.arange(4)[:, None] == [1, 1])
     objects = np.array([[1.0, None], [1.0, 2.0], [1.0, 2.0], [1.0, 2.0]])

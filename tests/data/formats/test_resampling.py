@@ -38,7 +38,7 @@ def test_irregular_frames():
     assert (np.abs(found.actions[0][:, 1] - new[:-1]) < np.diff(times).max()).all()
 
 
-def test_changes_add_up_and_other_actions_hold_on():
+def test_changes_are_summed_and_other_actions_are_held():
     steps = np.stack([np.ones(40), np.arange(40.0), np.arange(40.0)], 1)
     recordings = recorded(TIME, actions=steps)
     half = resampled(recordings, 10, ["change", "velocity", "absolute"]).actions[0]
@@ -86,7 +86,7 @@ def test_an_action_a_little_late_is_that_of_its_step():
     np.testing.assert_array_equal(found.actions[0][:, 0], np.arange(40))
 
 
-def test_one_lost_frame_is_no_gap_though_clocks_jitter():
+def test_one_lost_frame_with_clock_jitter_is_not_a_gap():
     times = np.delete(TIME, 20) + 0.01 * (np.arange(40) == 20)  # 0.11 s apart
     assert len(resampled(recorded(times, times=times), 20, times=[times]).states) == 1
     times = np.delete(TIME, [20, 21])

@@ -32,7 +32,7 @@ def observed(tray, tcp, target=(0.5, 0.3, 0.0)):
     return np.array([[*tcp, *tcp, *pose(*tray, -0.0091), *pose(*target, 0.0)]])
 
 
-def test_it_lets_go_when_the_tray_lies_there():
+def test_it_stops_when_the_tray_is_at_the_target():
     expert = AligningExpert([0], np.array([[(0.5, -0.2, 0.0), (0.5, 0.3, 0.0)]]), [0])
     for _ in range(12):
         moving = expert.act(observed((0.5, -0.2, 0.0), (0.525, -0.35, 0.25)))

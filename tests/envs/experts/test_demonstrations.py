@@ -48,7 +48,7 @@ def test_report(recording):
     assert done == sorted(done) and calls[-1] == (EPISODES, EPISODES)
 
 
-def test_takes_are_the_rows_of_the_original_recorder(recording):
+def test_recorded_rows_are_those_of_the_original_recorder(recording):
     data = recording[0]
     for take in iterate_takes("avoiding", EPISODES, seed=5, done=range(2, EPISODES)):
         assert len(take.frames) == len(take.actions) + 1 == take.log["rows"]

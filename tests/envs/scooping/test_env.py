@@ -129,7 +129,7 @@ def test_the_camera_sees_the_embodiments_differ(embodiment, graphics):
     assert (skin.sum() > 40) == (embodiment == "hand")
 
 
-def test_who_demonstrates_has_to_be_said(tmp_path):
+def test_the_embodiment_is_mandatory(tmp_path):
     with pytest.raises(ValueError, match="--embodiment robot or hand"):
         Demos(out=tmp_path / "a", task="scooping")()
     with pytest.raises(ValueError, match="unknown embodiment 'foot'"):
@@ -190,7 +190,7 @@ def test_the_bowl_and_its_pieces_stand_where_the_context_says():
     assert np.abs(after - spread).max() < 2e-3  # they rest there
 
 
-def test_what_takes_a_piece_out_of_one_bowl_is_not_even_over_the_rim_of_another():
+def test_actions_that_succeed_with_one_bowl_fail_with_another():
     targets, sims = play("robot", context_at(CORNERS[0]))
     assert sims.success[0]
     _, elsewhere = play("robot", context_at(CORNERS[3]), targets)
@@ -198,7 +198,7 @@ def test_what_takes_a_piece_out_of_one_bowl_is_not_even_over_the_rim_of_another(
     assert play("robot", context_at(CORNERS[3]))[1].success[0]
 
 
-def test_a_saved_state_knows_where_the_bowl_stands():
+def test_a_saved_state_holds_the_position_of_the_bowl():
     env, other = (make_env(MOVING, 1, embed=False) for _ in range(2))
     data = env.reset(contexts=context_at(CORNERS[1])[None])
     other.reset(contexts=context_at(CORNERS[2])[None])

@@ -68,7 +68,7 @@ def test_control_goes_on_with_the_old_plan_until_the_new_one_is_there():
     agent.close()
 
 
-def test_what_is_executed_meanwhile_binds_the_new_plan():
+def test_a_new_plan_begins_with_the_actions_executed_during_planning():
     agent = make_agent()
     agent.reset()
     for step in range(3):
@@ -81,7 +81,7 @@ def test_what_is_executed_meanwhile_binds_the_new_plan():
     agent.close()
 
 
-def test_a_plan_that_takes_long_is_bound_by_whole_steps_and_never_throughout():
+def test_a_slow_plan_is_bound_for_whole_steps_but_never_completely():
     agent = make_agent()
     assert [agent._steps(seconds) for seconds in (0.0, 0.02, 0.05)] == [1, 1, 2]  # of 33 ms
     agent.reset(np.zeros(2))
@@ -112,7 +112,7 @@ def test_a_plan_that_ends_before_the_next_is_there_is_told_in_every_episode():
     agent.close()
 
 
-def test_the_first_plan_is_made_before_the_clock_runs():
+def test_reset_makes_the_first_plan():
     agent = make_agent()
     agent.reset(np.array([7.0, 0.0]))
     assert agent.policy.planner.calls == [[7.0]]
@@ -121,7 +121,7 @@ def test_the_first_plan_is_made_before_the_clock_runs():
     agent.close()
 
 
-def test_the_command_is_held_back_as_in_the_policy_itself():
+def test_commands_are_limited_as_in_the_policy():
     agent = make_agent(lead=0.1)
     agent.reset()
     for step in range(4):
@@ -148,7 +148,7 @@ def test_refusals():
         AsynchronousAgent(policy_of(strategy="open_loop"), control_hz=30)
 
 
-def test_who_was_closed_says_so_at_once():
+def test_a_closed_agent_raises_errors_at_once():
     agent = make_agent()
     agent.reset()
     agent.act(np.zeros(2))
@@ -160,7 +160,7 @@ def test_who_was_closed_says_so_at_once():
 
 
 @pytest.mark.parametrize("wrong", ["runs/arm", object()])
-def test_what_is_no_policy_is_refused_as_by_the_agent(wrong):
+def test_other_objects_than_policies_raise_the_error_of_the_agent(wrong):
     with pytest.raises(TypeError, match=r"policy must come from load_policy\(\) or Trained.policy\(\), got"):
         AsynchronousAgent(wrong, control_hz=30)
 

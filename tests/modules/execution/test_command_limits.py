@@ -113,7 +113,7 @@ def test_a_task_says_which_columns_they_are():
     assert gain(torch.zeros(1, 1), torch.ones(8))[0].tolist() == [1.5] * 7 + [1.0]  # the gripper opens as it did
 
 
-def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):
+def test_a_trained_policy_has_the_limits_of_its_task_by_default(tmp_path):
     policy = load_policy("pretrained:sorting")
     assert policy.limits.lead == policy.execution.lead == 0.1
     assert load_policy("pretrained:sorting", lead=0.0, limits=math.inf).limits is None
@@ -135,6 +135,6 @@ def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):
         (lambda: policy_for("scooping", gain=1.1), "gain 1.1 and .* but no action is a change of a command"),
     ],
 )
-def test_what_limits_nothing_is_refused(make, message):
+def test_limits_without_effect_raise_errors(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -5,14 +5,14 @@ import pytest
 from torchrl_koap.modules import Execution, ExecutionConfig
 
 
-def test_what_is_asked_for_replaces_and_none_does_not():
+def test_given_values_replace_and_none_does_not():
     own = Execution(blend=0.5, lead=0.1)
     assert own.replaced(strategy="open_loop", blend=0.0, lead=None) == Execution("open_loop", blend=0.0, lead=0.1)
     assert own.replaced() == own
     assert Execution(**dataclasses.asdict(own)) == own
 
 
-def test_what_is_not_asked_for_is_the_defaults():
+def test_missing_values_are_the_defaults():
     default = Execution(strategy="open_loop", replan_interval=8, blend=0.0)
     assert ExecutionConfig().on(default) == default
     assert ExecutionConfig(blend=0.4, gain=1.5).on(default) == dataclasses.replace(default, blend=0.4, gain=1.5)

@@ -40,7 +40,7 @@ def test_a_plan_that_accelerates_from_the_present_state_is_left_as_it_is():
     torch.testing.assert_close(blend_plan(parabola.solution[:1], rough, 0.5), rough)  # least squares, at present
 
 
-def test_the_last_word_on_actions_sees_the_whole_window():
+def test_the_final_rule_for_actions_reads_the_whole_window():
     seen = []
 
     def rule(states, actions):

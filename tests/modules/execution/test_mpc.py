@@ -29,7 +29,7 @@ def test_a_fit_finds_the_system():
     torch.testing.assert_close(fitted.weight, system.weight, atol=1e-5, rtol=0)
 
 
-def test_uncoupled_axes_know_nothing_of_each_other():
+def test_uncoupled_axes_have_no_cross_weights():
     fitted = (
         ResponseModel([0, 1], [0, 1], [0, 1])
         .double()
@@ -71,7 +71,7 @@ def policy_of(response=None, **execution):
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_entries_that_the_response_does_not_know_are_the_rules(batch):
+def test_actions_outside_the_response_come_from_the_rule(batch):
     one_axis = ResponseModel([1], [1], [1], action_dim=3)
     one_axis.weight[0, 0, 2] = 0.3
     mpc = mpc_of(one_axis, action_rule=lambda states, actions: actions + states[..., :1])

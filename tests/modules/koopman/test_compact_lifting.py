@@ -36,7 +36,7 @@ def train(lifting, windows, steps=250):
 
 
 class TestNoiseAdjustedComponents:
-    def test_the_best_measured_come_first(self):
+    def test_components_with_least_noise_come_first(self):
         phase = turning()
         clean = torch.cat([phase.sin(), phase.cos()], -1)
         windows = torch.cat([0.1 * clean, 10 * torch.randn(400, 17, 2)], -1)
@@ -79,7 +79,7 @@ class TestNoiseAdjustedComponents:
 
 class TestCompactLifting:
     @pytest.mark.parametrize(("bodies", "kept"), [(2, 2), (4, 4)])
-    def test_as_many_coordinates_as_move(self, bodies, kept):
+    def test_kept_coordinates_are_as_many_as_moving_bodies(self, bodies, kept):
         windows = embedded(turning(bodies=bodies).sin())
         lifting = CompactLifting(24, 2)
         train(lifting, windows)
@@ -90,7 +90,7 @@ class TestCompactLifting:
         error = (lifting.decode(lifted) - windows).square().mean() / windows.var()
         assert error < 0.2
 
-    def test_a_folded_state_is_unfolded_before_it_is_trained_on(self):
+    def test_a_folded_state_is_unfolded_before_training(self):
         place = torch.linspace(0, 1, 120)[:, None, None] + 0.004 * torch.arange(15)[:, None]  # [120, 15, 1]
         windows = (-0.5 * ((place - torch.linspace(0, 1, 24)) / 0.04) ** 2).exp()
         windows = windows + 0.02 * torch.randn(windows.shape, generator=torch.Generator().manual_seed(0))
@@ -119,7 +119,7 @@ class TestCompactLifting:
             each.pretrain(windows, 3)
         assert all(torch.equal(value, same.state_dict()[name]) for name, value in lifting.state_dict().items())
 
-    def test_the_error_counts_components_by_how_far_they_stand_out(self):
+    def test_the_reconstruction_error_weights_components(self):
         windows = embedded(turning(bodies=2).sin())
         lifting = CompactLifting(24, 2)
         lifting.prepare(windows)

@@ -155,7 +155,7 @@ def one_axis_still(num: int) -> tuple[torch.Tensor, torch.Tensor]:
     return state, torch.cat([state[:, 3:] - state[:, 2:-1], torch.zeros(num, 3, 2)], 1)
 
 
-def test_an_axis_without_labels_worth_the_name_is_decoded_like_the_other():
+def test_an_axis_with_too_few_labels_is_decoded_like_the_other():
     spread = torch.randn(500, 16, 2, generator=torch.Generator().manual_seed(3)).cumsum(1) * 0.01
     answers = {}
     for axes in ((), (0, 1)):

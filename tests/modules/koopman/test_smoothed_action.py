@@ -71,12 +71,12 @@ def test_the_choice_comes_with_weights_that_are_copied_as_tensors():
     assert torch.equal(other(state=windows), infer(state=windows))
 
 
-def test_the_raw_block_may_not_reach_further():
+def test_the_raw_block_must_not_read_further_frames():
     with pytest.raises(ValueError, match="reads 4 frames back and 5 ahead: .* got 3 and 8"):
         make_infer(num_past=3)
 
 
-def test_steps_of_the_state_are_where_they_are_said_to_be():
+def test_steps_of_the_state_are_at_the_declared_positions():
     infer = make_infer()
     windows = torch.randn(50, 17, 2).cumsum(1)
     infer.finish(windows)
@@ -154,6 +154,6 @@ def test_smoothing_takes_noise_out_and_leaves_clean_windows():
     assert smoother(clean[:, index][None]).shape == (1, 1500, 8, 2)
 
 
-def test_windows_that_tell_no_noise_are_refused():
+def test_windows_too_short_to_estimate_noise_raise_errors():
     with pytest.raises(ValueError, match=r"T >= 5, d\], got \[5, 4, 2\]"):
         noise_covariance(torch.zeros(5, 4, 2))
