@@ -68,11 +68,11 @@ def default_policy() -> tuple[PlanningPolicy, int]:
     return make_policy(planner, controller, state_of=range(14), reads=StateReader(range(7))), 14
 
 
-def compiled(what: Exportable) -> Callable:
+def compiled(target: Exportable) -> Callable:
     """Compiles the policy with torch.compile and compares it with the eager one."""
     try:
-        function = torch.compile(what.module, fullgraph=True, dynamic=False)
-        gap = relative_gap(function(*what.inputs.values()), what.module(*what.inputs.values()))
+        function = torch.compile(target.module, fullgraph=True, dynamic=False)
+        gap = relative_gap(function(*target.inputs.values()), target.module(*target.inputs.values()))
     except Exception as error:  # a missing compiler raises various errors
         raise ExportError(f"torch.compile needs a C++ compiler such as g++: {str(error).splitlines()[0]}") from error
     if not gap <= TOLERANCE:
@@ -110,22 +110,22 @@ def time_calls(
 def exported(run: Path | None, repeats: int) -> list[dict[str, str]]:
     """Returns a row per way to call a policy."""
     policy, width = default_policy() if run is None else (load_policy(run), Trained.load(run).task.observation_dim)
-    what = exportable(policy, columns={"observations": {f"column {index}": "" for index in range(width)}})
-    ways: dict[str, Callable] = {"eager": what.module}
+    target = exportable(policy, columns={"observations": {f"column {index}": "" for index in range(width)}})
+    ways: dict[str, Callable] = {"eager": target.module}
     seconds = {"eager": 0.0}
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         for way in ("compile", *SUFFIXES):
             began = time.perf_counter()
             try:
                 if way == "compile":
-                    ways[way] = compiled(what)
+                    ways[way] = compiled(target)
                 else:
                     file = Path(folder) / f"policy{SUFFIXES[way]}"
-                    ways[way] = export_policy(what, file, kind=way, tolerance=TOLERANCE)
+                    ways[way] = export_policy(target, file, kind=way, tolerance=TOLERANCE)
             except ExportError as error:
                 print(f"{way}: {error}")
             seconds[way] = time.perf_counter() - began
-        times = time_calls(ways, tuple(what.inputs.values()), repeats=repeats)
+        times = time_calls(ways, tuple(target.inputs.values()), repeats=repeats)
     rows = [{"way": way, "p50_ms": f"{row['p50']:.2f}", "p99_ms": f"{row['p99']:.2f}"} for way, row in times.items()]
     more = [
         {"over_eager": f"{times[row['way']]['ratio']:.2f}", "preparation_s": f"{seconds[row['way']]:.0f}"}

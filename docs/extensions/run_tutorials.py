@@ -64,7 +64,7 @@ def run(name: str, *, check: bool = False) -> str:
         done = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, env=env)
         if done.returncode:
             raise SystemExit(f"{script.name} failed:\n{done.stderr[-3000:]}")
-        said, printed, picture = f"{name}: {time.monotonic() - began:.0f} s", OUTPUTS / f"{name}.txt", f"{name}.png"
+        summary, printed, picture = f"{name}: {time.monotonic() - began:.0f} s", OUTPUTS / f"{name}.txt", f"{name}.png"
         if not (Path(folder) / picture).exists():
             raise SystemExit(f"{script.name} left no {picture}")
         if check:
@@ -72,11 +72,11 @@ def run(name: str, *, check: bool = False) -> str:
             words, figures = differences(shown, done.stdout.splitlines())
             if words:
                 raise SystemExit("\n".join((f"{script.name} prints other words than {printed.name} shows:", *words)))
-            return "\n".join((said, *figures))
+            return "\n".join((summary, *figures))
         OUTPUTS.mkdir(exist_ok=True)
         printed.write_text(f"{DIGEST}{digest(script)}\n{done.stdout}", encoding="utf-8")
         shutil.copyfile(Path(folder) / picture, OUTPUTS / picture)
-    return said
+    return summary
 
 
 def differences(shown: Iterable[str], printed: Iterable[str]) -> tuple[list[str], list[str]]:
