@@ -97,18 +97,16 @@ def test_a_run_that_was_copied_takes_frames(run, tmp_path):
     assert list(Trained.load(copy_run(run, tmp_path / "copy")).cameras) == ["top"]
 
 
-def test_an_exported_file_says_that_it_takes_embeddings(run, tmp_path, capsys):
-    assert koap("export", run, "--out", tmp_path / "exported") == 0
-    note = "Columns of top are embeddings: the file takes no frames."
-    assert note in capsys.readouterr().out
-    assert json.loads((tmp_path / "exported" / "policy.json").read_text())["note"].endswith(note)
-
-
-def test_a_policy_with_a_network_of_one_s_own_is_exported_where_the_plugin_is_named(run, tmp_path, capsys):
+def test_a_file_with_a_network_of_one_s_own_needs_its_plugin_to_be_exported_and_says_that_it_takes_embeddings(
+    run, tmp_path, capsys
+):
     file = Trained.load(run).save(tmp_path / "policy.safetensors")
     assert koap("export", file, "--out", tmp_path / "exported") == 1
     assert "embeds frames with code of tiny_network: name it in plugins" in capsys.readouterr().err
     assert koap("export", file, "--out", tmp_path / "exported", "--plugin", "tiny_network") == 0
+    note = "Columns of top are embeddings: the file takes no frames."
+    assert note in capsys.readouterr().out
+    assert json.loads((tmp_path / "exported" / "policy.json").read_text())["note"].endswith(note)
 
 
 def test_latency_is_that_with_the_cameras(run, capsys):

@@ -1,3 +1,6 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Execution options: which are accepted, and what a method fills in."""
+
 import dataclasses
 
 import pytest
