@@ -64,8 +64,8 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
         last = weights[-actions.shape[1] - 1 : -1]
         gains.append(np.median(last[commands, np.arange(len(commands))]))
     needed = next(ahead for ahead, share in enumerate(shares) if share <= min(shares) + NEAR)
-    clear = shares[0] - min(shares) > CLEAR and gains[needed] > 0
-    return needed if clear and not (task.targets and gains[needed] > LARGEST_GAIN) else 0
+    largest = LARGEST_GAIN if task.targets else np.inf
+    return needed if shares[0] - min(shares) > CLEAR and 0 < gains[needed] <= largest else 0
 
 
 def _labelled_rows(data: TensorDictBase) -> np.ndarray:

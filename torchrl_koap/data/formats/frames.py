@@ -141,8 +141,8 @@ def _hdf5(clip: Clip) -> Iterator[np.ndarray]:
     with h5py.File(clip.file, "r") as stream:
         frames = stream[clip.entry]
         following = stream.get(clip.entry.replace("/obs/", "/next_obs/")) if "/obs/" in clip.entry else None
-        held = len(frames) + (following is not None)
-        for number in clip.numbers:  # number T: the last frame of next_obs
+        held = len(frames) + (following is not None)  # number T is the last frame of next_obs
+        for number in clip.numbers:
             if number >= held:
                 raise ValueError(f"frame {number} is missing: {clip.file} has {held}")
             frame = frames[number] if number < len(frames) else following[-1]
