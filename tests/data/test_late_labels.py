@@ -71,11 +71,14 @@ def test_a_script_that_reacts_to_noisy_states_is_on_time():
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_paths_without_anything_unforeseen_say_nothing():
-    time, generator = np.linspace(0, 1, FRAMES + 1)[:, None], np.random.default_rng(0)
-    paths = [time**3 * generator.normal(size=3) + np.sin(np.pi * time) * generator.normal(size=3) for _ in range(4)]
-    targets = [path[1:] + 0.02 * np.diff(path, axis=0) for path in paths]
-    data = make_demonstrations([path[:-1] for path in paths], targets, control_hz=30, action_kind="absolute")
-    assert frames_late(*data) == 0
+    time, states, actions = np.linspace(0, 1, 101)[:, None], [], []
+    for seed in range(30, 33):
+        generator = np.random.default_rng(seed)
+        path = generator.normal(0, 0.1, 3) + generator.uniform(-0.5, 0.5, 3) * time**3 * (10 - 15 * time + 6 * time**2)
+        path += 0.1 * np.sin(np.pi * time) * generator.normal(size=3)
+        states.append(path[:-1])
+        actions.append(path[1:] + 0.02 * np.diff(path, axis=0))
+    assert frames_late(*make_demonstrations(states, actions, control_hz=30, action_kind="absolute")) == 0
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
