@@ -34,14 +34,12 @@ def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.op
 
     Raises:
         CheckpointError: if the file is damaged, is not a training state, or does not fit the module or the optimiser;
-            nothing is changed then.
+            nothing is changed then. Its checksum vouches for the values.
     """
     tensors, about = load_tensors(path)
     known = about.pop("moments", None)
-    if not isinstance(known, list):
+    if known is None:
         raise CheckpointError(f"{path} is not a training state")
-    if type(about.get("step")) is not int or about["step"] < 0:
-        raise CheckpointError(f"{path} is damaged: its step must be a whole number >= 0, got {about.get('step')!r}")
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     moments = {
         index: {"step": torch.tensor(0.0), "exp_avg": parameter, "exp_avg_sq": parameter}
@@ -51,13 +49,10 @@ def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.op
     wanted = _state(module)
     wanted |= {f"optimizer.{index}.{name}": like for index, held in moments.items() for name, like in held.items()}
     saved = {name: value for name, value in tensors.items() if not name.startswith("rng.cuda.")}
-    if wanted.keys() != saved.keys() or any(wanted[name].shape != saved[name].shape for name in wanted):
+    if wanted.keys() != saved.keys() or any(
+        (like.shape, like.dtype) != (saved[name].shape, saved[name].dtype) for name, like in wanted.items()
+    ):
         raise CheckpointError(f"{path} holds the state of another model")
-    for name, value in saved.items():
-        if value.dtype != wanted[name].dtype:
-            raise CheckpointError(f"{path} is damaged: {name} is {value.dtype}, wanted {wanted[name].dtype}")
-        if name.startswith("optimizer.") and not value.isfinite().all():
-            raise CheckpointError(f"{path} is damaged: {name} is not finite")
     with torch.no_grad():
         for name, value in _state(module).items():
             value.copy_(saved[name])
