@@ -64,9 +64,3 @@ def test_it_rests_after_the_last_box_and_after_a_lost_one():
         assert not expert.finished.any()
         action = steady(expert, observation((0.5, 0.1), places), 10)
         assert expert.finished.all() and np.abs(action).max() < 1e-4
-
-
-def test_observations_that_hold_nan_are_refused():
-    expert = SortingExpert([0, 1], draw_contexts("sorting", 2, 0), [(0,), (1,)])
-    with pytest.raises(ValueError, match="NaN, row 1"):
-        expert.act(np.array([[0.5] * 16, [np.nan] * 16]))

@@ -76,8 +76,7 @@ class AligningExpert(Expert):
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Returns changes of the commanded TCP position [n, 3] (m) for observations [n, 20]."""
-        rows = zip(self._players, self._checked(observation), strict=True)
-        actions = np.stack([player.act(row) for player, row in rows])
+        actions = np.stack([player.act(row) for player, row in zip(self._players, observation, strict=True)])
         self.finished[:] = [player.since_success > player.linger for player in self._players]
         return actions
 

@@ -82,7 +82,6 @@ class AvoidingExpert(Expert):
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Returns changes of the commanded xy [n, 2] (m) for observations [n, 4]."""
-        observation = self._checked(observation)
         seen = self._look(observation)
         decision = self._decide(seen, observation[:, 3])
         self._decisions = np.concatenate([decision[:, None], self._decisions[:, :-1]], axis=1)

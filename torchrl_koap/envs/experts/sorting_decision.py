@@ -66,9 +66,7 @@ def solve_eikonal(slowness, cost):
 
 @njit(cache=True)
 def value_at(field, x, y):
-    """Interpolates a field [X, Y] at ``x, y`` (m): bilinear, constant beyond the border, NaN where they are."""
-    if np.isnan(x + y):
-        return np.nan
+    """Interpolates a field [X, Y] at ``x, y`` (m): bilinear, constant beyond the border."""
     u = min(max((x - ORIGIN[0]) / STEP, 0.0), field.shape[0] - 1.001)
     v = min(max((y - ORIGIN[1]) / STEP, 0.0), field.shape[1] - 1.001)
     i, j = int(u), int(v)

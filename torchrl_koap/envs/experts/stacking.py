@@ -57,7 +57,6 @@ class StackingExpert(Expert):
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Returns changes of the commanded joints (rad) and gripper commands (m) [n, 8] for observations [n, 31]."""
-        observation = self._checked(observation)
         seen = {name: observation[:, columns] for name, columns in self.task.observation.items()}
         commanded = seen["desired_joints_and_gripper"][:, :7]
         _, turned = tcp_pose(seen["measured_joints"])
