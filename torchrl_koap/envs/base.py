@@ -321,11 +321,10 @@ class ManipulationEnv(EnvBase):
         Cameras are ``"front"``, ``"cage"`` (D3IL's) and ``"wrist"``; Scooping's ``"third_person"`` and ``"front"``.
 
         Raises:
+            IndexError: for an environment outside the batch.
             RuntimeError: if no OpenGL library can be used.
-            ValueError: for an unknown camera, an environment outside the batch or a size below 1.
+            ValueError: for an unknown camera or a size below 1.
         """
-        if not 0 <= index < len(self.sims):
-            raise ValueError(f"index must be 0 to {len(self.sims) - 1}, got {index}")
         if self._renderer is None or self._renderer.size != (width, height):
             if self._renderer is not None:
                 self._renderer.close()

@@ -31,8 +31,6 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
     """Draws random contexts from the ranges of a task, float64 ``[num, objects, 3]``; ``generator`` may be a seed."""
     task = get_task(task)
     scene = _scene(task)
-    if num < 1:
-        raise ValueError(f"the number of contexts must be at least 1, got {num}")
     drawing = np.random.default_rng(generator)
     contexts = np.empty((num, len(task.objects), 3))
     for context in contexts:
@@ -54,7 +52,6 @@ def evaluation_contexts(task: Task | str) -> np.ndarray:
     a seed derived from its name.
     """
     task = get_task(task)
-    _scene(task)
     rows = json.loads(TABLE.read_text())["contexts"].get(task.source)
     if rows is None:  # not D3IL's: the same ones every time
         return draw_contexts(task, NUM_EVALUATION_CONTEXTS, np.random.default_rng([*task.source.encode()]))
@@ -90,7 +87,6 @@ def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
     Degrees become rad, and further entries are left out. The restricted unpickler reads the file.
     """
     task = get_task(task)
-    _scene(task)
     contexts = load_pickle(Path(file))
     if not isinstance(contexts, (list, tuple)) or not contexts:
         raise ValueError(f"{file}: wanted a list of contexts, got {type(contexts).__name__}")

@@ -64,10 +64,6 @@ class NetworkLoss(LossModule):
         """Mandatory entries, as renamed by ``set_keys``."""
         return [getattr(self.tensor_keys, name) for name in self.required]
 
-    @in_keys.setter
-    def in_keys(self, values) -> None:
-        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
-
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """Does nothing: there is no value estimator."""
 

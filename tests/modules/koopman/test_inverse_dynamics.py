@@ -215,13 +215,7 @@ def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held()
         ({"action_decoder": LinearActionDecoder(7, 2)}, "'action_decoder': 7"),
         ({"operator": KoopmanOperator(4, input_dim=9)}, "'operator input': 9"),
         ({"lifting": KoopmanLifting(3, 6)}, "latent_dim differs: lifting 6, operator 4"),
-        ({"state_normalizer": Normalizer(4)}, "state_normalizer has 4 columns, the model 3"),
-        ({"action_normalizer": Normalizer(1)}, "action_normalizer has 1 columns, the model 2"),
         ({"lifting": KoopmanLifting(2, 4)}, "state_dim differs: latent_action 3, lifting 2"),
-        (
-            {"action_decoder": LinearActionDecoder(4, 2, in_key="w")},
-            "writes 'latent_action', but action_decoder reads 'w'",
-        ),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(parts, message):

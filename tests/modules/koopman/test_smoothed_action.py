@@ -7,7 +7,6 @@ from tensordict import TensorDict
 
 from torchrl_koap.data import flatten_trajectories, select_state
 from torchrl_koap.modules import PRESETS, KoopmanLifting, Normalizer, make_koopman_inverse_dynamics
-from torchrl_koap.modules.koopman.compact_lifting import noise_covariance
 from torchrl_koap.modules.koopman.smoothed_action import LIFTED, RAW, LatentActionSmoothed, WienerSmoother
 from torchrl_koap.training.closed_form import fit_closed_form
 
@@ -152,8 +151,3 @@ def test_smoothing_takes_noise_out_and_leaves_clean_windows():
     smoother.fit(clean[:, index], clean)
     assert (smoother(clean[:, index]) - clean[:, index]).abs().max() < 0.02
     assert smoother(clean[:, index][None]).shape == (1, 1500, 8, 2)
-
-
-def test_windows_too_short_to_estimate_noise_raise_errors():
-    with pytest.raises(ValueError, match=r"T >= 5, d\], got \[5, 4, 2\]"):
-        noise_covariance(torch.zeros(5, 4, 2))

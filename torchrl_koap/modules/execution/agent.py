@@ -151,8 +151,6 @@ class Agent:
                 raise ValueError(f"this policy was trained without cameras: it takes one vector [obs], got {given}")
             observation = self.policy.observe(observation)
         observed = observed_numbers(observation)
-        if observed.is_complex() or observed.is_meta or observed.layout != torch.strided:
-            raise ValueError(f"an observation must be plain numbers, got a tensor of {observed.dtype}")
         shape = tuple(observed.shape)
         if len(shape) not in (1, 2) or not observed.numel():
             raise ValueError(f"an observation must be [obs] or [n, obs], got {list(shape)}")

@@ -34,8 +34,6 @@ def noise_covariance(windows: Tensor) -> Tensor:
     lag 0 and ``-R`` at lag 1. A parabola in the lag through lags 2 and 3 extrapolates the motion's own autocovariance
     to lag 1. Windows are ``[N, T, d]``, ``T >= 5``; the result ``[d, d]``, float64, is positive semidefinite.
     """
-    if windows.ndim != 3 or windows.shape[-2] < 5:
-        raise ValueError(f"noise_covariance needs windows [N, T >= 5, d], got {list(windows.shape)}")
     steps = windows.diff(dim=-2).double()
     lagged = []
     for lag in (1, 2, 3):
@@ -123,12 +121,10 @@ def isomap(points: Tensor, dims: int) -> Tensor:
     eigenvalues and -vectors of the landmarks' doubly centred squared distances: Isomap (Tenenbaum et al. 2000) with
     landmarks (de Silva and Tenenbaum 2003). The number of neighbours is doubled until the graph is connected.
 
-    The first 200 of the points ``[N, d]`` are the landmarks, so points should be in random order. Fewer than two raise
-    a ValueError. Coordinates ``[N, dims]`` have unit spread, those with the widest spread before scaling come first;
-    those that landmarks do not span are 0.
+    The first 200 of the points ``[N, d]`` are the landmarks, so points should be in random order. Coordinates
+    ``[N, dims]`` have unit spread, those with the widest spread before scaling come first; those that landmarks do not
+    span are 0.
     """
-    if len(points) < 2:
-        raise ValueError(f"coordinates along a surface need at least two points, got {len(points)}")
     chosen = min(LANDMARKS, len(points))
     ways = _shortest_ways(points.double(), chosen) ** 2  # [landmarks, N]
     own = ways[:, :chosen]

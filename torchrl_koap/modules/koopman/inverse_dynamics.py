@@ -15,7 +15,6 @@ from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule, LinearActionDecoder
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import RAW
-from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, RidgeFit, ridge, shared_filter
 from torchrl_koap.modules.windows import WindowReader
 
@@ -78,7 +77,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         **kwargs: normalisers, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
-        ValueError: if sizes of the parts differ, or the decoder does not read the entry that the network writes.
+        ValueError: if sizes of the parts differ.
 
     Examples:
         >>> import torch
@@ -113,18 +112,10 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
             raise ValueError(f"latent_dim differs: lifting {lifting.latent_dim}, operator {operator.latent_dim}")
         if latent_action.state_dim != lifting.state_dim:
             raise ValueError(f"state_dim differs: latent_action {latent_action.state_dim}, lifting {lifting.state_dim}")
-        if latent_action.out_keys != action_decoder.in_keys:
-            written, read = latent_action.out_keys[0], action_decoder.in_keys[0]
-            raise ValueError(f"latent_action writes {written!r}, but action_decoder reads {read!r}")
         super().__init__(latent_action, action_decoder, lifting, **kwargs)
         self.out_keys = [*latent_action.out_keys, self.out_key]
         self.latent_key = latent_action.out_keys[0]
         self.operator, self.penalty = operator, penalty
-        sizes = {"state_normalizer": lifting.state_dim, "action_normalizer": action_decoder.linear.out_features}
-        for name, width in sizes.items():
-            normalizer = kwargs.get(name)
-            if isinstance(normalizer, Normalizer) and len(normalizer.scale) != width:
-                raise ValueError(f"{name} has {len(normalizer.scale)} columns, the model {width}")
 
     def decode(self, latent: Tensor) -> Tensor:
         """Decodes latent actions ``[*B, T, m]`` to actions ``[*B, T, act]`` in normalised units."""
