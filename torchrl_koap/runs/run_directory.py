@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
-import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
@@ -48,8 +47,9 @@ class RunDirectory:
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file atomically; numbers that are not finite, which JSON lacks, become null."""
+        finite = json.loads(json.dumps(content), parse_constant=lambda word: None)
         with replacing_file(self.path / name) as aside:
-            aside.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+            aside.write_text(json.dumps(finite, indent=2) + "\n")
 
     def read_json(self, name: str) -> dict[str, Any]:
         """Reads a JSON file; a RunDirectoryError names a file that is missing or damaged."""
@@ -169,14 +169,6 @@ def _check_row(path: Path, row: Mapping[str, Any]) -> None:
     except (KeyError, TypeError, ValueError) as error:
         found = ", ".join(f"{value}" for value in row.values())
         raise RunDirectoryError(f"{path} is damaged in the row {found[:60]!r}: {error}") from error
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def pretrained_folders() -> dict[str, Path]:

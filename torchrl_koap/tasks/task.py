@@ -7,6 +7,7 @@ a data set, and simulators are only imported when used.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -287,7 +288,7 @@ class Task(Columns):
 
     def to_json(self) -> dict[str, Any]:
         """Returns the task as dictionaries, lists, strings and numbers; raises a TypeError for other objects."""
-        return {name: _plain(value, name) for name, value in asdict(self).items()}
+        return json.loads(json.dumps(asdict(self)))
 
     def definition(self) -> dict[str, Any] | None:
         """Returns the task as stored in data sets and runs; None if it names code: only its name is stored then."""
@@ -297,13 +298,3 @@ class Task(Columns):
     def from_json(cls, entries: object) -> Task:
         """Reads the task that :meth:`to_json` wrote; refuses unknown, missing and invalid entries."""
         return dataclass_from_json(cls, entries)
-
-
-def _plain(value: Any, place: str) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(entry, f"{place}.{key}") for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry, place) for entry in value]
-    if value is None or isinstance(value, (str, int, float, bool)):
-        return value
-    raise TypeError(f"{place} cannot be written to JSON: wanted an import string, got {value!r}")
