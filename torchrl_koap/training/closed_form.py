@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.data.windows import WindowTable, spread_evenly
@@ -29,12 +29,10 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     table = WindowTable.build(data, controller.num_window_frames, pad_before=controller.num_past)
     frames, _ = table.frames()
     frames = spread_evenly(frames[data[HAS_ACTION].squeeze(-1)[frames[:, controller.num_past]]], MOST)
-    windows = data.select(STATE, ACTION, EPISODE)[frames]
+    entries = {controller.in_key: STATE, controller.out_key: ACTION, EPISODE: EPISODE}
+    windows = TensorDict({own: data[name][frames] for own, name in entries.items()}, frames.shape)
     mask = torch.zeros_like(frames, dtype=torch.bool)
     mask[:, controller.num_past] = True  # other frames would use a step twice, with a clamped look-ahead
-    for name, own in ((STATE, controller.in_key), (ACTION, controller.out_key)):
-        if own != name:
-            windows.rename_key_(name, own)
     return controller.fit_labels(windows, mask, **known)
 
 
