@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests that weights with the best held-out score are kept, and that training then ends."""
 
+from unittest import mock
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,6 +11,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.training import loop
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import train_phase
 
@@ -30,8 +33,9 @@ def training(path, score, *, stop=None, num_steps=100, **options):
             raise KeyboardInterrupt
 
     run = RunDirectory(path)
-    options = {"num_steps": num_steps, "learning_rate": 1e-2, "checkpoint_every": 15, "progress": progress, **options}
-    train_phase("planner", loss, sample, target_update=average, best=best, run=run, **options)
+    options = {"num_steps": num_steps, "learning_rate": 1e-2, "progress": progress, **options}
+    with mock.patch.object(loop, "CHECKPOINT_EVERY", 15):
+        train_phase("planner", loss, sample, target_update=average, best=best, run=run, **options)
     return loss, best, run
 
 

@@ -23,7 +23,7 @@ from torchrl_koap.runs.weights import CheckpointError
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.checkpoints import load_training_state, save_training_state
 
-CHECKPOINT_EVERY = 500
+CHECKPOINT_EVERY = 500  # updates
 WARMUP = 100  # updates until the learning rate reaches its peak
 TIMES = 5.0  # of the root mean square length; mini-batch gradients vary by about a factor of two
 SETTLED = 100  # updates until the mean square is reliable
@@ -61,7 +61,6 @@ def train_phase(
     run: RunDirectory | None = None,
     logger: Any = None,
     log_every: int = 50,
-    checkpoint_every: int | None = None,
     resume: bool = False,
     replay: bool = False,
     progress: Callable[[int, dict[str, float]], None] | None = None,
@@ -80,12 +79,7 @@ def train_phase(
         DivergedError: if a loss is not finite when logged, or a parameter is not when a checkpoint is due; the message
             names step and term. The last checkpoint is kept.
         CheckpointError: if the checkpoint is damaged or of another model.
-        ValueError: if a number of steps is below 1.
     """
-    checkpoint_every = CHECKPOINT_EVERY if checkpoint_every is None else checkpoint_every
-    for name, value in {"num_steps": num_steps, "log_every": log_every, "checkpoint_every": checkpoint_every}.items():
-        if value < 1:
-            raise ValueError(f"{name} must be >= 1, got {value}")
     device = next(loss_module.parameters()).device
     replay = replay and device.type == "cuda"
     # fused AdamW is the fastest on CPU and CUDA, and its state is plain tensors
@@ -151,7 +145,7 @@ def train_phase(
                     logger.log_scalar(f"{phase}/{key}", number, step=done)
         if progress is not None:
             progress(done, values)
-        if checkpoint is not None and (done % checkpoint_every == 0 or done == num_steps):
+        if checkpoint is not None and (done % CHECKPOINT_EVERY == 0 or done == num_steps):
             if not all(parameter.isfinite().all() for parameter in loss_module.parameters()):
                 raise DivergedError(f"{phase}: parameters are not finite at step {done}; lower the learning rate")
             save_training_state(checkpoint, state, optimizer, {"phase": phase, "step": done})
