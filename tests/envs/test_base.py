@@ -50,12 +50,6 @@ def test_some_environments_alone():
     assert np.array_equal(env.simulate_actions(np.full((1, 1, 2, 2), 0.01), np.array([1]))[:, 0], both[:, 1])
 
 
-def test_a_wrong_shape():
-    env, _ = started(AvoidingEnv, "avoiding", 0)
-    with pytest.raises(ValueError, match=r"actions must be \[m, 2, k, 2\].*got shape \[1, 3, 2, 2\]"):
-        env.simulate_actions(np.zeros((1, 3, 2, 2)), np.arange(2))
-
-
 def test_episodes_that_are_over():
     env, data = started(AvoidingEnv, "avoiding", 0, max_steps=1)
     assert env.over.tolist() == [False, False]

@@ -294,11 +294,8 @@ class ManipulationEnv(EnvBase):
         """Simulates action sequences from the present state of the environments ``rows`` and restores it.
 
         Sequences ``[m, len(rows), k, act]`` lead to observations ``[m, len(rows), k, obs]``. Entry ``k`` is the state
-        after actions 0 to ``k``; :meth:`step` observes it one control step later. Raises a ValueError for other shapes.
+        after actions 0 to ``k``; :meth:`step` observes it one control step later.
         """
-        if actions.ndim != 4 or actions.shape[1] != len(rows) or actions.shape[3] != self.task.action_dim:
-            wanted = f"[m, {len(rows)}, k, {self.task.action_dim}] [sequences, environments, control steps, action]"
-            raise ValueError(f"actions must be {wanted}, got shape {list(actions.shape)}")
         present = {row: self.get_state(row) for row in rows}
         observations = np.empty((*actions.shape[:3], self.task.observation_dim))
         for sequence, observed in zip(actions, observations, strict=True):

@@ -52,7 +52,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         if options is None or options["begin"][self.index]:
             self._error, self._steps, self._over, self._success, self._most = "", 0, False, False, 0.0
             try:
-                self._take(_begin(self.env, seed))
+                self._take(self.env.reset(seed=seed)[0])
             except Exception as error:  # reported by the first step: an episode without a step has no outcome
                 self._error = f"reset: {say(error)}"
         return self._last, {}
@@ -126,7 +126,7 @@ def find_success_key(env_id: str, env: gymnasium.Env, success_key: str | None) -
     action = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
     shapes, entries = create_zero_array(env.observation_space), set[str]()
     try:
-        _check_shape(_begin(env, seed=0), shapes)
+        _check_shape(env.reset(seed=0)[0], shapes)
         for _ in range(1 if success_key is None else _LONGEST_PROBE):
             seen, _, terminated, truncated, info = env.step(action)
             _check_shape(seen, shapes)
@@ -142,14 +142,6 @@ def find_success_key(env_id: str, env: gymnasium.Env, success_key: str | None) -
         has = ", ".join(sorted(map(str, entries))) or "nothing"
         raise ValueError(f"info of environment {env_id!r} has no {success_key!r}, it has {has}")
     return found
-
-
-def _begin(env: gymnasium.Env, seed: int | None) -> Any:
-    """Resets an environment; returns the first observation."""
-    given: Any = env.reset(seed=seed)
-    if not isinstance(given, tuple) or len(given) != 2:
-        raise ObservationError(f"reset() must return an observation and an info, got {type(given).__name__}")
-    return given[0]
 
 
 def _check_shape(seen: Any, wanted: Any) -> None:
