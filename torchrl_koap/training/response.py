@@ -34,24 +34,21 @@ def tracked_columns(task: Task) -> dict[str, Any]:
     Raises:
         ValueError: if its observation does not repeat the last command, or it is not known what the actions move.
     """
-    columns, gripper = commanded_columns(task), task.gripper
-    known = (
-        range(task.action_dim) if columns is None else (*columns["actions"], *(() if gripper is None else gripper[:1]))
-    )
-    rest = [name for column, name in enumerate(task.action_names) if column not in known]
-    lacks = None
-    if task.command is None:
-        lacks = "its observation has no part that repeats the last command (Task.command)"
-    elif rest:
+    columns = commanded_columns(task)
+    if columns is not None:
+        known = (*columns["actions"], *(task.gripper or ())[:1])
+        rest = [name for column, name in enumerate(task.action_names) if column not in known]
+        if not rest:
+            return columns | {"absolute": bool(task.targets)}
         lacks = f"it is not known what the actions {', '.join(rest)} move"
-    elif columns is None:
+    elif task.command is None:
+        lacks = "its observation has no part that repeats the last command (Task.command)"
+    else:
         lacks = (
             f"its {task.action_dim} actions, the commands ({task.command!r}) and the state columns that they move"
             " (Action.column or Task.robot) differ in number"
         )
-    if columns is None or lacks:
-        raise ValueError(f"task {task.name!r} cannot follow plans by prediction: {lacks}")
-    return columns | {"absolute": bool(task.targets)}
+    raise ValueError(f"task {task.name!r} cannot follow plans by prediction: {lacks}")
 
 
 class LabelledSteps(NamedTuple):
