@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.data.d3il.conversion import CONVERTERS, ROBOT_COLUMNS, RawEpisode
+from torchrl_koap.data.d3il.conversion import CONVERTERS, ROBOT_COLUMNS
 from torchrl_koap.tasks import get_task
 
 
@@ -31,12 +31,11 @@ def made_up(task, rows=5, seed=0):
         half = np.radians(rng.uniform(-80, 80, rows)) / 2  # turned about z
         quat = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
         objects[name] = pose(rng.normal(size=(rows, 3)), quat)
-    return RawEpisode(robot=robot, objects=objects)
+    return robot, objects
 
 
 def write_folder(folder, task, episodes=3):
     files = [Path(folder) / f"env_{index:03d}_00.pkl" for index in range(episodes)]
     for index, file in enumerate(files):
-        episode = made_up(task, rows=4 + index, seed=index)
-        write_raw_episode(file, episode.robot, episode.objects)
+        write_raw_episode(file, *made_up(task, rows=4 + index, seed=index))
     return files

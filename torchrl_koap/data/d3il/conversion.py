@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -41,15 +41,7 @@ _LEAST_ROWS = 2
 _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
 
 
-@dataclass(frozen=True)
-class RawEpisode:
-    """Recorded demonstration of ``T`` control steps: arrays ``[T, ...]`` by name, of the robot and each object."""
-
-    robot: Mapping[str, np.ndarray]
-    objects: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-
-
-Robot = Mapping[str, np.ndarray]  # entries of ``robot`` [T, ...] by name
+Robot = Mapping[str, np.ndarray]  # entries of ``robot``, or of an object, [T, ...] by name
 Poses = Sequence[tuple[np.ndarray, np.ndarray]]  # positions [T, 3] and quaternions [T, 4] of every object
 
 
@@ -63,10 +55,10 @@ class Converter:
     columns: Callable[[Robot, Poses], tuple[np.ndarray, np.ndarray]]  # to observations and actions
     unread: tuple[str, ...] = ()  # objects that may be logged too, and are ignored
 
-    def convert(self, episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
-        """Converts a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``, float64."""
-        robot = {name: np.asarray(episode.robot[name], dtype=np.float64) for name in self.robot}
-        logged = [episode.objects[name] for name in self.objects]
+    def convert(self, robot: Robot, objects: Mapping[str, Robot]) -> tuple[np.ndarray, np.ndarray]:
+        """Converts the ``T`` rows of an episode to observations ``[T, obs]`` and actions ``[T - 1, act]``, float64."""
+        robot = {name: np.asarray(robot[name], dtype=np.float64) for name in self.robot}
+        logged = [objects[name] for name in self.objects]
         poses = [(np.asarray(each["pos"], np.float64), np.asarray(each["quat"], np.float64)) for each in logged]
         return self.columns(robot, poses)
 
@@ -149,7 +141,7 @@ def read_raw(
         if progress is not None and index:
             progress(index, len(files))
         try:
-            observed, acted = converter.convert(_read_episode(file, converter))
+            observed, acted = converter.convert(*_read_episode(file, converter))
         except DataError as error:
             problems += [f"{file}: {problem}" for problem in error.problems]
         except OSError as error:
@@ -161,8 +153,8 @@ def read_raw(
     return frames, actions
 
 
-def _read_episode(path: Path, converter: Converter) -> RawEpisode:
-    """Reads a pickle and checks that it has the converter's entries and poses."""
+def _read_episode(path: Path, converter: Converter) -> tuple[Robot, dict[str, Robot]]:
+    """Reads the robot and the objects of a pickle; checks that it has the converter's entries and poses."""
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("robot"), dict):
         held = f"the keys {sorted(map(str, content))}" if isinstance(content, dict) else f"a {type(content).__name__}"
@@ -172,7 +164,7 @@ def _read_episode(path: Path, converter: Converter) -> RawEpisode:
     if set(converter.objects) not in (set(others), {*others} - {*converter.unread}):
         wanted = ", ".join(converter.objects) or "no objects"
         raise DataError(path, f"of another task: it logs {', '.join(map(str, others))}, wanted {wanted}")
-    return RawEpisode(content["robot"], others)
+    return content["robot"], others
 
 
 def _problems(robot: Mapping[str, Any], objects: Mapping[str, Any], converter: Converter) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from torchrl_koap import keys
-from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter, RawEpisode
+from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.lookup import resolve
@@ -163,4 +163,4 @@ def _converted(
     poses = np.stack([poses[row] for _, poses in logs], axis=1)  # [objects, T, 7]
     each = zip(converter.objects, poses, strict=True)
     objects = {name: {"pos": own[:, :3], "quat": own[:, 3:]} for name, own in each}
-    return converter.convert(RawEpisode(robot=robot, objects=objects))
+    return converter.convert(robot, objects)
