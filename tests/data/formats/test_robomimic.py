@@ -141,8 +141,6 @@ def test_faults(file, tmp_path):
     (tmp_path / "text.hdf5").write_text("text")
     with pytest.raises(DataError, match="no HDF5 file"):
         read_robomimic(tmp_path / "text.hdf5")
-    with pytest.raises(FileNotFoundError):
-        read_robomimic(tmp_path / "none.hdf5")
 
 
 @pytest.mark.parametrize(

@@ -128,11 +128,6 @@ def test_a_rate_that_is_given_needs_no_time_stamps(tmp_path):
         read_tables(tmp_path, control_hz=30, action_columns=["akcion"])
 
 
-def test_an_empty_folder(tmp_path):
-    with pytest.raises(FileNotFoundError, match="holds no"):
-        read_tables(tmp_path)
-
-
 @pytest.mark.parametrize("content", [b"", b"PK no archive", b"\x93NUMPY"])
 def test_damaged_archives_are_named(content, tmp_path):
     (tmp_path / "a.npz").write_bytes(content)

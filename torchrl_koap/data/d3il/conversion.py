@@ -123,8 +123,6 @@ def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
         files = [file for file in found if not any(fnmatch.fnmatch(file.name, other) for other in _NO_EPISODES)]
         if files:
             return files
-    if not root.is_dir():
-        raise FileNotFoundError(f"no folder {root}")
     searched = ", ".join(map(str, folders))
     raise FileNotFoundError(f"no data set of `koap convert` and no demonstrations of D3IL (*.pkl) in {searched}")
 

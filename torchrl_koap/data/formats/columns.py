@@ -127,7 +127,7 @@ def assemble(
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
     refuse(source, problems)
     times = None
-    if resample is not None and rate is not None:
+    if resample is not None:
         times = [np.arange(piece.frames) / rate for piece in pieces] if counting is None else counting.times
         seen_in = [np.isfinite(_stack(piece.states, observed)).all(1) | bool(piece.actions) for piece in pieces]
         times = [at[rows] for at, rows in zip(times, seen_in, strict=True)]

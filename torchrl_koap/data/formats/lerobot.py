@@ -112,8 +112,6 @@ def read_lerobot(
 def read_info(root: str | Path) -> dict[str, Any]:
     """Reads the description of a data set; raises a DataError if it is invalid."""
     file = Path(root).expanduser() / INFO
-    if not file.is_file():
-        raise FileNotFoundError(f"no LeRobot data set in {root}: it has no {INFO}")
     info = read_json(file)
     features = info.get("features") or {}
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):

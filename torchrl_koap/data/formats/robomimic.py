@@ -57,8 +57,6 @@ def read_robomimic(
     """
     h5py = import_extra("h5py", "hdf5", "HDF5 files are read with")
     files = hdf5_files(file)
-    if not files:
-        raise FileNotFoundError(f"{file} is no HDF5 file, and no folder of them")
     pieces, rates, skipped = [], {}, []
     for each in files:
         try:

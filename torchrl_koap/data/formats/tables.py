@@ -57,8 +57,6 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     those of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     folder, files = Path(folder), table_files(folder)
-    if not files:
-        raise FileNotFoundError(f"{folder} holds no *.npz, *.csv or *.parquet files")
     archives = [file.name for file in files if file.suffix.lower() == ".npz"]
     if action_columns is not None and archives:
         raise ValueError(
