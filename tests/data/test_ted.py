@@ -52,7 +52,7 @@ def test_save_refuses(tmp_path):
     (tmp_path / "work" / "thesis.txt").write_text("years")
     with pytest.raises(FileExistsError, match="it was not changed"):
         save_ted(recorded(), tmp_path / "work", AVOIDING)
-    with pytest.raises(TypeError, match="entries .'note'. are not tensors"):
+    with pytest.raises(ValueError, match="`note` is invalid, expected torch.Tensor"):
         save_ted(recorded().set_non_tensor("note", "text"), tmp_path / "other", AVOIDING)
     with pytest.raises(DataError):
         save_ted(recorded().exclude("action"), tmp_path / "other", AVOIDING)

@@ -17,7 +17,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict, TensorDictBase
@@ -47,7 +46,7 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
 
     Raises:
         DataError: if the data do not follow the storage layout.
-        TypeError: if an entry is not a tensor.
+        ValueError: if an entry is not a tensor.
         FileExistsError: if the folder holds something other than a data set.
 
     Examples:
@@ -65,9 +64,6 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     folder = Path(folder)
     keys.validate(data, command=task.command_columns)
     entries = dict(data.flatten_keys("/").items())
-    invalid = [name for name, value in entries.items() if not isinstance(value, torch.Tensor)]
-    if invalid:
-        raise TypeError(f"only tensors can be saved; entries {invalid} are not tensors")
     if folder.exists() and not (folder.is_dir() and ((folder / _ABOUT).is_file() or not any(folder.iterdir()))):
         raise FileExistsError(f"{folder} exists and holds no data set; it was not changed")
     lengths = trajectory_lengths(data).tolist()
