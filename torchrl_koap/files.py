@@ -119,11 +119,8 @@ def read_json(path: str | Path) -> dict[str, Any]:
 def sha256_of(path: str | Path) -> str:
     """Computes the checksum of a file of any size, in hexadecimal."""
     check_file(path, largest=1 << 40)
-    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        while part := file.read(1 << 20):
-            digest.update(part)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def check_folder(path: str | Path) -> None:

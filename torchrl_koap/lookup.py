@@ -30,20 +30,18 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
     """
     if isinstance(name, str) and name in table:
         return table[name] if isinstance(table, Mapping) else name
-    near = nearest(table, name) if isinstance(name, str) else None
-    hint = f"known: {', '.join(table)}" if near is None else f"did you mean {near!r}?"
-    raise ValueError(f"unknown {what} {name!r}; {hint}")
+    raise ValueError(_unknown(table, name, what))
 
 
 def unknown(asked: Iterable[str], known: Collection[str], what: str) -> list[str]:
     """Returns the message of :func:`lookup` for every unknown name."""
-    said = []
-    for name in asked:
-        try:
-            lookup(known, name, what)
-        except ValueError as error:
-            said.append(str(error))
-    return said
+    return [_unknown(known, name, what) for name in asked if name not in known]
+
+
+def _unknown(known: Collection[str], name: object, what: str) -> str:
+    near = nearest(known, name) if isinstance(name, str) else None
+    hint = f"known: {', '.join(known)}" if near is None else f"did you mean {near!r}?"
+    return f"unknown {what} {name!r}; {hint}"
 
 
 def nearest(known: Iterable[str], name: str) -> str | None:

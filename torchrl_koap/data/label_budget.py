@@ -241,9 +241,8 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
     rows = torch.isin(episode, episode[~data.get(keys.HAS_ACTION).squeeze(-1)])
     result = data.clone()
     for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION):
-        value = result.get(key).clone()
+        value = result.get(key)
         value[:, command] = torch.where(rows.unsqueeze(-1), math.nan, value[:, command])
-        result.set(key, value)
     return result
 
 
