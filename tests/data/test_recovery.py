@@ -123,7 +123,7 @@ def moved(windows, share, **options):
 def test_observed_frames_move_along_the_way_to_the_nearest_other_window_and_the_future_comes_back(dtype):
     torch.manual_seed(0)
     windows = torch.randn(50, 16, 3, dtype=dtype)
-    there = moved(windows, 0.6, history=2, decay=0.5)
+    there = moved(windows, 0.6, history=2)
     assert there.dtype == dtype
     shift = there - windows
     for index, present in enumerate(windows[:, 1]):
@@ -135,7 +135,7 @@ def test_observed_frames_move_along_the_way_to_the_nearest_other_window_and_the_
         torch.testing.assert_close(shift[index, 1], share * way, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(shift[:, 0], shift[:, 1])  # both observed frames alike: its velocity stays
     for step in range(1, 15):
-        torch.testing.assert_close(shift[:, 1 + step], 0.5**step * shift[:, 1], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(shift[:, 1 + step], 0.85**step * shift[:, 1], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(16, 3), (1, 16, 3), (2, 2, 16, 3)])
@@ -151,9 +151,7 @@ def test_windows_without_neighbours_are_refused(shape):
         (RecoveryAugmentation, {"sigma": 1.0, "decay": 1.0}, "sigma must be >= 0 and decay"),
         (RecoveryAugmentation, {"sigma": 1.0, "decay": 0.0, "under_way": True}, "sigma must be >= 0 and decay"),
         (RecoveryAugmentation, {"sigma": 1.0, "columns": (0,), "tool": (2, 3, 4)}, "wanted columns and kinematics"),
-        *((GripperRecovery, {"column": 0, "share": x}, "share must be in") for x in (-0.1, 1.1, math.nan)),
         *((NeighborRecovery, {"share": share}, "share must be >= 0") for share in (-0.1, math.nan)),
-        *((NeighborRecovery, {"share": 1.0, "decay": decay}, "share must be >= 0") for decay in (1.0, -0.1)),
     ],
 )
 def test_options_out_of_range_are_refused(kind, options, message):

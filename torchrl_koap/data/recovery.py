@@ -16,6 +16,7 @@ from torchrl_koap.tasks.action_rules import OPEN_ABOVE, OPENING
 
 _DIFFERENCE = 1e-3  # rad, half step of the central differences in the Jacobian
 _DAMPING = 1e-4  # m2 / rad2, of the damped least squares: bounds the joint shifts where the arm is stretched out
+_NEIGHBOR_DECAY = 0.85  # rho towards a neighbour: share of the shift left after each frame
 _WIDTH_DECAY = 0.5  # factor per step of the width that opening fingers still lack
 EMPTY = 0.05  # m; fingers closer than this hold nothing: the boxes of Stacking are 0.06 m wide
 
@@ -151,16 +152,13 @@ class GripperRecovery(TensorDictModuleBase):
         column (int): state column of the width between the fingers (m).
 
     Keyword Args:
-        share (float): share of the windows with open fingers to replace, in [0, 1].
+        share (float): share of the windows with open fingers to replace.
         history (int): observed frames of the window.
-        state_key (NestedKey): key in the windows. Default: ``"state"``.
     """
 
-    def __init__(self, column: int, *, share: float = 0.1, history: int = 2, state_key: NestedKey = STATE):
+    def __init__(self, column: int, *, share: float = 0.1, history: int = 2):
         super().__init__()
-        if not 0 <= share <= 1:
-            raise ValueError(f"share must be in [0, 1], got {share}")
-        self.in_keys = self.out_keys = [state_key]
+        self.in_keys = self.out_keys = [STATE]
         self.column, self.share, self.history = column, share, history
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -193,15 +191,15 @@ class NeighborRecovery(TensorDictModuleBase):
         share (float): ``s``, largest share of the way to the neighbour; 0 changes nothing.
 
     Keyword Args:
-        history, decay, state_key: as in :class:`RecoveryAugmentation`. A batch needs two or more windows.
+        history (int): observed frames of the window. A batch needs two or more windows.
     """
 
-    def __init__(self, share: float, *, history: int = 2, decay: float = 0.85, state_key: NestedKey = STATE):
+    def __init__(self, share: float, *, history: int = 2):
         super().__init__()
-        if not 0 <= share < math.inf or not 0 <= decay < 1:
-            raise ValueError(f"share must be >= 0 and decay in [0, 1), got {share} and {decay}")
-        self.in_keys = self.out_keys = [state_key]
-        self.share, self.history, self.decay = share, history, decay
+        if not 0 <= share < math.inf:
+            raise ValueError(f"share must be >= 0, got {share}")
+        self.in_keys = self.out_keys = [STATE]
+        self.share, self.history = share, history
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by shifted ones."""
@@ -213,5 +211,5 @@ class NeighborRecovery(TensorDictModuleBase):
         distance.fill_diagonal_(torch.inf)
         shift = present[distance.argmin(-1)] - present
         shift = self.share * torch.rand(len(state), 1, dtype=state.dtype, device=state.device) * shift
-        remaining = _remaining(state, self.history, self.decay)
+        remaining = _remaining(state, self.history, _NEIGHBOR_DECAY)
         return tensordict.set(self.out_keys[0], state + shift[:, None] * remaining)
