@@ -133,10 +133,10 @@ def test_selecting_nothing_names_a_fraction_that_works(total):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        *(({"count": count}, "count .* whole number of at least 1") for count in (0, -1, True, 2.0, "3")),
+        *(({"count": count}, "count .* whole number of at least 1") for count in (0, -1, 2.0, "3")),
         *(
             ({"fraction": fraction}, r"labels: fraction must be in \(0, 1\]")
-            for fraction in (0, -0.5, 1.5, math.nan, math.inf, True, "0.1")
+            for fraction in (0, -0.5, 1.5, math.nan, math.inf, "0.1")
         ),
         ({"count": 1, "unit": "windows"}, "unknown unit of labels 'windows'"),
         ({"fraction": 0.1, "count": 1}, "give one of fraction, count and episodes, got fraction and count"),

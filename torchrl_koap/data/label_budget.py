@@ -101,9 +101,9 @@ class LabelBudget:
         if len(given) > 1:
             raise ValueError(f"labels: give one of fraction, count and episodes, got {' and '.join(given)}")
         lookup(get_args(Unit), self.unit, "unit of labels")
-        if self.fraction is not None and not (_is(self.fraction, numbers.Real) and 0 < self.fraction <= 1):
+        if self.fraction is not None and not (isinstance(self.fraction, numbers.Real) and 0 < self.fraction <= 1):
             raise ValueError(f"labels: fraction must be in (0, 1], got {self.fraction!r}")
-        if self.count is not None and not (_is(self.count, numbers.Integral) and self.count >= 1):
+        if self.count is not None and not (isinstance(self.count, numbers.Integral) and self.count >= 1):
             raise ValueError(f"labels: count must be a whole number of at least 1, got {self.count!r}")
         if self.episodes is not None:
             chosen = tuple(int(episode) for episode in self.episodes)
@@ -214,10 +214,6 @@ class LabelBudget:
                 f" ({usable / total:.4g}); 1.0 keeps all labels"
             )
         return number
-
-
-def _is(value: object, kind: type) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _positions(present: np.ndarray, usable: np.ndarray, wanted: tuple[int, ...]) -> np.ndarray:
