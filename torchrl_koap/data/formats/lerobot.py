@@ -43,7 +43,7 @@ def read_lerobot(
 
     The options are those of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
-    info = read_info(root)
+    info = _read_info(root)
     known = info["features"]
     observed = [name for name in known if name.startswith(PREFIX)]
     cameras = [name for name in observed if known[name].get("dtype") in IMAGES]
@@ -64,7 +64,7 @@ def read_lerobot(
         problems.append(f"no feature {PREFIX}* holds numbers; there are {', '.join(observed) or 'none'}")
     refuse(root, problems)
     flags = [name for name in known if name not in observed and kind_of(name)[0] in ("start", "end")]
-    rows, undescribed = read_rows(root, chosen, flags=flags, episodes=episodes)
+    rows, undescribed = _read_rows(Path(root), info, chosen, flags, episodes)
     if not rows:
         raise DataError(root, "there are no trajectories")
     first, width = next(iter(rows.values())), _announced(info) or options.get("action_dim")
@@ -109,9 +109,9 @@ def read_lerobot(
     )
 
 
-def read_info(root: str | Path) -> dict[str, Any]:
+def _read_info(root: str | Path) -> dict[str, Any]:
     """Reads the description of a data set; raises a DataError if it is invalid."""
-    file = Path(root).expanduser() / INFO
+    file = Path(root) / INFO
     info = read_json(file)
     features = info.get("features") or {}
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
@@ -121,21 +121,20 @@ def read_info(root: str | Path) -> dict[str, Any]:
     return info | {"features": features}
 
 
-def read_rows(
-    root: str | Path, features: Sequence[str], *, flags: Sequence[str] = (), episodes: Sequence[int] = ()
+def _read_rows(
+    root: Path, info: Mapping[str, Any], features: Sequence[str], flags: Sequence[str], episodes: Sequence[int]
 ) -> tuple[dict[int, dict[str, Any]], list[str]]:
     """Reads columns of numbers, with actions and flags if present, of every episode by its number.
 
     They are float64 ``[T, d]``, NaN where a row is empty; ``frame_index`` is ``[T]``, ``file`` their file. The second
     value lists the columns that are not read.
     """
-    root = Path(root).expanduser()
     table, unread = _read_table(root, (*features, EPISODE, FRAME), (ACTION, TIME, *flags))
     files, problems = table["__filename"].to_pylist(), []
     columns: dict[str, Any] = {}
     for name in table.column_names:
         if name != "__filename":
-            announced = _announced(read_info(root)) if name == ACTION else 1
+            announced = _announced(info) if name == ACTION else 1
             try:
                 columns[name] = numbers(table[name], name, announced=announced, files=files)
             except ValueError as error:
@@ -143,7 +142,7 @@ def read_rows(
     refuse(root, problems)
     episode, frame = (columns.pop(name)[:, 0] for name in (EPISODE, FRAME))
     found, starts = np.unique(episode.astype(int), return_index=True)
-    ends, expected = [*starts[1:], len(episode)], _expected_lengths(root)
+    ends, expected = [*starts[1:], len(episode)], _expected_lengths(root, info)
     missing = sorted((set(episodes) or expected.keys()) - {*found.tolist()})
     if missing:
         cure = f"name in {option('episodes')} those to read: {some(found)}"
@@ -209,7 +208,7 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
     return table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")]), [name for name in there if name not in kinds]
 
 
-def _expected_lengths(root: Path) -> dict[int, int | None]:
+def _expected_lengths(root: Path, info: Mapping[str, Any]) -> dict[int, int | None]:
     """Returns the number of rows of every described episode; None if only the episode's number is known."""
     listed, tables = root / "meta/episodes.jsonl", sorted((root / "meta/episodes").rglob("*.parquet"))
     try:
@@ -219,7 +218,7 @@ def _expected_lengths(root: Path) -> dict[int, int | None]:
             read = import_pyarrow().parquet.read_table
             entries = [row for file in tables for row in read(file, columns=[EPISODE, "length"]).to_pylist()]
         else:
-            return dict.fromkeys(range(int(read_info(root).get("total_episodes") or 0)))
+            return dict.fromkeys(range(int(info.get("total_episodes") or 0)))
         return {int(entry[EPISODE]): int(entry["length"]) for entry in entries}
     except Exception as error:  # damaged lists may raise any exception
         raise DataError(root, f"the list of its episodes cannot be read: {error!r}") from error

@@ -176,9 +176,7 @@ def _other_frame(frames: np.ndarray, following: np.ndarray) -> int | None:
 
 
 def _shape(entry: Any) -> list[int]:
-    import h5py
-
-    return list(entry.shape or ()) if isinstance(entry, h5py.Dataset) else []
+    return list(getattr(entry, "shape", None) or ())  # groups have none
 
 
 def _number(name: str) -> tuple[int, str]:
