@@ -269,13 +269,7 @@ def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str
 def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -> list[int]:
     """Returns the numbers of columns given by name or number, one or several."""
     given = [given] if isinstance(given, (str, int, slice)) else list(given)
-    odd = [
-        column
-        for column in given
-        if isinstance(column, (bool, np.bool_))
-        or not isinstance(column, str)
-        and (not isinstance(column, (int, float, np.number)) or column % 1)
-    ]
+    odd = [column for column in given if isinstance(column, bool) or not isinstance(column, (str, int, np.integer))]
     if odd:
         problems.append(f"{option(what)} takes columns by name or number, got {odd[0]!r}")
         return []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import numbers
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -194,8 +195,7 @@ def make_recordings(
 
 def wrong_rate(value: Any, name: str) -> list[str]:
     """Returns a list with a message if a rate is no positive number, else an empty list."""
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and not np.iscomplexobj(value)
-    if number and 0 < value < math.inf:
+    if isinstance(value, numbers.Real) and not isinstance(value, bool) and 0 < value < math.inf:
         return []
     return [f"{option(name)} must be a positive number of frames per second, got {value!r}"]
 
@@ -241,7 +241,7 @@ def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str
     """Converts a trajectory to float64, NaN where it is masked or None; adds a fault and returns None on failure."""
     try:
         if isinstance(value, torch.Tensor):
-            value = value.detach().cpu().resolve_conj().resolve_neg()
+            value = value.detach().cpu()
             value = (value.double() if value.is_floating_point() else value).numpy()
         array = np.ma.asarray(value)
         if array.dtype.kind in "fiubO":
