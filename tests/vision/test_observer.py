@@ -55,7 +55,7 @@ def test_numbers_that_no_policy_sees_may_be_left_out():
     [
         ({"wrst": FRAME}, "has an unknown 'wrst': wanted state, top, wrist"),
         ({"state": np.zeros(3)}, r"'state' must be \[4\] with these frames, got \[3\]"),
-        ({"top": FRAME[..., :1]}, "the frame of camera 'top' is greyscale"),
+        ({"top": FRAME[..., :1]}, "the frame of camera 'top' has shape"),
     ],
 )
 def test_other_entries_are_refused(change, says):

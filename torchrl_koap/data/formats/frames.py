@@ -32,7 +32,6 @@ PICTURES = (".png", ".jpg", ".jpeg")
 MAGIC = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG files
 TIMES = "_times.npy"
 LATE = 1.5  # largest distance in time of a frame from its row, in median steps of the camera's clock
-_COLOURS = {1: "greyscale", 2: "greyscale with alpha", 4: "RGBA"}
 
 
 @dataclass(frozen=True)
@@ -84,12 +83,8 @@ def stored_clips(notes: Mapping[str, Any]) -> dict[str, list[Clip]]:
 def fault_of(frame: np.ndarray, size: Sequence[int] | None = None) -> str | None:
     """Returns a fault of an image and its remedy; None if it is uint8 ``[H, W, 3]`` with the size (H, W)."""
     shape = list(frame.shape)
-    channels = 1 if len(shape) == 2 else shape[-1] if len(shape) == 3 else 0
-    if channels in _COLOURS:
-        return f"is {_COLOURS[channels]} {shape}, wanted three colours [H, W, 3]: save it as RGB"
-    if channels != 3:
-        cure = "put the colours last" if shape[:1] == [3] else "a frame is one image"
-        return f"has shape {shape}, wanted [H, W, 3]: {cure}"
+    if len(shape) != 3 or shape[2] != 3:
+        return f"has shape {shape}, wanted [H, W, 3]: save one image as RGB, the three colours last"
     if frame.dtype != np.uint8:
         return f"is {frame.dtype}, wanted uint8 in 0 to 255: scale and round it"
     if size is not None and tuple(shape[:2]) != tuple(size):
