@@ -185,8 +185,6 @@ def _problems(robot: Mapping[str, Any], objects: Mapping[str, Any], converter: C
                 lengths[f"{name}/{key}"] = len(entries[key])
     if len(set(lengths.values())) > 1:
         problems.append(f"unequal lengths: {', '.join(f'{key} {length}' for key, length in sorted(lengths.items()))}")
-    elif not lengths and not problems:  # the other problems are more specific
-        problems.append("'robot' holds none of the known arrays: " + ", ".join(ROBOT_COLUMNS))
     elif lengths and min(lengths.values()) < _LEAST_ROWS:
         problems.append(f"too short: {min(lengths.values())} rows, at least {_LEAST_ROWS} are needed")
     return problems
