@@ -16,7 +16,7 @@ TRAINING = {*BASE, "tasks", "data", "vision", "modules", "objectives", "runs", "
 MAY_IMPORT = {
     "keys": {"files"},
     "lookup": set(),
-    "files": set(),
+    "files": {"lookup"},
     "graphics": set(),
     "tasks": {*BASE, "tasks"},
     "data": {*BASE, "tasks", "data"},

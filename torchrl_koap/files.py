@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import errno
 import hashlib
 import json
@@ -22,6 +21,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 import filelock
 from safetensors import SafetensorError
+
+from torchrl_koap.lookup import lookup
 
 _DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 _UNIONS = (Union, UnionType)
@@ -231,7 +232,7 @@ def dataclass_from_json(kind: type[_Made], content: object) -> _Made:
     Missing fields keep their defaults, lists become tuples, and ``"inf"`` becomes infinity in a field of numbers.
 
     Raises:
-        ValueError: if an option is unknown, in the wrong section, missing, of the wrong type or out of range; names it.
+        ValueError: if an option is unknown, missing, of the wrong type or out of range; names it.
 
     Examples:
         >>> from torchrl_koap.files import dataclass_from_json
@@ -239,32 +240,31 @@ def dataclass_from_json(kind: type[_Made], content: object) -> _Made:
         >>> dataclass_from_json(Body, {"name": "mug", "position": "mug_xy", "half": [0.1, 0.2]}).half
         (0.1, 0.2)
     """
-    return _read(kind, content, "", tuple(_names(kind)))
+    return _read(kind, content, "")
 
 
-def _read(kind: Any, value: Any, place: str, known: tuple[str, ...]) -> Any:
+def _read(kind: Any, value: Any, place: str) -> Any:
     """Converts a JSON value to the type of a hint; ``place`` is its name with that of its section."""
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         if not isinstance(value, Mapping):
             raise ValueError(f"{place or 'the file'} must be an object, got {_short(value)}")
         hints, inside = get_type_hints(kind), f"{place}." if place else ""
         for name in value:
-            if name not in hints:
-                raise ValueError(_unknown(f"{inside}{name}", known))
+            lookup(hints, name, f"option of {place}" if place else "option")
         for field in dataclasses.fields(kind):
             if field.name not in value and field.default is field.default_factory is dataclasses.MISSING:
                 raise ValueError(f"option {inside}{field.name} is missing")
-        return kind(**{name: _read(hints[name], entry, f"{inside}{name}", known) for name, entry in value.items()})
+        return kind(**{name: _read(hints[name], entry, f"{inside}{name}") for name, entry in value.items()})
     value = math.inf if value == "inf" and _fits(math.inf, kind) else value
     if not _fits(value, kind):
         raise ValueError(f"{place} must be {_words(kind)}, got {_short(value)}")
     if get_origin(kind) in _UNIONS:
-        return _read(next(part for part in get_args(kind) if _fits(value, part)), value, place, known)
+        return _read(next(part for part in get_args(kind) if _fits(value, part)), value, place)
     if isinstance(value, (list, tuple)):
-        return tuple(_read(one, entry, place, known) for one, entry in zip(_each(kind, value), value, strict=True))
+        return tuple(_read(one, entry, place) for one, entry in zip(_each(kind, value), value, strict=True))
     if isinstance(value, Mapping):
         inner = (Any, *get_args(kind))[-1]
-        return {name: _read(inner, entry, f"{place}.{name}", known) for name, entry in value.items()}
+        return {name: _read(inner, entry, f"{place}.{name}") for name, entry in value.items()}
     return value
 
 
@@ -272,25 +272,6 @@ def _each(kind: Any, value: Sequence[Any]) -> tuple[Any, ...]:
     """Returns the types of the entries of a tuple or list."""
     inner = get_args(kind) or (Any, ...)
     return inner[:1] * len(value) if inner[-1] is ... else inner
-
-
-def _names(kind: Any, prefix: str = "") -> Iterator[str]:
-    """Yields the name of every option with its section, ``"planner.steps"``."""
-    for name, inner in get_type_hints(kind).items():
-        if dataclasses.is_dataclass(inner):
-            yield from _names(inner, f"{prefix}{name}.")
-        else:
-            yield prefix + name
-
-
-def _unknown(name: str, known: tuple[str, ...]) -> str:
-    last = name.rpartition(".")[2]
-    elsewhere = [other for other in known if other.rpartition(".")[2] == last]
-    if elsewhere:
-        sections = [f"section {other.rpartition('.')[0]}" if "." in other else "no section" for other in elsewhere]
-        return f"unknown option {name}: {last} is in {' or '.join(sections)}"
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"unknown option {name}" + (f": did you mean {near[0]}?" if near else "")
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -69,9 +69,9 @@ def test_every_task_survives_json(name):
 
 def test_json_of_another_kind_is_refused():
     entries = get_task("avoiding").to_json()
-    with pytest.raises(ValueError, match="unknown option colour"):
+    with pytest.raises(ValueError, match="unknown option 'colour'"):
         Task.from_json(entries | {"colour": 1})
-    with pytest.raises(ValueError, match=r"unknown option scene.shapes.size"):
+    with pytest.raises(ValueError, match="unknown option of scene.shapes 'size'"):
         Task.from_json(entries | {"scene": {"shapes": [{"size": 1}]}})
     with pytest.raises(ValueError, match="option actions is missing"):
         Task.from_json({key: value for key, value in entries.items() if key != "actions"})
