@@ -71,7 +71,7 @@ def roll(
     ground: Ground, trained: Trained, execution: ExecutionConfig, n: int, *, first_seed: int = FIRST_SEED
 ) -> dict[str, Any]:
     """Rolls a policy out in the simulator of a ground; returns columns of the table."""
-    observe = Observer.of(trained.task, trained.cameras)
+    observe = Observer(trained.task, trained.cameras) if trained.cameras else None
     episodes = roll_out(
         load_policy(trained, **{key: value for key, value in vars(execution).items() if value is not None}),
         lambda count: GymnasiumBatch(ground.env, trained.task, count, observe=observe, max_steps=ground.max_steps),

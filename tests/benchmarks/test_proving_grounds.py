@@ -112,7 +112,6 @@ def table_of(monkeypatch, tmp_path):
         outside = {"relative": 0.6, "ridge_relative": 0.8}
         errors = {"relative_plan_error": 0.5, "action_errors": {"outside_budget": outside}}
         monkeypatch.setattr(run, "evaluate", lambda folder, config: errors)
-        monkeypatch.setattr(run.Observer, "of", lambda *args: None)
         for _ in range(2):
             run.main(("toy",), seeds=1, methods=("koap",), folder=tmp_path, results=tmp_path / "table.csv", **options)
         with (tmp_path / "table.csv").open() as file:

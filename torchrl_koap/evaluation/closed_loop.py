@@ -228,7 +228,7 @@ def find_environment(
         task,
         env_kwargs=environment_arguments(config.env_kwargs),
         processes=config.num_envs is not None,
-        observe=Observer.of(task, cameras or {}),
+        observe=Observer(task, cameras) if cameras else None,
         success_key=config.success_key,
         record=record,
     )

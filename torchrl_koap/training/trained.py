@@ -212,7 +212,7 @@ class Trained:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
         reads = state_reader(self.task, self.config.controller)
         facts = policy_facts(self.task, reads=reads, ranges=self.results.get("command_ranges"))
-        facts["observe"] = Observer.of(self.task, self.cameras)
+        facts["observe"] = Observer(self.task, self.cameras) if self.cameras else None
         if self.method.plans:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
         self.method.check_execution(execution, self.execution)

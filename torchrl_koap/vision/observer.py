@@ -58,11 +58,6 @@ class Observer:
         self.state_dim = sum(self._numbers.values())  # columns that are not embeddings
         self._encoders = {name: _load(name, projection) for name, projection in cameras.items()}
 
-    @classmethod
-    def of(cls, task: Task, cameras: Mapping[str, Projection]) -> Observer | None:
-        """Makes an observer if there are cameras, else returns None."""
-        return cls(task, cameras) if cameras else None
-
     def example(self) -> dict[str, np.ndarray]:
         """Returns zeros and black frames in the format of a robot."""
         black = {name: np.zeros((*each.size, 3), np.uint8) for name, each in self.cameras.items()}
