@@ -42,7 +42,7 @@ def test_embeddings_are_further_columns_that_are_not_the_robot_s(tmp_path):
     columns = open_dataset(tmp_path / "seen", task=task)[0]["state"]
     assert columns.shape[1] == 12 and not (tmp_path / "seen" / "unfinished").exists()
     for name, report in reports.items():
-        assert report.size == (16, 24) and report.components == 5 and report.rate > 0
+        assert report.size == (16, 24) and report.components == 5
         assert 0.3 < report.kept < 1, name
     cameras = load_cameras(tmp_path / "seen" / "cameras")
     frames = np.load(tmp_path / "raw" / "03" / "top.npy")

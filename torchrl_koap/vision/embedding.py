@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -40,13 +39,11 @@ class CameraReport:
     size: tuple[int, int]  # height and width of its frames
     components: int  # columns of an embedding
     kept: float  # share of the features' variance, on held-out trajectories if there are ten or more
-    rate: float  # frames embedded per second; NaN if all features existed before
 
     def __str__(self) -> str:
-        speed = "embedded before" if np.isnan(self.rate) else f"{self.rate:.0f} frames a second"
         return (
             f"{self.size[0]} x {self.size[1]}, {self.components} components keep {self.kept:.1%} of the variance,"
-            f" reconstruction error {(1 - self.kept) ** 0.5:.2f} of the spread, {speed}"
+            f" reconstruction error {(1 - self.kept) ** 0.5:.2f} of the spread"
         )
 
 
@@ -200,7 +197,6 @@ class _CameraFeatures:
         about = [encoder.identity, [asdict(clip) for clip in self.clips]]
         key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
         self._files = [folder / f"{camera}-{key}" / f"{index:06d}.safetensors" for index in range(len(self.clips))]
-        self._frames, self._seconds = 0, 0.0
 
     def embed(self) -> Iterator[int]:
         """Writes missing features of trajectories; yields the numbers of frames that are done."""
@@ -210,9 +206,7 @@ class _CameraFeatures:
                 continue
             found, frames = [], _read(self.recordings, self.camera, index, self.encoder.size)
             while part := list(islice(frames, BATCH)):
-                began = time.perf_counter()
                 found.append(self.encoder.features(torch.from_numpy(np.stack(part))))
-                self._frames, self._seconds = self._frames + len(part), self._seconds + time.perf_counter() - began
                 yield len(part)
             with replacing_file(file) as aside:
                 save_file({"features": torch.cat(found)}, aside)
@@ -240,6 +234,4 @@ class _CameraFeatures:
     def report(self, projection: Projection) -> CameraReport:
         """Reports the share of variance that components keep on held-out frames."""
         kept = projection.kept(self.sample(held_out=True))
-        rate = self._frames / self._seconds if self._frames else float("nan")
-        height, width = self.encoder.size
-        return CameraReport((height, width), projection.dim, kept, rate)
+        return CameraReport(self.encoder.size, projection.dim, kept)
