@@ -269,7 +269,7 @@ PARTLY = partly((20, 33, 16, 40), shown=(1, 3))
         (demonstrations(), {"count": 9}, "9 labelled trajectories asked for, there are 4"),
         (demonstrations((12, 3)), {"count": 1, "unit": "window"}, "longest: 12"),
         (PARTLY, {"count": 3}, "3 labelled trajectories asked for, only 2 of 4 have a label"),
-        (PARTLY, {"fraction": 0.75}, r"0.75 is 3 of 4 trajectories, but only 2 have a label \(0.5\)"),
+        (PARTLY, {"fraction": 0.75}, "3 labelled trajectories asked for, only 2 of 4 have a label"),
         (PARTLY, {"episodes": [2, 3]}, r"episodes \[2\] are to be labelled, but the data hold no actions for them"),
         (partly((20, 33), shown=()), {"count": 1}, "none of the 53 steps has an action: there are no labels to select"),
         (PARTLY.exclude("has_action", "action"), {"count": 1}, "no entry 'action', and thus no labels"),

@@ -193,15 +193,12 @@ class LabelBudget:
     def _number_of(self, total: int, usable: int) -> int:
         """Returns how many units to draw from ``total``, of which ``usable`` have a label."""
         plural = plural_of(self.unit)
-        if self.count is not None:
-            if self.count > usable:
-                have = f"there are {total}" if usable == total else f"only {usable} of {total} have a label"
-                raise ValueError(f"{self.count} labelled {plural} asked for, {have}")
-            return int(self.count)
-        if self.fraction is None or self.fraction == 1:
+        if self.count is None and self.fraction in (None, 1):
             return usable
-        # decimal arithmetic: 0.145 of 100 is 14.5, not 14.499999999999998
-        number = int((Decimal(repr(float(self.fraction))) * total).to_integral_value(ROUND_HALF_UP))
+        if self.count is not None:
+            number = int(self.count)
+        else:  # decimal arithmetic: 0.145 of 100 is 14.5, not 14.499999999999998
+            number = int((Decimal(repr(float(self.fraction))) * total).to_integral_value(ROUND_HALF_UP))
         if number == 0:
             least = Context(prec=4, rounding=ROUND_CEILING).divide(Decimal("0.5"), Decimal(total))
             raise ValueError(
@@ -209,10 +206,8 @@ class LabelBudget:
                 f" the smallest fraction that selects one is {least}"
             )
         if number > usable:
-            raise ValueError(
-                f"a label fraction of {self.fraction} is {number} of {total} {plural}, but only {usable} have a label"
-                f" ({usable / total:.4g}); 1.0 keeps all labels"
-            )
+            have = f"there are {total}" if usable == total else f"only {usable} of {total} have a label"
+            raise ValueError(f"{number} labelled {plural} asked for, {have}")
         return number
 
 
