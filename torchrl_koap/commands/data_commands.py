@@ -172,8 +172,7 @@ class Convert(Command):
 
     def _bring_in(self) -> dict[str, Any]:
         if stored_folder(self.source) is not None:
-            again = " (and convert that with the roles of its columns)" if self.resample is not None else ""
-            raise ValueError(f"{self.source} is a data set of this library already: name another format by --to{again}")
+            raise ValueError(f"{self.source} is a data set of this library already: name another format by --to")
         check_new(self.out)
         with warnings.catch_warnings(record=not self.quiet) as unlikely:  # with --quiet, no table shows them later
             warnings.simplefilter("always")

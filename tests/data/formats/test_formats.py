@@ -39,8 +39,6 @@ def test_a_data_set_of_this_library(below, recordings, tmp_path):
     np.testing.assert_allclose(again.actions[2], recordings.actions[2], rtol=1e-6)
     with pytest.raises(ValueError, match="control_hz .*: not an option for a data set of this library"):
         read_recordings(tmp_path / "arm", control_hz=3)
-    with pytest.raises(DataError, match="action_kind .*names 3 columns, there are 2"):
-        read_recordings(tmp_path / "arm", resample=10, action_kind=["velocity"] * 3)
 
 
 def test_nothing_to_read(tmp_path):

@@ -15,14 +15,13 @@ from torchrl_koap import keys
 from torchrl_koap.data.formats.frames import stored_clips
 from torchrl_koap.data.formats.lerobot import INFO, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each
-from torchrl_koap.data.formats.resampling import resampled
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.robomimic import hdf5_files, read_robomimic
 from torchrl_koap.data.formats.tables import read_tables, table_files
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
 from torchrl_koap.data.ted import load_ted, read_about, source_names, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import DataError, option, read_json, refuse
+from torchrl_koap.files import DataError, option, read_json
 from torchrl_koap.lookup import lookup
 
 __all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recordings", "write_recordings"]
@@ -39,9 +38,7 @@ class Format:
     write: Callable[[Recordings, Path], None] | None = None  # into a new folder; None: cannot be written
 
 
-def _read_stored(
-    source: str, *, resample: float | None = None, action_kind: str | Sequence[str] = "delta"
-) -> Recordings:
+def _read_stored(source: str) -> Recordings:
     """Reads all observation columns, including commands, and all labels of a data set of this library."""
     folder = stored_folder(source)
     data, task = load_ted(folder)
@@ -50,7 +47,7 @@ def _read_stored(
     before, after = (data[key].double() + origin for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION))
     actions = torch.where(data[keys.HAS_ACTION], data[keys.ACTION].double() + added, torch.nan)
     pairs = zip(before.split(lengths), after.split(lengths), strict=True)
-    recordings = make_recordings(
+    return make_recordings(
         [torch.cat([frames, following[-1:]]) for frames, following in pairs],
         actions.split(lengths),
         state_names=task.observation_names,
@@ -60,13 +57,6 @@ def _read_stored(
         cameras=stored_clips(read_about(folder)["notes"]),
         source=source,
     )
-    if resample is None:
-        return recordings
-    problems: list[str] = []
-    given = one_each(action_kind, task.action_dim, "action_kind", problems)
-    refuse(source, problems)
-    each = zip(task.actions.values(), given, strict=True)
-    return resampled(recordings, resample, ["absolute" if is_one.kind == "absolute" else kind for is_one, kind in each])
 
 
 # files that are no recordings -> advice
@@ -94,7 +84,6 @@ FORMATS = {
         "a data set of this library",
         lambda source: stored_folder(source) is not None,
         _read_stored,
-        ("resample", "action_kind"),
     ),
     "robomimic": Format(
         "an HDF5 file in robomimic's layout or ALOHA's, or a folder of them (*.hdf5)",
