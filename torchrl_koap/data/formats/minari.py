@@ -11,7 +11,7 @@ import numpy as np
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.kinds import numbered, spread
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, gathered, refuse
+from torchrl_koap.files import gathered, refuse
 from torchrl_koap.lookup import import_extra
 
 PREFIX = "minari:"
@@ -33,7 +33,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
         )
     dataset = minari.load_dataset(name, download=False)
     pieces, faults = [], []
-    for episode in _episodes(dataset, source):
+    for episode in dataset.iterate_episodes():
         states: dict[str, np.ndarray] = {}
         unread: list[str] = []
         called = f"episode {episode.id}"
@@ -45,8 +45,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
         if not states:
             faults.append((called, "observations hold images only, no numbers"))
         if isinstance(episode.actions, (Mapping, tuple)):
-            kind = "Dict" if isinstance(episode.actions, Mapping) else "Tuple"
-            faults.append((called, f"its actions are a {kind}, wanted one vector [T, a] of numbers"))
+            faults.append((called, "its actions are a Dict or Tuple, wanted one vector [T, a] of numbers"))
             continue
         steps = np.asarray(episode.actions)
         if steps.ndim > 2 or steps.dtype.kind != "f" and (steps.ndim < 2 or steps.dtype.kind not in "iub"):
@@ -61,15 +60,6 @@ def read_minari(source: str, **options: Any) -> Recordings:
         no_rate="its environment declares no render_fps",
         **options,
     )
-
-
-def _episodes(dataset: Any, source: str) -> Iterator[Any]:
-    """Yields the episodes of a data set; raises a DataError for those that Minari cannot read with its spaces."""
-    for number in dataset.episode_indices:
-        try:
-            yield next(iter(dataset.iterate_episodes([number])))
-        except (KeyError, ValueError, TypeError, OSError, StopIteration) as error:
-            raise DataError(source, f"episode {number} is damaged, or does not match its spaces: {error}") from error
 
 
 def _leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
