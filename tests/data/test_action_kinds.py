@@ -57,7 +57,7 @@ def test_a_gripper_of_two_values():
     (said,) = warnings(PATHS, opening, acting=("a", "grip"))
     assert said.startswith("grip: an action with two values") and said.endswith("--action-kind delta raw")
     assert not warnings(PATHS, opening, action_kind=["delta", "raw"])
-    with pytest.raises(ValueError, match="'gripper' is unknown: use 'raw' if two values open and close"):
+    with pytest.raises(ValueError, match="unknown kind of action 'gripper'; known: delta"):
         demonstrations(PATHS, opening, action_kind=["delta", "gripper"])
 
 

@@ -144,10 +144,6 @@ def make_demonstrations(
         (3, 2, (0, 1), False)
     """
     for kind in (action_kind,) if isinstance(action_kind, str) else action_kind:
-        if kind == "gripper":
-            raise ValueError(
-                "action_kind 'gripper' is unknown: use 'raw' if two values open and close, 'absolute' for a width"
-            )
         lookup(ACTION_KINDS, kind, "kind of action")
     if isinstance(states, Recordings):
         if actions is not None:
