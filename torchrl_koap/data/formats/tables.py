@@ -20,7 +20,6 @@ from __future__ import annotations
 import csv
 import io
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,8 +36,6 @@ from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import unknown
 
-# exceptions of readers for damaged files
-_DAMAGED = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
 _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "frame": "a count of frames"}
@@ -122,7 +119,7 @@ def _entries(file: Path) -> dict[str, np.ndarray]:
         for name in archive.files:
             try:
                 entries[name] = archive[name]
-            except _DAMAGED as error:
+            except Exception as error:  # damaged archives may raise any exception
                 what = "it holds objects (lists of different lengths, or None?), or is damaged"
                 raise ValueError(f"entry {name!r} cannot be read: {what}") from error
     return entries
