@@ -127,7 +127,7 @@ def test_faults_of_all_files_come_together(tmp_path):
     text = str(error.value)
     for part in (
         "003_00.pkl: asks for",
-        "004_00.pkl: the file is empty",
+        "004_00.pkl: not a complete pickle",
         "005_00.pkl: too short",
         "007_00.pkl: missing",
     ):

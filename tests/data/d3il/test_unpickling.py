@@ -216,11 +216,11 @@ def test_exponential_and_cyclic_containers():
 def test_damaged_files(tmp_path):
     content = pickle.dumps({"robot": {"c_pos": np.arange(30.0).reshape(10, 3)}})
     for end in range(len(content)):
-        with pytest.raises(DataError, match="not a complete pickle" if end else "the file is empty"):
+        with pytest.raises(DataError, match="not a complete pickle"):
             loads_pickle(content[:end])
     path = tmp_path / "empty.pkl"
     path.touch()
-    with pytest.raises(DataError, match=r"empty\.pkl.*empty"):
+    with pytest.raises(DataError, match=r"empty\.pkl.*not a complete pickle"):
         load_pickle(path)
     lengths = (
         b"\x80\x04\x95" + b"\xff" * 7 + b"\x7fN.",

@@ -58,8 +58,6 @@ def load_pickle(path: str | Path) -> Any:
 
 def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
     """Reads a pickle from bytes under the rules of :func:`load_pickle`."""
-    if not content:
-        raise DataError(name, "the file is empty")
     try:
         _scan(content)
         loaded = _RestrictedUnpickler(content).load()
