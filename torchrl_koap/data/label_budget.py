@@ -8,7 +8,6 @@ last command. Its differences are the actions, so those columns become NaN too (
 from __future__ import annotations
 
 import math
-import numbers
 from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_HALF_UP, Context, Decimal
@@ -101,9 +100,11 @@ class LabelBudget:
         if len(given) > 1:
             raise ValueError(f"labels: give one of fraction, count and episodes, got {' and '.join(given)}")
         lookup(get_args(Unit), self.unit, "unit of labels")
-        if self.fraction is not None and not (isinstance(self.fraction, numbers.Real) and 0 < self.fraction <= 1):
+        if self.fraction is not None and not (
+            isinstance(self.fraction, (int, float, np.number)) and 0 < self.fraction <= 1
+        ):
             raise ValueError(f"labels: fraction must be in (0, 1], got {self.fraction!r}")
-        if self.count is not None and not (isinstance(self.count, numbers.Integral) and self.count >= 1):
+        if self.count is not None and not (isinstance(self.count, (int, np.integer)) and self.count >= 1):
             raise ValueError(f"labels: count must be a whole number of at least 1, got {self.count!r}")
         if self.episodes is not None:
             chosen = tuple(int(episode) for episode in self.episodes)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import numbers
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -195,7 +194,8 @@ def make_recordings(
 
 def wrong_rate(value: Any, name: str) -> list[str]:
     """Returns a list with a message if a rate is no positive number, else an empty list."""
-    if isinstance(value, numbers.Real) and not isinstance(value, bool) and 0 < value < math.inf:
+    real = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if real and 0 < value < math.inf:
         return []
     return [f"{option(name)} must be a positive number of frames per second, got {value!r}"]
 
