@@ -88,9 +88,7 @@ class WindowTable:
         for name, value in (("pad_before", pad_before), ("pad_after", pad_after)):
             if not 0 <= value < window:
                 raise ValueError(f"{name} must be in 0..{window - 1} frames (less than the window), got {value}")
-        episode = data.get(keys.EPISODE, None)
-        if episode is None:
-            raise KeyError(f"windows need the entry {keys.EPISODE!r}; the data have {sorted(map(str, data.keys()))}")
+        episode = data[keys.EPISODE]
         if data.batch_dims != 1 or episode.ndim != 1:
             got = f"batch size {list(data.batch_size)} and {keys.EPISODE!r} {list(episode.shape)}"
             raise ValueError(f"windows are cut from flat data [N] with {keys.EPISODE!r} [N], got {got}")
@@ -318,9 +316,6 @@ def make_window_buffer(
         data = data.storage.get(slice(None))
     table = WindowTable.build(data, window, counted=counted, pad_before=pad_before, pad_after=pad_after)
     if select is not None:
-        absent = [key for key in select if data.get(key, None) is None]
-        if absent:
-            raise KeyError(f"the data have no entries {absent}")
         data = data.select(*select)
     sampler = WindowSampler(table.labelled, labelled_share=labelled_share)
     sampler.number_labelled(batch_size)  # raises if the share rounds to 0 windows
