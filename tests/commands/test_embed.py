@@ -79,7 +79,7 @@ def test_a_plugin_is_taken_for_a_network_s_file_that_lies_elsewhere(run, tmp_pat
     loaded = Trained.load(file, plugins=["net.py"])
     assert loaded.cameras["top"].about["network"] == f"{tmp_path}/net.py:random_layer"
     assert loaded.policy().observe.example()["top"].shape == (16, 24, 3)
-    with pytest.raises(ValueError, match="camera 'top': network: module '/elsewhere/net.py' cannot be imported"):
+    with pytest.raises(ValueError, match="network: module '/elsewhere/net.py' cannot be imported"):
         trained.policy()
     monkeypatch.setattr(loop_on_labels, "_EXPLAINED", -1)
     monkeypatch.setattr(loop_on_labels, "_DRIFT", 1e9)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_koap.tasks import Action, Task
-from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, WeightsError, load_backbone, load_encoder
+from torchrl_koap.vision import FrozenImageEncoder, Observer, Projection, load_backbone, load_encoder
 
 OWN = "tiny_network:random_layer"
 FRAME = np.random.default_rng(0).integers(0, 256, (16, 24, 3), dtype=np.uint8)
@@ -77,5 +77,5 @@ def test_networks_are_loaded_before_the_first_frame(monkeypatch):
     assert observe(observe.example()).shape == (11,)
     monkeypatch.undo()
     cameras["wrist"].about["network"] = "/nowhere/net.py:network"
-    with pytest.raises(WeightsError, match="^camera 'wrist': network: module '/nowhere/net.py' cannot be"):
+    with pytest.raises(ValueError, match="^network: module '/nowhere/net.py' cannot be"):
         Observer(task, {"wrist": cameras["wrist"]})

@@ -13,8 +13,7 @@ from torch import Tensor
 from torchrl_koap.data.formats.frames import fault_of
 from torchrl_koap.keys import observed_numbers
 from torchrl_koap.tasks import Task
-from torchrl_koap.vision.backbones import WeightsError
-from torchrl_koap.vision.encoder import FrozenImageEncoder, Projection, load_encoder
+from torchrl_koap.vision.encoder import Projection, load_encoder
 
 STATE = "state"
 
@@ -56,7 +55,7 @@ class Observer:
         self._numbers = {name: width for name, width in widths.items() if name not in cameras}
         self._needed = [*([] if self._numbers.keys() <= {*task.hidden} else [STATE]), *cameras]
         self.state_dim = sum(self._numbers.values())  # columns that are not embeddings
-        self._encoders = {name: _load(name, projection) for name, projection in cameras.items()}
+        self._encoders = {name: load_encoder(projection) for name, projection in cameras.items()}
 
     def example(self) -> dict[str, np.ndarray]:
         """Returns zeros and black frames in the format of a robot."""
@@ -92,10 +91,3 @@ class Observer:
         if fault is not None:
             raise ValueError(f"the frame of camera {name!r} {fault}")
         return self._encoders[name].embed(torch.from_numpy(np.ascontiguousarray(given)))
-
-
-def _load(name: str, projection: Projection) -> FrozenImageEncoder:
-    try:
-        return load_encoder(projection)
-    except ValueError as error:
-        raise WeightsError(f"camera {name!r}: {error}") from error
