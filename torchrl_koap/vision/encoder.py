@@ -20,7 +20,7 @@ from torchrl_koap.data.ted import CAMERAS, stored_folder
 from torchrl_koap.files import check_file, option, replacing_file
 from torchrl_koap.keys import read_entry
 from torchrl_koap.lookup import absolute
-from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
+from torchrl_koap.vision.backbones import Backbone, load_backbone
 
 BATCH = 32  # frames that the network processes at once
 SHORT_SIDE = 96  # pixels; frames with a longer short side are scaled down to it
@@ -45,7 +45,7 @@ class FrozenImageEncoder(ObservationTransform):
             with a warning at the first one.
 
     Raises:
-        WeightsError: if there are no weights.
+        RuntimeError: if the extra with the default network is missing.
         ValueError: in use, for frames that are not uint8 or not of three colours, or a network without feature output.
 
     Examples:
@@ -291,7 +291,8 @@ def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | 
         FrozenImageEncoder: frozen, in evaluation mode.
 
     Raises:
-        WeightsError: if the weights are missing, or differ from those that the projection was fitted with.
+        RuntimeError: if the extra with the network is missing.
+        ValueError: if its weights differ from those that the projection was fitted with.
         FileNotFoundError: if the file does not exist.
 
     Examples:
@@ -305,7 +306,7 @@ def load_encoder(projection: Projection | str | Path = SCOOPING, network: str | 
     about, size = fitted.about, fitted.size
     backbone = load_backbone(network or about["network"])
     if backbone.digest != about["weights"]:
-        raise WeightsError(
+        raise ValueError(
             f"the projection was fitted with weights {about['weights'][:12]} of {about['network']}, got"
             f" {backbone.digest[:12]} of {backbone.name}: fit a projection for them, or pass its network"
         )

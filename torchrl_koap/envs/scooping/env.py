@@ -53,9 +53,8 @@ class ScoopingEnv(ManipulationEnv):
         pixels (bool): return the frames, too.
 
     Raises:
-        ValueError: for an embedding of another size than the task's.
-        RuntimeError: if there is no OpenGL library.
-        WeightsError: if the weights are missing or do not match the projection.
+        ValueError: for an embedding of another size than the task's, or weights that do not match the projection.
+        RuntimeError: if there is no OpenGL library, or the extra with the weights is missing.
 
     Examples:
         >>> from torchrl_koap.envs import ScoopingEnv
