@@ -1,13 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Runs many independent jobs, in processes of this machine or on a Ray cluster. A failed job does not stop the others.
-
-The fork server of the worker processes imports this module first, which calls :func:`end_with_parent`.
-"""
+"""Runs many independent jobs, in processes of this machine or on a Ray cluster; one that fails stops no other."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib.util
 import multiprocessing
 import os
@@ -23,26 +19,9 @@ from typing import Any, TextIO
 
 from torchrl_koap.lookup import lookup
 
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _LONGEST = 500  # characters of a reason at most
 _PATIENCE = 3  # seconds in which a process may release system resources, such as semaphores
 LAUNCHERS = ("local", "ray")
-
-
-def end_with_parent() -> None:
-    """Makes the system kill this process as soon as its parent ends; does nothing on systems other than Linux."""
-    if not sys.platform.startswith("linux"):
-        return
-    parent = os.getppid()
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # the parent ended before prctl took effect
-        os._exit(1)
-
-
-if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # true in the fork server
-    # the server itself notices the end of its parent only after all its imports, seconds later
-    end_with_parent()
 
 
 @dataclass(frozen=True)
