@@ -147,6 +147,13 @@ def test_outcomes_are_compared_by_context_and_else_by_seed():
     assert cells_file._outcomes_of({"episode": rows}) == [[7, 100, True], [101, 101, False]]
 
 
+def test_a_trajectory_without_a_relative_error_has_no_outcome():
+    """Where no recorded action varies, no error is relative to that of the mean action."""
+    rows = [{"episode": 3, "relative_action_error": None}]
+    found = {"kind": "offline", "action_errors_on": "left_out", "action_errors": {"left_out": {"trajectory": rows}}}
+    assert cells_file._outcomes_of(found) == []
+
+
 def test_a_cell_of_which_something_else_was_asked_is_refused(root, planner, demonstrations):
     config = replace(cell_config(root, planner, demonstrations), out=planner.parent / CELL.folder)
     folder, evaluation = root / CELL.folder, EvalConfig(episodes=1, threads=1)

@@ -165,7 +165,8 @@ def _outcomes_of(result: Mapping[str, Any]) -> list[list[float]]:
     if result.get("kind") == KIND:
         split = result["action_errors_on"]
         rows = result["action_errors"][split]["trajectory"] if split else ()
-        return [[row["episode"], 0, row["relative_action_error"]] for row in rows]
+        found = [(row["episode"], row["relative_action_error"]) for row in rows]
+        return [[episode, 0, error] for episode, error in found if error is not None]  # None: no action varies
     return [
         [row["seed"] if row.get("context") is None else row["context"], row["seed"], row["outcome"] == "success"]
         for row in result["episode"]
