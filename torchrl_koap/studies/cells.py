@@ -68,8 +68,6 @@ def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | Non
 def read_asked(folder: Path) -> tuple[TrainConfig, EvalConfig | None]:
     """Reads the request of a cell; a RunDirectoryError names a ``cell.json`` that is missing or damaged."""
     content, path = RunDirectory(folder).read_json(ASKED), folder / ASKED
-    if set(content) != {"train", "evaluation"}:
-        raise RunDirectoryError(f"{path} is damaged: wanted the entries 'train' and 'evaluation'")
     evaluation = content["evaluation"]
     config = from_json(TrainConfig, content["train"], path)
     return config, None if evaluation is None else from_json(EvalConfig, evaluation, path)
@@ -98,20 +96,10 @@ def read_result(folder: str | Path) -> Result | None:
 
     The row has columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`.
     """
-    path = Path(folder) / FOUND
-    if not path.exists():
+    if not (Path(folder) / FOUND).exists():
         return None
     content = RunDirectory(folder).read_json(FOUND)
-    try:
-        row = {str(name): value for name, value in content["row"].items()}
-        outcomes = {(int(context), int(seed)): float(value) for context, seed, value in content["outcomes"]}
-        if outcomes and row.get("kind") != KIND and not 0 <= row["successes"] <= row["episodes"]:
-            raise ValueError("wanted 0 <= successes <= episodes")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RunDirectoryError(f"{path} is damaged ({type(error).__name__}: {error})") from error
-    if len(outcomes) < len(content["outcomes"]):
-        raise RunDirectoryError(f"{path} is damaged: an episode occurs twice")
-    return row, outcomes
+    return content["row"], {(context, seed): float(value) for context, seed, value in content["outcomes"]}
 
 
 def cell_row(root: Path, cell: Cell, *, label_unit: str, reason: str | None = None) -> Result:
