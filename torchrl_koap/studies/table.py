@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -82,17 +81,11 @@ class Summary:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes rows as csv, atomically; values that are missing or not finite stay empty."""
+    """Writes rows as csv, atomically; values that are missing stay empty."""
     with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
-        writer.writerows({name: _written(value) for name, value in row.items()} for row in rows)
-
-
-def _written(value: Any) -> Any:
-    if isinstance(value, str):
-        return " ".join(value.split())  # joins the lines of a reason
-    return "" if value is None or (isinstance(value, float) and not math.isfinite(value)) else value
+        writer.writerows(rows)
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
@@ -133,8 +126,7 @@ def _summary(task: str, unit: str, demonstrations: float, labels: float, method:
     rolled_out = [row for row in done if row.get("episodes")]
     successes, episodes = (sum(row[name] for row in rolled_out) for name in ("successes", "episodes"))
     values = {name: [row[name] for row in done if row.get(name) is not None] for name in _MEASURES}
-    finite = {name: [value for value in found if math.isfinite(value)] for name, found in values.items()}
-    measures = {name: Measure(statistics.fmean(v), min(v), max(v)) for name, v in finite.items() if v}
+    measures = {name: Measure(statistics.fmean(v), min(v), max(v)) for name, v in values.items() if v}
     if episodes:
         rates = [row["successes"] / row["episodes"] for row in rolled_out]
         measures["success"] = Measure(successes / episodes, *wilson_interval(successes, episodes))
@@ -242,11 +234,10 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def not_done(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns a line per cell that is not done, with the reason of its failure."""
-    left = [row for row in rows if row["status"] != "done"]
-    reasons = [" ".join((row.get("reason") or "").split()) for row in left]
     return [
-        f"{cell_name(row)}: {row['status']}" + (f": {reason}" if reason else "")
-        for row, reason in zip(left, reasons, strict=True)
+        f"{cell_name(row)}: {row['status']}" + (f": {row['reason']}" if row.get("reason") else "")
+        for row in rows
+        if row["status"] != "done"
     ]
 
 
