@@ -101,13 +101,9 @@ def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0)
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is not a"), ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO")],
-)
-def test_settings_with_which_nothing_can_be_imported(settings, says):
-    status, said = ended("doctor", settings=settings)
-    assert status == 1 and says in said and len(said.splitlines()) == 1
+def test_a_setting_with_which_nothing_can_be_imported():
+    status, said = ended("doctor", settings={"MPLBACKEND": "bogus"})
+    assert status == 1 and "'bogus' is not a valid value for backend" in said and len(said.splitlines()) == 1
 
 
 @pytest.mark.faults

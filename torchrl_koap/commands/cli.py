@@ -125,11 +125,6 @@ def _check_words(arguments: Sequence[str]) -> None:
 
 def _commands() -> tuple[Any, ...]:
     """Imports and returns the modules that take seconds to import."""
-    if sys.flags.optimize > 1:
-        raise RuntimeError(
-            "Python runs with -OO (or PYTHONOPTIMIZE=2), which removes docstrings that torch and the options of"
-            " `koap` need; use -O or nothing"
-        )
     loaded = "torchrl_koap.commands.subcommands" in sys.modules
     with nullcontext() if loaded else handling_signals(leave):
         try:
@@ -137,11 +132,6 @@ def _commands() -> tuple[Any, ...]:
             from torchrl_koap.runs.progress import without_progress_bars
         except (ImportError, AttributeError) as error:
             raise RuntimeError(f"a part of the installation cannot be imported: {error}") from error
-        except ValueError as error:
-            backend = os.environ.get("MPLBACKEND")
-            if backend and backend in str(error):
-                raise ValueError(f"MPLBACKEND={backend} is not a matplotlib backend; unset it") from error
-            raise
     return options, subcommands, without_progress_bars
 
 
