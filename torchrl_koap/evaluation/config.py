@@ -15,8 +15,6 @@ from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.device import check_machine
 from torchrl_koap.runs.plugins import Plugins
 
-MOST_EPISODES = 100_000  # all are kept in memory
-
 
 @dataclass
 class EvalConfig:
@@ -66,8 +64,6 @@ class EvalConfig:
             value = vars(self)[name]
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be >= 1, got {value}")
-        if self.episodes > MOST_EPISODES:
-            raise ValueError(f"episodes must be at most {MOST_EPISODES:,}, all kept in memory, got {self.episodes:,}")
         check_machine(self.threads, self.device)
         if self.seed < 0:
             raise ValueError(f"seed must be >= 0, got {self.seed}")
