@@ -70,9 +70,6 @@ def test_wrong_uses():
         attached.follower(observed, observed[..., 2:], plan, 2)
     with pytest.raises(ValueError, match="task 'avoiding' has no environment"):
         OracleFollower(replace(TASK, env=None), blend=0.0)
-    policy = policy_of(small_planner())
-    with pytest.raises(ValueError, match="needs an environment that simulates actions, object does not"):
-        policy.attach(object())
 
 
 def test_the_command(copied_run, tmp_path):

@@ -148,12 +148,6 @@ def test_every_episode_begins_in_its_own_context_and_is_handed_what_is_its_own(b
         roll_out(policy, lambda n: Placed(n, ((9,),) * n), [0, 1], **options)
 
 
-@pytest.mark.parametrize(("seeds", "size"), [([], None), ([1], 0), ([1], -2)])
-def test_nothing_to_roll_out_is_refused(seeds, size):
-    with pytest.raises(ValueError, match="at least one seed and a batch size >= 1"):
-        toy_rollouts(seeds, batch_size=size)
-
-
 def test_a_policy_may_read_its_history_from_another_entry():
     policies = [make_policy(CountingPlanner(), EchoController(), state_of=(1, 2), **keys) for keys in KEYS]
     first, second = (

@@ -50,13 +50,7 @@ class OracleFollower(Follower):
 
     def attach(self, env: EnvBase) -> None:
         """Sets the environment whose episodes are about to begin; it must be able to simulate actions ahead."""
-        from torchrl_koap.envs.base import ManipulationEnv  # needs a simulator
-
         base = env.base_env if isinstance(env, TransformedEnv) else env
-        if not isinstance(base, ManipulationEnv):
-            raise ValueError(
-                f"strategy 'oracle' needs an environment that simulates actions, {type(base).__name__} does not"
-            )
         count, size = base.batch_size[0], len(self._changes)
         self._env, self._time, self._last = base, 0, np.zeros((count, size))
         self._matrix = np.zeros((count, LOOK_AHEAD * size, LOOK_AHEAD * size))

@@ -46,10 +46,8 @@ def roll_out(
     noise. ``progress`` is called with the number of episodes finished.
 
     Raises:
-        ValueError: without seeds, for a batch size below 1, or for another number of contexts than of seeds.
+        ValueError: for another number of contexts than of seeds.
     """
-    if not len(seeds) or (batch_size is not None and batch_size < 1):
-        raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
     noise_key, episodes = policy.planner.noise_key or NOISE, []
