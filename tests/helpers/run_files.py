@@ -17,6 +17,7 @@ LABELS = {
     "total_units": 2,
     "labelled_transitions": 20,
     "total_transitions": 40,
+    "available_transitions": 40,
     "trajectories_touched": 1,
     "total_trajectories": 2,
     "seed": 7,

@@ -25,7 +25,7 @@ def found(**numbers):
 
 
 def rates(success, **more):
-    return {"rates": {"success": {"rate": success, "episodes": 60} | more}}
+    return {"rates": {"success": {"rate": success, "low": success, "high": success, "episodes": 60} | more}}
 
 
 def actions(own, ridge):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from html_pages import Page
-from run_files import make_demonstrations, make_object_rollouts, write_run
+from run_files import LABELS, make_demonstrations, make_object_rollouts, write_run
 from safetensors.numpy import save_file
 
 from torchrl_koap.evaluation.statistics import expected_entropy
@@ -80,10 +80,10 @@ def test_everything_from_files_is_escaped(tmp_path):
     evil = "<script>alert('1')</script>&\""
     content = {evil: evil, "command": evil, "task": evil, "method": evil, "seed": evil, "versions": {evil: evil}}
     (tmp_path / "config.json").write_text(json.dumps(content))
-    labels = {evil: evil, "labelled_transitions": 1, "total_transitions": 2}
-    summary = {"labels": labels, "train_seconds": {evil: 1.0}}
+    summary = {"labels": LABELS | {evil: evil}, "train_seconds": {evil: 1.0}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
-    evaluation = {"rates": {evil: {"rate": 0.5}}, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
+    rate = {"rate": 0.5, "low": 0.4, "high": 0.6, "episodes": 10}
+    evaluation = {"rates": {evil: rate}, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
     evaluation["episode"] = [{"seed": evil, evil: evil}]
     evaluation["action_errors"] = {"outside_budget": {"note": evil}}
     (tmp_path / "eval.json").write_text(json.dumps(evaluation))
@@ -147,14 +147,6 @@ def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path, monke
     assert "plots/demonstrations.png" in page.links
 
 
-def test_odd_values_do_not_stop_the_report(tmp_path):
-    odd = {"rates": {"success": {"rate": None}, "half": 3}, "episodes": "many", "mode_entropy": float("nan")}
-    (tmp_path / "eval.json").write_text(json.dumps(odd | {"control_hz": [], "episode": "none", "plan_ms": "x"}))
-    (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "train_seconds": 12.0}))
-    page = Page(write_report(tmp_path))
-    assert "not a number" in page.text
-
-
 def write_object_run(folder, task="stacking", **evaluation):
     """A run of a task with objects, with what an evaluation in contexts leaves."""
     write_run(folder)
@@ -174,9 +166,8 @@ def write_object_run(folder, task="stacking", **evaluation):
 
 
 def test_tiles_of_a_task_with_contexts(tmp_path):
-    rates = {"success": {"rate": 0.5, "low": 0.15, "high": 0.85}, "one box stacked": {"rate": 0.75, "low": 0.3}}
-    rates["one box stacked"]["high"], rates["three boxes stacked"] = 0.954, {"rate": 0.5}
-    rates = {name: values | {"episodes": 4} for name, values in rates.items()}
+    rates = {"success": {"rate": 0.5, "low": 0.15, "high": 0.85, "episodes": 4}}
+    rates["one box stacked"] = {"rate": 0.75, "low": 0.3, "high": 0.954, "episodes": 4}
     pooled = {"mode_entropy": None, "pooled_mode_entropy": 0.387, "pooled_mode_entropy_low": 0.0}
     write_object_run(tmp_path, rates=rates, **pooled, pooled_mode_entropy_high=0.5)
     text = Page(write_report(tmp_path, draw=False)).text
@@ -184,7 +175,6 @@ def test_tiles_of_a_task_with_contexts(tmp_path):
     for wanted in (
         "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts in 2 contexts",
         "one box stacked 75.0 % interval 95 % interval 30.0 to 95.4 %, 3 of 4 rollouts",
-        "three boxes stacked 50.0 % 2 of 4 rollouts",
         f"mode entropy, all contexts together, base 6 0.39 95 % interval 0.00 to 0.50; 2 of 6 modes; {even}",
         "Outside the budget, for evaluation only: 20 labels",
     ):

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from torchrl_koap.evaluation.findings import EXPERIMENTS, GOOD
-from torchrl_koap.reports.run_facts import RunFacts, number
+from torchrl_koap.reports.run_facts import RunFacts, entry_at
 
 APART = 0.2  # difference of success rates that exceeds chance with a few dozen rollouts
 WIDE = 0.25  # width of a 95 % interval that hardly distinguishes two methods
@@ -31,7 +31,7 @@ class Advice:
 
 def advice(run: RunFacts) -> Iterator[Advice]:
     """Yields all advice about a run, the most important first."""
-    success, policy = run.success(), number(run.summary, "planner_parameters") == 0  # a policy has no planner
+    success, policy = run.success(), run.summary.get("planner_parameters") == 0  # a policy has no planner
     planner, controller, both = (run.experiment(name) for name in EXPERIMENTS)
     if run.evaluation.get("env") and not run.evaluation.get("success_key") and not success:
         success = None  # not defined, as for a walker or another endless task
@@ -61,15 +61,15 @@ def advice(run: RunFacts) -> Iterator[Advice]:
         if run.evaluation.get("env"):  # it cannot start from recorded states
             apart = ("compare their errors on recordings", "koap eval {run} --out {run}_recorded")
         yield Advice(f"success is {_percent(success)}; whether planner or controller fails is not known", *apart)
-    labels = number(run.summary, "labels", "labelled_transitions")
+    labels = entry_at(run.summary, "labels", "labelled_transitions")
     if fails and not planner_fails and labels is not None and labels < FEW_LABELS and str(method).startswith("koap"):
         yield Advice(
             f"{labels:,.0f} transitions are labelled",
             "a few more labels may suffice, where they teach the decoder most",
             "koap suggest {run} --count 5",
         )
-    entropy, even = run.evaluated("mode_entropy"), run.expected_entropy
-    entropy = run.evaluated("pooled_mode_entropy") if entropy is None else entropy
+    entropy, even = run.evaluation.get("mode_entropy"), run.expected_entropy
+    entropy = run.evaluation.get("pooled_mode_entropy") if entropy is None else entropy
     if entropy is not None and even and entropy < FEW_MODES * even:
         seen = f"the entropy of the modes is {entropy:.2f}, a uniform choice would average {even:.2f}"
         if policy:
@@ -85,25 +85,25 @@ def advice(run: RunFacts) -> Iterator[Advice]:
                 "koap inspect {run}",
             )
     split = run.evaluation.get("action_errors_on")
-    own, ridge = (number(run.action_errors, split, name) for name in ("relative", "ridge_relative"))
+    own, ridge = (entry_at(run.action_errors, split, name) for name in ("relative", "ridge_relative"))
     if own is not None and ridge is not None and own >= ridge and method not in CONTROLS:
         yield Advice(
             f"the action error of {method} is {own:.3g} times the mean action's, a plain ridge's {ridge:.3g} times",
             "the ridge is simpler; compare both in closed loop before keeping either",
             "koap curve --datasets {data} --methods koap koap_untrained linear_steps linear --out curves/compare",
         )
-    plan, control = run.evaluated("plan_ms"), run.control_hz
+    plan, control = run.evaluation.get("plan_ms"), run.control_hz
     if plan is not None and control is not None and plan >= 1000 / control:
         yield Advice(
             f"a plan takes {plan:.0f} ms, a control step {1000 / control:.0f} ms",
             "plan in a thread (AsynchronousAgent), or less often (--replan-interval)",
             "koap latency {run}",
         )
-    low, high, episodes = (run.success(end) for end in ("low", "high", "episodes"))
-    wide = low is not None and high is not None and high - low > WIDE
-    if success is not None and wide and episodes is not None and episodes < 60:
+    found = run.rates.get("success")
+    if success is not None and found and found["high"] - found["low"] > WIDE and found["episodes"] < 60:
         yield Advice(
-            f"the interval of the success is {100 * (high - low):.0f} points wide with {episodes:.0f} rollouts",
+            f"the interval of the success is {100 * (found['high'] - found['low']):.0f} points wide with"
+            f" {found['episodes']:.0f} rollouts",
             "more rollouts before anything is concluded",
             "koap eval {run} --episodes 60 --seed 100",
         )

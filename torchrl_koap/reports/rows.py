@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from torchrl_koap.reports.run_facts import RunFacts, mapping, number
+from torchrl_koap.reports.run_facts import RunFacts, entry_at, mapping
 from torchrl_koap.tasks.columns import thousandths
 
 _ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
@@ -47,33 +47,31 @@ def evaluation_rows(run: RunFacts) -> list[Row]:
 
 
 def _labels(run: RunFacts) -> Row | None:
-    names = ("labelled_transitions", "total_transitions", "trajectories_touched", "total_trajectories")
-    seen, steps, touched, recordings = (number(run.summary, "labels", name) for name in names)
-    if seen is None or steps is None:
+    labels = run.summary.get("labels")
+    if labels is None:
         return None
-    where = [] if touched is None or recordings is None else [f"in {touched:,} of {recordings:,} recordings"]
-    there = number(run.summary, "labels", "available_transitions")
-    if there is not None and seen < there < steps:
-        where.append(f"the data have {there:,} labels")
-    return Row("labels", f"{seen:,} of {steps:,} steps", "; ".join(where))
+    seen, there, steps = (labels[f"{kind}_transitions"] for kind in ("labelled", "available", "total"))
+    where = f"in {labels['trajectories_touched']:,} of {labels['total_trajectories']:,} recordings"
+    more = f"; the data have {there:,} labels" if seen < there < steps else ""
+    return Row("labels", f"{seen:,} of {steps:,} steps", where + more)
 
 
 def _planner(run: RunFacts) -> list[Row]:
     """Returns how the planner was trained, and why training ended; nothing for a method without a planner."""
     asked = mapping(run.config.get("planner"))
-    if not asked or not number(run.summary, "planner_parameters"):
+    if not asked or not run.summary.get("planner_parameters"):
         return []
     if asked.get("source") is not None:
         return [Row("planner", f"that of {asked['source']}", "not trained here")]
     names = ("updates", "kept_update", "best_held_out_score")
-    updates, kept, score = (number(run.summary, "planner", name) for name in names)
+    updates, kept, score = (entry_at(run.summary, "planner", name) for name in names)
     if updates is None:
         return []
     value = f"{updates:,.0f} updates{_seconds(run, 'planner')}"
     if kept is None or score is None:
         return [Row("planner", value, "no recording was held out")]
     note = f"kept update {kept:,.0f}, with plan score {score:.3g} on held-out recordings (smaller is better)"
-    return [Row("planner", value, note), Row("training ended", *_ending(updates, kept, number(asked, "steps")))]
+    return [Row("planner", value, note), Row("training ended", *_ending(updates, kept, asked.get("steps")))]
 
 
 def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
@@ -85,16 +83,16 @@ def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
 
 
 def _controller(run: RunFacts) -> Row | None:
-    method, updates = run.config.get("method"), number(run.summary, "controller_updates")
+    method, updates = run.config.get("method"), run.summary.get("controller_updates")
     if not isinstance(method, str) or updates is None:
         return None
-    labels = number(run.summary, "decoder_fit", "labels_used")
+    labels = entry_at(run.summary, "decoder_fit", "labels_used")
     trained = f"{method}, {updates:,} updates{_seconds(run, 'controller')}"
     return Row("controller", trained, "" if labels is None else f"fitted to {labels:,} labels")
 
 
 def _seconds(run: RunFacts, part: str) -> str:
-    seconds = number(run.summary, "train_seconds", part)
+    seconds = entry_at(run.summary, "train_seconds", part)
     return "" if seconds is None or seconds < 1 else f" in {seconds:.0f} s"  # 0 if it was finished before a resume
 
 
@@ -143,34 +141,26 @@ def _loop(run: RunFacts) -> Row | None:
 
 
 def _rates(run: RunFacts) -> list[Row]:
-    contexts, found = run.evaluated("contexts"), []
+    contexts, found = run.evaluation.get("contexts"), []
     for name, values in run.rates.items():
-        rate, low, high, total = (number(values, key) for key in ("rate", "low", "high", "episodes"))
-        if rate is None:
-            continue
-        notes, interval = [], None
-        if low is not None and high is not None:
-            notes = [f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"]
-            interval = tuple(100 * min(max(part, 0.0), 1.0) for part in (rate, low, high))
-        if total:
-            among = f" in {contexts:g} contexts" if contexts and name == "success" else ""
-            notes.append(f"{round(rate * total)} of {total:g} rollouts{among}")
-        found.append(Row(name, f"{100 * rate:.1f} %", ", ".join(notes), interval))
+        rate, low, high = (100 * values[key] for key in ("rate", "low", "high"))
+        among = f" in {contexts:g} contexts" if contexts and name == "success" else ""
+        count = f"{round(values['rate'] * values['episodes'])} of {values['episodes']:g} rollouts{among}"
+        found.append(Row(name, f"{rate:.1f} %", f"95 % interval {low:.1f} to {high:.1f} %, {count}", (rate, low, high)))
     return found
 
 
 def _entropy(run: RunFacts) -> Row | None:
     modes = run.modes.number
-    name = next((name for name in _ENTROPIES if run.evaluated(name) is not None), None)
+    name = next((name for name in _ENTROPIES if run.evaluation.get(name) is not None), None)
     if name is None or modes < 2:
         return None
-    value, low, high = (run.evaluated(name + end) for end in ("", "_low", "_high"))
-    contexts, episodes = run.evaluated("contexts"), run.evaluated("episodes")
-    notes = [] if low is None or high is None else [f"95 % interval {low:.2f} to {high:.2f}"]
-    distinct = run.evaluation.get("distinct_modes")
-    notes += [] if distinct is None else [f"{distinct} of {modes} modes"]
+    value, low, high = (run.evaluation.get(name + end) for end in ("", "_low", "_high"))
+    contexts, episodes = run.evaluation.get("contexts"), run.evaluation.get("episodes")
+    notes = [] if low is None else [f"95 % interval {low:.2f} to {high:.2f}"]
+    notes.append(f"{run.evaluation['distinct_modes']} of {modes} modes")
     if run.successes and contexts and name == "mode_entropy":
-        notes += [f"mean over contexts, {episodes / contexts:g} rollouts each"] if episodes else []
+        notes.append(f"mean over contexts, {episodes / contexts:g} rollouts each")
     elif run.successes:
         notes.append(f"a uniform choice averages {run.expected_entropy:.2f}, n = {run.successes}")
     return Row(f"{_ENTROPIES[name]}, base {modes}", f"{value:.2f}", "; ".join(notes))
@@ -182,21 +172,21 @@ def _environment(run: RunFacts) -> Row | None:
         return None
     success = f"success: info[{made['success_key']!r}]" if made.get("success_key") else made.get("success")
     limit = f"at most {made['step_limit']}" if made.get("step_limit") else None
-    total = run.evaluated("mean_return")
-    left = run.evaluated("left_out_of_return")
+    total = run.evaluation.get("mean_return")
+    left = run.evaluation.get("left_out_of_return")
     notes = [f"{left:g} rollouts that an error ended are left out"] if left else []
     low, high = made.get("mean_return_interval") or (None, None)
     notes = notes if low is None else [f"95 % interval {low:.4g} to {high:.4g}", *notes]
     about = f" ({'; '.join(notes)})" if notes else ""
     gained = None if total is None else f"mean return {total:.4g}{about}"
-    early = run.evaluated("ended_early")
+    early = run.evaluation.get("ended_early")
     ended = f"{early:g} rollouts ended before that without success" if early else None
     return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, ended, success, gained))))
 
 
 def _speed(run: RunFacts) -> Row | None:
-    plan, control = run.evaluated("plan_ms"), run.evaluated("control_ms")
-    if plan is None or control is None:
+    plan, control = run.evaluation.get("plan_ms"), run.evaluation.get("control_ms")
+    if plan is None:
         return None
     robot = f"; the robot's step has {1000 / run.control_hz:.3g} ms" if run.control_hz else ""
     return Row("time of a plan", f"{plan:.3g} ms", f"then {control:.3g} ms per control step{robot}")

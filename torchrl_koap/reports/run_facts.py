@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,16 +15,14 @@ from torchrl_koap.tasks.registry import task_from
 
 
 def mapping(value: Any) -> Mapping[str, Any]:
-    """Returns the value if it is a mapping, else an empty one: files may be damaged."""
+    """Returns the value if it is a mapping, else an empty one, for entries that are missing or null."""
     return value if isinstance(value, Mapping) else {}
 
 
-def number(value: Any, *keys: str) -> float | int | None:
-    """Returns the value, or its nested entry at ``keys``, if it is a finite number, else None."""
+def entry_at(value: Any, *keys: str) -> Any:
+    """Returns the nested entry at ``keys``; None if it is missing."""
     for key in keys:
         value = mapping(value).get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        return None
     return value
 
 
@@ -82,12 +79,11 @@ class RunFacts:
     @property
     def rates(self) -> Mapping[str, Mapping[str, Any]]:
         """Shares of the rollouts by name, success first: ``rate``, ``low``, ``high`` and ``episodes`` of each."""
-        known = mapping(self.evaluation.get("rates")).items()
-        return {name: values for name, values in known if isinstance(values, Mapping)}
+        return self.evaluation.get("rates", {})
 
     def success(self, entry: str = "rate") -> float | None:
         """Returns the success rate, an end of its interval or the number of rollouts; None if it is missing."""
-        return number(self.evaluation, "rates", "success", entry)
+        return entry_at(self.evaluation, "rates", "success", entry)
 
     @property
     def successes(self) -> int:
@@ -106,16 +102,12 @@ class RunFacts:
         """Errors of decoded actions by the labels on which they were measured; each may be a note why it is missing."""
         return mapping(self.evaluation.get("action_errors"))
 
-    def evaluated(self, name: str) -> float | None:
-        """Returns a number of the evaluation, None if it is missing."""
-        return number(self.evaluation, name)
-
     def experiment(self, name: str) -> float | None:
         """Returns the success of an experiment of ``koap inspect``, None if it was not made.
 
         In tasks where objects are moved, the controller alone succeeds if it stays near a recorded tool path.
         """
-        left, episodes = (number(self.inspection, "recordings_left", entry) for entry in ("count", "episodes"))
-        if name == "controller_alone" and left is not None and episodes:
-            return 1 - left / episodes
-        return number(self.inspection, name, "rate")
+        left = self.inspection.get("recordings_left")
+        if name == "controller_alone" and left is not None:
+            return 1 - left["count"] / left["episodes"]
+        return entry_at(self.inspection, name, "rate")

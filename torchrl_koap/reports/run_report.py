@@ -46,7 +46,7 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
         commands={name: _filled(command, run) for name, command in commands.items()},
         advice=[replace(item, command=_filled(item.command, run)) for item in advice(run)],
         training=training_rows(run),
-        labels_read=run.evaluated("labels_read_outside_budget"),
+        labels_read=run.evaluation.get("labels_read_outside_budget"),
         label_figure=next((item for item in figures if item["name"] == _BESIDE_LABELS), None),
         figures=[item for item in figures if item["name"] != _BESIDE_LABELS],
         missing=missing,
