@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from torchrl_koap.reports.pictures import picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.scenes import bodies_of, body_handles, draw_bodies, draw_scene, keep_inside
-from torchrl_koap.reports.style import BLUE, GREY, entry, set_title, tidy, with_unit
+from torchrl_koap.reports.style import BLUE, GREY, entry, panels, set_title, tidy, with_unit
 from torchrl_koap.tasks import Task
 
 _MOST_COLUMNS = 12  # panels of single state columns at most
@@ -77,18 +77,12 @@ def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, t
     time = (np.arange(len(state)) - np.repeat(first, np.diff(np.append(first, len(state))))) / task.control_hz
     columns = list(zip(task.state_names, task.state_units, strict=True))
     drawn = columns[:_MOST_COLUMNS]
-    across = min(len(drawn), 4)
-    down = -(-len(drawn) // across)
-    figure = Figure(figsize=(max(2.9 * across, 5.6), 1.1 + 2.1 * down), layout="constrained")
-    panels = figure.subplots(down, across, squeeze=False)
-    for index, axes in enumerate(panels.flat):
-        if index >= len(drawn):
-            axes.set_axis_off()
-            continue
+    figure, beside = panels(len(drawn), 4, (2.9, 2.1), (2.7 if len(drawn) == 1 else 0, 1.1))
+    for index, axes in enumerate(beside):
         _draw_lines(axes, np.column_stack([time, state[:, index]]), borders, along, (0.6, 1.3))
         axes.autoscale_view()
         set_title(axes, with_unit(*columns[index]))
-        if index + across >= len(drawn):
+        if index + 4 >= len(drawn):
             axes.set_xlabel("time (s)")
         tidy(axes)
     rest = f"; {len(columns) - len(drawn)} columns are not drawn" if len(drawn) < len(columns) else ""
