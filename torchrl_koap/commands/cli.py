@@ -125,8 +125,7 @@ def _check_words(arguments: Sequence[str]) -> None:
 
 def _commands() -> tuple[Any, ...]:
     """Imports and returns the modules that take seconds to import."""
-    loaded = "torchrl_koap.commands.subcommands" in sys.modules
-    with nullcontext() if loaded else handling_signals(leave):
+    with handling_signals(leave):
         try:
             from torchrl_koap.commands import options, subcommands
             from torchrl_koap.runs.progress import without_progress_bars

@@ -124,7 +124,11 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
         "labelled_transitions": labels["labelled_transitions"],
         "trajectories_touched": labels["trajectories_touched"],
         "controller_updates": summary["controller_updates"],
-    } | _own_error(result)
+    }
+    if (split := result["action_errors_on"]) is not None:
+        row = result["action_errors"][split]["unit"][0]
+        unit, factor = thousandths(row["unit"])  # of the first column
+        common |= {"action_error": row["controller"] * factor, "action_error_unit": unit}
     if result.get("kind") == KIND:
         names = ("relative_plan_error", "relative_action_error", "action_errors_on")
         return common | {"kind": KIND} | {name: result[name] for name in names}
@@ -133,16 +137,6 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
     common |= {f"success_{name}": success[name] for name in ("rate", "low", "high")}
     common["successes"] = round(success["rate"] * result["episodes"])
     return common | {"mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy}
-
-
-def _own_error(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the action error in the displayed unit of the first column, and that unit, if it was measured."""
-    split = result["action_errors_on"]
-    if split is None:
-        return {}
-    row = result["action_errors"][split]["unit"][0]
-    unit, factor = thousandths(row["unit"])
-    return {"action_error": row["controller"] * factor, "action_error_unit": unit}
 
 
 def _outcomes_of(result: Mapping[str, Any]) -> list[list[float]]:
