@@ -42,6 +42,7 @@ def test_objects_move_in_the_animation():
 
 def test_long_animations_skip_steps():
     long = {"position": np.random.rand(1, 1000, 2), "length": [1000], "mode": [0], "outcome": [1]}
+    long |= {"plan": np.zeros((1, 0, 14, 2)), "plan_step": np.zeros((1, 0), int)}
     film = animate_rollouts(long, RUN)
     assert film.seconds == pytest.approx(6 * 0.035) and len(list(film.frames)) <= 171
 
@@ -83,7 +84,7 @@ def test_film_starts_from_the_context(task, monkeypatch):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({}, "a film needs the entry 'context'"),
+        ({}, "missing entry 'context'"),
         ({"context": np.zeros((1, 2, 3))}, r"'context' must have shape \[any, 4, 3\]"),
         ({"action": np.zeros((1, 3, 5))}, r"'action' must have shape \[any, any, 2\]"),
     ],

@@ -50,7 +50,7 @@ def test_a_running_mean_skips_what_is_missing():
 
 @pytest.mark.parametrize(
     ("rows", "message"),
-    [([], "no row"), ([{"step": "1"}], r"no value in a loss_\* column"), ([{"step": "1", "loss_a": "x"}], "float")],
+    [([], "no row"), ([{"step": "1", "loss_a": "x"}], "float")],
 )
 def test_bad_metrics(rows, message):
     with pytest.raises(ValueError, match=message):
@@ -60,10 +60,9 @@ def test_bad_metrics(rows, message):
 def test_actions_tell_the_error_and_what_they_are_read_for():
     true = np.zeros((50, 2))
     predicted = np.tile([0.003, 0.004], (50, 1))
-    predicted[0] = np.nan  # left out
     figure = draw_actions({"predicted": predicted, "true": true}, run_of("avoiding"))
     assert titles(figure) == ["x: RMSE 3 mm", "y: RMSE 4 mm"]
-    assert figure.get_suptitle() == "49 steps of demonstrations outside the label budget, for evaluation only"
+    assert figure.get_suptitle() == "50 steps of demonstrations outside the label budget, for evaluation only"
 
 
 def test_actions_of_another_robot():
@@ -76,13 +75,9 @@ def test_actions_of_another_robot():
     assert titles(figure)[0] == "action 1: RMSE 0.5" and figure.axes[0].get_xlabel().endswith("(per step)")
 
 
-@pytest.mark.parametrize(
-    ("predicted", "message"),
-    [(np.zeros((3, 2)), r"'predicted' must have shape \[4, 2\]"), (np.full((4, 2), math.nan), "no row of 4")],
-)
-def test_bad_actions(predicted, message):
-    with pytest.raises(ValueError, match=message):
-        draw_actions({"predicted": predicted, "true": np.zeros((4, 2))}, NOTHING)
+def test_actions_that_do_not_belong_together():
+    with pytest.raises(ValueError, match=r"'predicted' must have shape \[4, 2\]"):
+        draw_actions({"predicted": np.zeros((3, 2)), "true": np.zeros((4, 2))}, NOTHING)
 
 
 def test_errors_of_actions_are_shares_so_that_small_ones_can_be_read():

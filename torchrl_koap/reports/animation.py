@@ -59,10 +59,8 @@ def _frames(rollouts: Mapping[str, Any], run: RunFacts, steps: list[int]) -> Ite
     moving, colors = body_paths(rollouts), episode_colors(mode, outcome, run.modes)
     bodies = bodies_of(run.task, moving[0].shape[1]) if moving else ()
     pales = [tuple(0.45 * np.array(to_rgb(body.color)) + 0.55) for body in bodies]
-    plan, plan_step = np.zeros((len(paths), 0, 0, 2)), np.zeros((len(paths), 0))
-    if "plan" in rollouts and "plan_step" in rollouts:
-        plan = entry(rollouts, "plan", [len(paths), None, None, 2])
-        plan_step = entry(rollouts, "plan_step", plan.shape[:2])
+    plan = entry(rollouts, "plan", [len(paths), None, None, 2])
+    plan_step = entry(rollouts, "plan_step", plan.shape[:2])
     figure = Figure(figsize=(4.2, 5.2), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = draw_scene(figure.add_subplot(), run.task)
@@ -155,8 +153,6 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
         raise NotFilmed(f"task {task.name!r} names no camera of a simulator to film it with")
     context = None
     if task.bodies:
-        if "context" not in rollouts:
-            raise ValueError(f"task {task.name!r} has varying starts: a film needs the entry 'context'")
         context = entry(rollouts, "context", [None, len(task.bodies), 3])[index].astype(np.float64)[None]
     try:
         return Film(list(_film_frames(actions.astype(np.float64), task, context, stride)), 2 / task.control_hz)

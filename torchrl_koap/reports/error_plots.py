@@ -73,12 +73,9 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
     if not rows:
         raise ValueError("metrics.csv has no rows yet")
     names = [name for name in TERMS if name in rows[0]]
-    names += sorted(name for name in rows[0] if (name or "").startswith("loss_") and name not in TERMS)
+    names += sorted(name for name in rows[0] if name.startswith("loss_") and name not in TERMS)
     step, columns = _column(rows, "step"), {name: _column(rows, name) for name in names}
     columns = {name: values for name, values in columns.items() if np.isfinite(values).any()}
-    if not columns:
-        raise ValueError(f"metrics.csv has no value in a loss_* column, got columns {', '.join(map(str, rows[0]))}")
-
     figure, drawn = panels(len(columns), 2, (4.2, 2.7))
     for axes, (name, values) in zip(drawn, columns.items(), strict=True):
         set_title(axes, TERMS.get(name, name.removeprefix("loss_").replace("_", " ")))
@@ -144,11 +141,8 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     if run.task is not None and run.task.action_dim == width:
         names, units = list(run.task.actions), [action.unit for action in run.task.actions.values()]
         absolute = tuple(name for name, action in run.task.actions.items() if action.kind != "delta")
-    there = np.isfinite(true).all(1) & np.isfinite(predicted).all(1)
-    if not there.any():
-        raise ValueError(f"'predicted' and 'true' have no row of {len(true)} that is finite in both")
     shown, factor = zip(*map(thousandths, units), strict=True)
-    true, predicted = true[there] * factor, predicted[there] * factor
+    true, predicted = true * factor, predicted * factor
     error = predicted - true
     figure, drawn = panels(width, width if width < 5 else -(-width // 2), (3.2, 3.4), (0.6, 0.35))
     for index, (axes, name) in enumerate(zip(drawn, names, strict=True)):
