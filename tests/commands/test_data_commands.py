@@ -93,9 +93,7 @@ def test_validation_says_how_many_labels_there_are(arm, tmp_path, capsys):
     assert re.search(r"labelled steps +58\b", capsys.readouterr().out)
     save_demonstrations(tmp_path / "bare", [np.random.default_rng(0).normal(size=(9, 2))], control_hz=9, action_dim=1)
     assert koap("validate", tmp_path / "bare") == 0
-    said = capsys.readouterr().out
-    assert re.search(r"labelled steps +none: `koap train` needs a few", said)
-    assert re.search(r"warning 1 +no recording has actions: a planner can be trained, a policy cannot", said)
+    assert re.search(r"labelled steps +none: `koap train` needs a few", capsys.readouterr().out)
 
 
 @pytest.mark.filterwarnings("ignore:action 'action_1'")

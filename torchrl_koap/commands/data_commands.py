@@ -287,6 +287,4 @@ def _numbered(found: list[str], data: TensorDictBase) -> dict[str, str]:
     if len(data["episode"].unique()) == 1:
         hint = "there is only one trajectory: if it holds several episodes, mark their ends"
         found = [f"{hint} (a column 'episode_index' or 'timeouts')", *found]
-    if not data["has_action"].any():
-        found = ["no recording has actions: a planner can be trained, a policy cannot", *found]
     return {f"warning {number}": warning for number, warning in enumerate(found, 1)}

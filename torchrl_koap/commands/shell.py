@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -45,9 +44,6 @@ def describe_interrupt(error: KeyboardInterrupt, command: str = "") -> tuple[str
 @contextlib.contextmanager
 def handling_signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     """Calls a handler for the signals that end a process inside the block; ignored ones (``nohup``) stay ignored."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread can set handlers
-        yield
-        return
     earlier = {number: signal.getsignal(number) for number in ENDING}
     changed = [number for number, was in earlier.items() if was not in (signal.SIG_IGN, None)]
     for number in changed:
