@@ -20,7 +20,6 @@ DATA = "fix what `koap validate` warns about"
 MORE = f"{DATA}, then record more, or train longer (--steps) if plans were still improving"  # advice on plans
 KIND = f"{DATA}, check --action-kind and --robot, or label a recording that moves it"  # advice on actions
 ROUND = "round at another threshold, or choose the value in your driver; give each of several modes a 0/1 column"
-_NO_STATES = "The policy does not use these predictions: if the action error of `koap eval` is small, ignore them"
 UNSTABLE = 3.0  # late commands in a loop on labels, relative to the largest demonstrated one
 HARDLY = 0.9  # share of the mean action's error above which a column is not learned, even if others are
 _FAR = 3.0  # largest distance to the nearest recorded state, in standard deviations of these states
@@ -28,7 +27,6 @@ STAYS = 0.2  # smallest distance from the start, relative to that of demonstrati
 LEAVES = "cut pauses at their ends (`koap convert --trim-still`), or train longer (--steps)"  # advice
 _MAX_LEFT = 0.1  # share of recorded paths that a controller may leave
 _ODD, _NOTABLE = 2.0, 0.5  # labels are odd above: multiple of the others' median error; relative error
-_WORSE = 2.0  # multiple of the error of a comparable model above which a latent model is worse
 
 
 def error_unit(part: str, task: Task) -> tuple[str, float]:
@@ -77,26 +75,6 @@ def _describe_experiments(result: Mapping[str, Any]) -> str:
     if planner is None:
         return "the controller works alone: the fault is in the planner, or in plans that start from executed states"
     return "planner and controller work alone, not together: plans that start from executed states are worse"
-
-
-def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
-    """Says what is wrong with the latent dynamics as a model of the motion; an empty list if nothing is.
-
-    Compares the errors of :func:`~torchrl_koap.evaluation.latent_space.prediction_errors` after the last step, in the
-    first part of the state.
-    """
-    part = next(iter(multi_step["koopman"]))
-    koopman, back, linear, still = (float(multi_step[model][part][-1]) for model in MODELS)
-    faults = []
-    if not koopman < float("inf"):
-        return ["the latent dynamics diverge: their prediction is not finite"]
-    if koopman > still:
-        faults.append(f"the latent dynamics predict {_worse(koopman, still, 'standing still')}")
-    if koopman > _WORSE * linear:
-        faults.append(f"the latent dynamics predict {_worse(koopman, linear, 'a linear model on raw states')}")
-    if faults and back > _WORSE * linear:
-        faults.append(f"mapping lifted states back alone is {_worse(back, linear, 'that linear model')}")
-    return faults
 
 
 def offline_faults(
@@ -175,12 +153,11 @@ def _describe_latent(latent: Mapping[str, Any], task: Task) -> str:
     part = next(iter(errors["koopman"]))
     shown, factor = error_unit(part, task)
     ahead = {model: f"{factor * errors[model][part][-1]:.3g} {shown}".rstrip() for model in MODELS}
-    faults = latent_faults(errors)
-    said = f"Of the latent model: {'; '.join(faults)}. {_NO_STATES}. " if faults else ""
-    return said + (
+    return (
         f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
         f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
-        f" standing still by {ahead['copy_last']}. {_describe_probe(latent[OUTSIDE_THE_BUDGET], task)}"
+        f" standing still by {ahead['copy_last']}; the policy does not use these predictions."
+        f" {_describe_probe(latent[OUTSIDE_THE_BUDGET], task)}"
     )
 
 
@@ -203,7 +180,3 @@ def _describe_probe(outside: Mapping[str, Any], task: Task) -> str:
 def _against(own: float, other: float, unit: str) -> str:
     shown, factor = thousandths(unit)
     return f"{own * factor:.4g} against {other * factor:.4g} {shown}".rstrip()
-
-
-def _worse(own: float, other: float, model: str) -> str:
-    return f"{own / other:.3g} times worse than {model}" if other > 0 else f"worse than {model}, which makes no error"
