@@ -264,14 +264,14 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
     command = [sys.executable, "-m", "torchrl_koap.commands.cli", *command_of(out, demonstrations, workers=1)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        wait_until(lambda: (out / DP / "config.json").exists() or process.poll() is not None)
+        wait_until(lambda: (out / LINEAR / "config.json").exists() or process.poll() is not None)
     finally:
         process.kill()
         process.wait()
     wait_until(lambda: not living(process.pid))
     before = marks(out)
     assert f"{PLANNER}/result.json" in before and not (out / "index.html").exists()
-    assert not (out / LINEAR / "result.json").exists()
+    assert not (out / DP / "result.json").exists()
     assert run(out, demonstrations)["done"] == 2
     after = marks(out)
     assert {name: after[name] for name in before} == before

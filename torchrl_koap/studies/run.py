@@ -198,27 +198,25 @@ def _write_rows(study: Study, results: Mapping[Cell, Result]) -> list[dict[str, 
 
 def _work(study: Study, cells: Sequence[Cell], results: dict[Cell, Result], machines: Machines) -> None:
     """Runs shared planners, then the cells that are not done; reads the result of each once, when it has ended."""
-    first: list[Job] = []
-    jobs: dict[Path, Job] = {}
+    planners: dict[Path, Job] = {}
+    jobs: list[Job] = []
     for cell in cells:
         if results[cell][0]["status"] == "done":
             continue
         planner, needs = study.planner_folder(cell), None
         if planner is not None and study.given_planner(cell.task) is None and not _is_trained(planner):
             needs = planner
-            if planner not in {job.folder for job in first}:
-                first.append(Job(planner))
+            if planner not in planners:
+                planners[planner] = Job(planner)
                 with suppress(OSError):  # if this cannot be written, the job itself reports why
                     prepare_cell(planner, study.planner_config(cell), None)
         folder = study.out / cell.folder
-        jobs[folder] = Job(folder, needs)
+        jobs.append(Job(folder, needs))
         with suppress(OSError):
             prepare_cell(folder, study.train_config(cell), study.eval_config(cell))
     places = {study.out / cell.folder: cell for cell in cells}
-    alone = [job for job in jobs.values() if job.needs is None]  # these do not wait for a planner
-    ordered = [*first, *alone, *(job for job in jobs.values() if job.needs is not None)]
-    with progress_bar(len(ordered), "cells", unit="cell", smoothing=0.1) as bar:
-        with closing(launch(run_cell, ordered, machines)) as ended:
+    with progress_bar(len(planners) + len(jobs), "cells", unit="cell", smoothing=0.1) as bar:
+        with closing(launch(run_cell, [*planners.values(), *jobs], machines)) as ended:
             for job, reason in ended:
                 bar.update()
                 bar.set_postfix_str(job.folder.name + (" FAILED" if reason else ""))
