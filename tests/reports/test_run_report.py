@@ -83,8 +83,8 @@ def test_everything_from_files_is_escaped(tmp_path):
     summary = {"labels": LABELS | {evil: evil}, "train_seconds": {evil: 1.0}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     rate = {"rate": 0.5, "low": 0.4, "high": 0.6, "episodes": 10}
-    evaluation = {"rates": {evil: rate}, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
-    evaluation["episode"] = [{"seed": evil, evil: evil}]
+    evaluation = {"rates": {evil: rate}, "execution": {evil: evil}, "distinct_modes": evil, "mode_entropy": 0.1}
+    evaluation["episodes"], evaluation["episode"] = 1, [{"seed": evil, evil: evil}]
     evaluation["action_errors"] = {"outside_budget": {"note": evil}}
     (tmp_path / "eval.json").write_text(json.dumps(evaluation))
     page = Page(write_report(tmp_path))

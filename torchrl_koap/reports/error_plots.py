@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.reports.pictures import NothingToDraw, picture
-from torchrl_koap.reports.run_facts import RunFacts, mapping
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import (
     BLUE,
     FAINT,
@@ -182,7 +182,7 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
 )
 def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws errors of sampled plans over the horizon, and those of baselines that need no learning."""
-    plan = mapping(result.get("plan_errors"))
+    plan = result.get("plan_errors", {})
     if "unit" not in plan:
         raise NothingToDraw("no plan was evaluated on recorded data")
     rows = plan["unit"]
@@ -221,7 +221,7 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
 )
 def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws errors of decoded actions and of a ridge by column, relative to those of the mean action."""
-    parts = [(name, part) for name, part in mapping(result.get("action_errors")).items() if "column" in part]
+    parts = [(name, part) for name, part in result.get("action_errors", {}).items() if "column" in part]
     if not parts:
         raise NothingToDraw("no action was evaluated on recorded data")
     count = len(parts[0][1]["column"])

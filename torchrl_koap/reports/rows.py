@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from torchrl_koap.reports.run_facts import RunFacts, entry_at, mapping
+from torchrl_koap.reports.run_facts import RunFacts, entry_at
 from torchrl_koap.tasks.columns import thousandths
 
 _ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
@@ -58,7 +58,7 @@ def _labels(run: RunFacts) -> Row | None:
 
 def _planner(run: RunFacts) -> list[Row]:
     """Returns how the planner was trained, and why training ended; nothing for a method without a planner."""
-    asked = mapping(run.config.get("planner"))
+    asked = run.config.get("planner")
     if not asked or not run.summary.get("planner_parameters"):
         return []
     if asked.get("source") is not None:
@@ -125,8 +125,8 @@ def _error_row(name: str, row: Mapping[str, Any], errors: Mapping[str, float], k
 
 
 def _loop(run: RunFacts) -> Row | None:
-    found = mapping(run.evaluation.get("loop"))
-    if not found:
+    found = run.evaluation.get("loop")
+    if found is None:
         return None
     if "note" in found:
         return Row("closed loop", _NOT_MEASURED, found["note"])

@@ -14,15 +14,10 @@ from torchrl_koap.tasks import Modes, Task
 from torchrl_koap.tasks.registry import task_from
 
 
-def mapping(value: Any) -> Mapping[str, Any]:
-    """Returns the value if it is a mapping, else an empty one, for entries that are missing or null."""
-    return value if isinstance(value, Mapping) else {}
-
-
 def entry_at(value: Any, *keys: str) -> Any:
-    """Returns the nested entry at ``keys``; None if it is missing."""
+    """Returns the nested entry at ``keys``; None if it or one on the way is missing or null."""
     for key in keys:
-        value = mapping(value).get(key)
+        value = (value or {}).get(key)
     return value
 
 
@@ -100,7 +95,7 @@ class RunFacts:
     @property
     def action_errors(self) -> Mapping[str, Any]:
         """Errors of decoded actions by the labels on which they were measured; each may be a note why it is missing."""
-        return mapping(self.evaluation.get("action_errors"))
+        return self.evaluation.get("action_errors", {})
 
     def experiment(self, name: str) -> float | None:
         """Returns the success of an experiment of ``koap inspect``, None if it was not made.

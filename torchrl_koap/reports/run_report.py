@@ -14,7 +14,7 @@ from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, draw_pictures
 from torchrl_koap.reports.rows import evaluation_rows, training_rows
-from torchrl_koap.reports.run_facts import RunFacts, mapping
+from torchrl_koap.reports.run_facts import RunFacts, entry_at
 
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
@@ -67,13 +67,13 @@ def write_report(folder: str | Path, *, draw: bool = True, animation: bool = Tru
 
 def _subtitle(run: RunFacts) -> str:
     sections = {"preset": run.config.get("controller"), "dataset": run.config, "seed": run.config.get("run")}
-    shown = [f"{name} {section[name]}" for name, section in sections.items() if _given(mapping(section), name)]
+    shown = [f"{name} {section[name]}" for name, section in sections.items() if section and _given(section, name)]
     return " · ".join([str(run.folder), *shown])
 
 
 def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
     """Returns the figures to show, and for each command the titles of the pictures whose source it would write."""
-    no_actions = mapping(run.action_errors.get("outside_budget")).get("note")
+    no_actions = entry_at(run.action_errors, "outside_budget", "note")
     figures: list[dict[str, Any]] = []
     missing: dict[str, list[str]] = {}
     for name, item in all_pictures().items():
@@ -85,7 +85,7 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
             figures.append(figure | {"source": f"{FOLDER}/{name}", "beside": name.endswith(".gif")})
         elif (item.source in _SIMULATED) if run.offline else item.offline:
             continue  # no command makes it for this task
-        elif item.source == "actions.safetensors" and not source and isinstance(no_actions, str):
+        elif item.source == "actions.safetensors" and not source and no_actions:
             figures.append(figure | {"empty": no_actions})  # no command would make it
         elif not source:
             missing.setdefault(_filled(item.made_by, run), []).append(item.title)
@@ -96,14 +96,11 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
 
 def _eval_command(run: RunFacts) -> str:
     evaluation = run.evaluation
-    words = ["koap", "eval", str(run.folder)]
-    if evaluation.get("kind") == "offline":
-        evaluation = {"seed": evaluation.get("seed")}
-    episode = evaluation.get("episode")
-    first = mapping(episode[0]) if isinstance(episode, list) and episode else {}
-    options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
-    options |= dict(mapping(run.evaluation.get("execution"))) | {key: evaluation.get(key) for key in _ABOUT_ENV}
-    return shlex.join([*words, *_words(options)])
+    options = {"seed": evaluation.get("seed")}
+    if "episode" in evaluation:  # rolled out, not evaluated on recorded data
+        options = {"episodes": evaluation["episodes"], "seed": evaluation["episode"][0]["seed"]}
+    options |= evaluation.get("execution", {}) | {key: evaluation.get(key) for key in _ABOUT_ENV}
+    return shlex.join(["koap", "eval", str(run.folder), *_words(options)])
 
 
 def _words(options: Mapping[str, Any]) -> list[str]:
