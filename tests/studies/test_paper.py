@@ -49,6 +49,7 @@ def test_levels_are_those_of_the_tasks():
 
 def cell(task, method, labels, successes=None, seed=0):
     row = {"task": task, "method": method, "labels": labels, "seed": seed, "status": "missing"}
+    row |= {"demonstrations": 1.0, "label_unit": "window"}
     return row if successes is None else row | {"status": "done", "episodes": 60, "successes": successes}
 
 

@@ -77,7 +77,7 @@ def write_study_report(
     with replacing_file(folder / "table.md") as aside:
         aside.write_text(markdown_table(rows), encoding="utf-8")
     write_csv(folder / "comparisons.csv", COMPARISON_COLUMNS, compared)
-    windows = [row for row in rows if row.get("label_unit") == "window"]
+    windows = [row for row in rows if row["label_unit"] == "window"]
     offline = any(item.offline for item in summaries)
     return write_page(
         "curve.html",
@@ -100,8 +100,8 @@ def write_study_report(
 def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns two sentences on the cells, and the titles of their methods."""
     count = Counter(row["status"] for row in rows)
-    names = {name: list(dict.fromkeys(row.get(name) for row in rows)) for name in ("task", "method", "seed")}
-    unit = list(dict.fromkeys(plural_of(row.get("label_unit") or "") for row in rows))
+    names = {name: list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method", "seed")}
+    unit = list(dict.fromkeys(plural_of(row["label_unit"]) for row in rows))
     text = ", ".join(
         (
             f"{', '.join(map(str, names['task']))}: methods {', '.join(map(str, names['method']))}",
@@ -138,9 +138,8 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
         hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
         mixed = _MIXED if len({compared for item in main for compared in item.action_errors_on}) > 1 else ""
         more = {"success": used + hollow, "relative_action_error": mixed}
-        counted = plural_of(label_unit) if label_unit else ""
         for kind in known:
-            options = {"methods": methods, "label_unit": counted, **wanted[kind]}
+            options = {"methods": methods, "label_unit": plural_of(label_unit), **wanted[kind]}
             figures.append(_figure(folder, name, kind, main, more.get(kind, ""), **options))
         if len(shares) > 1 and "success" in known:
             figures.append(_figure(folder, name, "demonstrations", items, by=("demonstrations",), methods=methods))

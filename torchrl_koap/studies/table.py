@@ -94,7 +94,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
     The Wilson interval assumes independent episodes. But the same contexts recur for every seed, so it is too narrow if
     seeds differ by more than chance: compare it with the range of the seeds.
 
-    Cells have at least task, method, labels, seed and status. Raises a ValueError for a cell that occurs twice.
+    Cells have at least task, method, labels, demonstrations, seed, label_unit and status. Raises a ValueError for a
+    cell that occurs twice.
     """
     places = group_cells(rows).items()
     return [_summary(*place, method, cells) for place, methods in places for method, cells in methods.items()]
@@ -105,8 +106,7 @@ def group_cells(rows: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, dict
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
 
     def setting_of(row: Mapping[str, Any]) -> Place:
-        share = row.get("demonstrations")
-        return row["task"], row.get("label_unit") or "", 1.0 if share is None else share, row["labels"]
+        return row["task"], row["label_unit"], row["demonstrations"], row["labels"]
 
     def order(row: Mapping[str, Any]) -> tuple:
         return tasks.index(row["task"]), *setting_of(row)[1:], methods.index(row["method"])
@@ -151,7 +151,7 @@ def _summary(task: str, unit: str, demonstrations: float, labels: float, method:
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     """Returns the table as text, a row per method and share of labels, without columns that have no value."""
     units = {item.label_unit for item in summaries}
-    labels = f"labels ({plural_of(*units)})" if len(units) == 1 and "" not in units else "labels"
+    labels = f"labels ({plural_of(*units)})" if len(units) == 1 else "labels"
     error = ", ".join(sorted({unit for item in summaries for unit in item.action_error_units}))
     numbers = {  # heading to measure and form
         "mode entropy": ("mode_entropy", ".2f"),
@@ -243,8 +243,7 @@ def not_done(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def cell_name(row: Mapping[str, Any]) -> str:
     """Returns a cell in words: ``avoiding, koap, 2 % labels, seed 1``."""
-    demonstrations = row.get("demonstrations")
-    used = "" if demonstrations in (None, 1.0) else f"{percent(demonstrations)} of the demonstrations, "
+    used = "" if row["demonstrations"] == 1 else f"{percent(row['demonstrations'])} of the demonstrations, "
     return f"{row['task']}, {row['method']}, {percent(row['labels'])} labels, {used}seed {row['seed']}"
 
 
