@@ -15,11 +15,13 @@ import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.vector.utils import iterate
+from gymnasium.wrappers.utils import create_zero_array
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode, entries_of, find_success_key, say
+from torchrl_koap.data.formats.kinds import leaves, spread
+from torchrl_koap.envs.gymnasium_episode import GymnasiumEpisode, ObservationError, entries_of, find_success_key, say
 from torchrl_koap.files import some
 from torchrl_koap.keys import ACTION, FAILED, MODE, OBSERVATION, SUCCESS
 from torchrl_koap.tasks import Task
@@ -49,6 +51,33 @@ class EpisodeRecord:
         return found
 
 
+class NamedColumns(gymnasium.ObservationWrapper):
+    """Takes the columns ``names`` from a dictionary of numbers, in that order; ``read_minari`` names them alike.
+
+    Raises:
+        ObservationError: if the dictionary lacks one of the columns.
+    """
+
+    def __init__(self, env: gymnasium.Env, names: Sequence[str]):
+        super().__init__(env)
+        self.names = names
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(names),), np.float64)
+        known = self._columns(create_zero_array(env.observation_space))
+        if lacks := [name for name in names if name not in known]:
+            has = some(list(known)) or "no numbers"
+            raise ObservationError(f"its observation is a dictionary of {has}; it lacks the columns {some(lacks)}")
+
+    def observation(self, observation: Any) -> np.ndarray:
+        """Returns the columns ``[obs]``."""
+        columns = self._columns(observation)
+        return np.concatenate([columns[name] for name in self.names])
+
+    @staticmethod
+    def _columns(observation: Any) -> dict[str, np.ndarray]:
+        numbers = [(name, values) for name, values in leaves(observation) if values.ndim < 2]
+        return {name: column for entry, values in numbers for name, column in spread(entry, values[None]).items()}
+
+
 class GymnasiumBatch(EnvBase):
     """Runs environments of one Gymnasium id in parallel; one whose episode is over waits for the others.
 
@@ -57,7 +86,7 @@ class GymnasiumBatch(EnvBase):
     (``failed``).
 
     Observations and actions are those of the data: the task's ``origins`` are subtracted from an environment's
-    observations and added to its actions.
+    observations and added to its actions. Of a dictionary, the task's columns are taken by name.
 
     For a policy trained with cameras (``observe``), the environment's observation is a dictionary. Its uint8 pictures
     are frames of the cameras of the same name (a single one needs no matching name); its numbers are concatenated to
@@ -88,11 +117,18 @@ class GymnasiumBatch(EnvBase):
         self.task, self._observe = task, observe
         self._origin, self._added = map(np.asarray, task.origins or (0.0, 0.0))
         self.record = EpisodeRecord() if record is None else record
-        make = partial(gymnasium.make, env_id, **(env_kwargs or {}))
+
+        def make() -> gymnasium.Env:
+            env = gymnasium.make(env_id, **(env_kwargs or {}))
+            named = observe is None and isinstance(env.observation_space, gymnasium.spaces.Dict)
+            return NamedColumns(env, task.observation_names) if named else env
+
         try:
             first = make()
         except Exception as error:
-            raise ValueError(f"environment {env_id!r} cannot be made: {say(error)}") from error
+            absent = isinstance(error, gymnasium.error.UnregisteredEnv) and ":" not in env_id
+            cure = f" Name the package that registers it: PACKAGE:{env_id}" if absent else ""
+            raise ValueError(f"environment {env_id!r} cannot be made: {say(error)}{cure}") from error
         try:
             if observe is None:
                 _check_box(env_id, "observation", first.observation_space, task.name, task.observation_dim)

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +50,17 @@ def numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     table = np.asarray(values, dtype=np.float64)
     table = table.reshape(len(table), int(np.prod(table.shape[1:])))
     return {f"{name}_{index}": column for index, column in enumerate(table.T)}
+
+
+def leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Yields the arrays of nested dictionaries and tuples with joined names, in the order of the names."""
+    if isinstance(observations, tuple):
+        observations = {str(index): part for index, part in enumerate(observations)}
+    if not isinstance(observations, Mapping):
+        yield name, np.asarray(observations)
+        return
+    for key in sorted(observations):
+        yield from leaves(observations[key], f"{name}_{key}" if name else str(key))
 
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from torchrl_koap.data.formats.columns import Piece, assemble
-from torchrl_koap.data.formats.kinds import numbered, spread
+from torchrl_koap.data.formats.kinds import leaves, numbered, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import gathered, refuse
 from torchrl_koap.lookup import import_extra
@@ -37,7 +37,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
         states: dict[str, np.ndarray] = {}
         unread: list[str] = []
         called = f"episode {episode.id}"
-        for name, array in _leaves(episode.observations):
+        for name, array in leaves(episode.observations):
             if array.ndim > 2 or array.dtype.kind not in "fiub":
                 unread.append(name or "observation")
             else:
@@ -53,29 +53,14 @@ def read_minari(source: str, **options: Any) -> Recordings:
             continue
         pieces.append(Piece(str(episode.id), states, numbered("action", steps), unread=tuple(unread)))
     refuse(source, gathered(faults))
-    return assemble(
-        pieces,
-        source,
-        declared_hz=_rate(dataset),
-        no_rate="its environment declares no render_fps",
-        **options,
-    )
+    rate, no_rate = _rate(dataset)
+    return assemble(pieces, source, declared_hz=rate, no_rate=no_rate, **options)
 
 
-def _leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """Yields arrays with their names, those of dictionaries in the order of their names."""
-    if isinstance(observations, tuple):
-        observations = {str(index): part for index, part in enumerate(observations)}
-    if not isinstance(observations, Mapping):
-        yield name, np.asarray(observations)
-        return
-    for key in sorted(observations):
-        yield from _leaves(observations[key], f"{name}_{key}" if name else str(key))
-
-
-def _rate(dataset: Any) -> float | None:
+def _rate(dataset: Any) -> tuple[float | None, str]:
+    """Returns the rate of the environment, if known, and why it may be unknown."""
     try:
         rate = dataset.recover_environment().metadata.get("render_fps")
-    except Exception:  # an environment that is not installed may raise anything; its rate is optional
-        return None
-    return float(rate) if rate else None
+    except Exception as error:  # an environment that is not installed may raise anything; its rate is optional
+        return None, f"the rate is unknown, as its environment cannot be made ({type(error).__name__}: {error})"
+    return float(rate) if rate else None, "its environment declares no render_fps"
