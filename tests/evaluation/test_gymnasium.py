@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 
 import gymnasium
+import numpy as np
 import pytest
 from offline_runs import record
 from tiny_runs import koap
@@ -83,13 +84,13 @@ def test_rollouts_that_do_not_leave_their_start_are_told(arm_run, monkeypatch):
 
 
 def test_rollouts_that_start_elsewhere_are_told(arm_run, monkeypatch):
-    """A sensor whose zero has drifted, or columns in another order, and the policy is not to blame."""
+    """Columns in another order: goals of both signs where recordings have a speed of zero."""
     made = type(gymnasium.make("toy_gym:ToyReach-v0").unwrapped)
     own = made._observe
     elsewhere = "rollouts start where no recording does: q2 at "
     asked = {"episodes": 5, "env": "toy_gym:ToyReach-v0", "env_kwargs": ("count=99",), "threads": 1}
     for shift, told in ((0.0, 0), (40.0, 1)):
-        monkeypatch.setattr(made, "_observe", lambda env, shift=shift: own(env) + [0, shift, 0, 0])
+        monkeypatch.setattr(made, "_observe", lambda env, far=shift: own(env) + [0, far * np.sign(env.goal[0]), 0, 0])
         for found in (evaluate(arm_run, EvalConfig(**asked)), inspect(arm_run, InspectConfig(**asked))):
             assert sum(fault.startswith(elsewhere) for fault in found.get("faults", ())) == told
 

@@ -139,18 +139,18 @@ def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> l
 
 
 def start_faults(rollouts: Sequence[TensorDictBase], data: TensorDictBase, task: Task) -> list[str]:
-    """Names columns in which 90 % of at least five rollouts ``[T]`` start above, or below, all recorded starts."""
+    """Names columns in which 90 % of at least five rollouts ``[T]`` start outside the range of recorded starts."""
     if len(rollouts) < _MIN_ROLLOUTS:
         return []
     observed = data[OBSERVATION].double()
     (low, high), (least, most) = (torch.aminmax(rows, dim=0) for rows in (observed[begins(data)], observed))
     seen = torch.stack([episode[OBSERVATION][0].double() for episode in rollouts])
     margin = _START_MARGIN * (most - least)
-    out = (seen.quantile(0.1, 0) > high + margin) | (seen.quantile(0.9, 0) < low - margin)
+    out = ((seen > high + margin) | (seen < low - margin)).double().mean(0) >= 0.9
     origin = torch.tensor((task.origins or (0.0,))[0], dtype=torch.float64)
-    table = torch.stack([seen.median(0).values, low, high], -1) + origin.unsqueeze(-1)
+    table = torch.stack([*torch.aminmax(seen, dim=0), low, high], -1) + origin.unsqueeze(-1)
     rows = [(task.observation_names[column], *table[column].tolist()) for column in out.nonzero().flatten().tolist()]
-    said = some([f"{name} at {start:.4g} (recordings: {low:.4g} to {high:.4g})" for name, start, low, high in rows])
+    said = some([f"{name} at {a:.4g} to {b:.4g} (recordings: {c:.4g} to {d:.4g})" for name, a, b, c, d in rows])
     return [f"rollouts start where no recording does: {said}: another zero, unit or order of columns?"] if rows else []
 
 
