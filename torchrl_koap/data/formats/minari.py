@@ -43,7 +43,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
             else:
                 states |= spread(name or "state", array)
         if not states:
-            faults.append((called, "observations hold images only, no numbers"))
+            faults.append((called, "observations hold images, matrices or text only, no vectors of numbers"))
         if isinstance(episode.actions, (Mapping, tuple)):
             faults.append((called, "its actions are a Dict or Tuple, wanted one vector [T, a] of numbers"))
             continue
