@@ -25,7 +25,7 @@ MOVED = torch.cat([MOVED, torch.sin(MOVED)], 1)
 TIME = np.linspace(0, 2, 60)[:, None]
 
 
-def warnings(states, actions=None, *, columns=("x", "y"), units=("m", "m"), names=(), acting=("v",)):
+def warnings(states, actions=None, *, columns=("x", "y"), units=("m", "m"), names=(), acting=("v",), robot=()):
     frames = [torch.as_tensor(path) for path in states]
     task = Task(
         name="arm",
@@ -33,6 +33,7 @@ def warnings(states, actions=None, *, columns=("x", "y"), units=("m", "m"), name
         observation_units=tuple(units),
         actions={name: Action() for name in acting},
         position="arm",
+        robot=robot,
     )
     data = flatten_trajectories(frames, actions, action_dim=len(acting), dtype=torch.float64)
     return find_warnings(data.set("state", data["observation"]), task, names)
@@ -127,6 +128,15 @@ def test_the_same_angle_a_turn_apart_is_warned_of():
 def test_columns_that_differ_between_trajectories_alone_are_goals():
     frames = [np.hstack([TIME, 0 * TIME + goal, 0 * TIME]) for goal in (1, 2)]
     assert goal_columns(make_recordings(frames, action_dim=1, state_names=["x", "goal", "shelf"])) == ["goal"]
+
+
+def test_goals_that_change_within_recordings_are_not_the_robot():
+    """As in Minari's mazes, where first frames hold the goal of the recording before; grippers have few values."""
+    paths = np.random.default_rng(0).normal(size=(6, 60, 1)).cumsum(1)
+    behind = np.arange(60)[:, None] > 0
+    for goal, told in ((lambda i: np.where(behind, i + 1.5, i + 0.5), 1), (lambda i: 1.0 * (behind * i % 2), 0)):
+        found = warnings([np.hstack([path, goal(i)]) for i, path in enumerate(paths)], robot=(0, 1))
+        assert sum("the controller reads 'y', which keep" in each for each in found) == told
 
 
 def test_a_plan_that_is_short_against_the_motion():

@@ -38,6 +38,7 @@ ROUNDING = 1e-5  # a column that moves less than this share of the farthest one 
 NOISE = 8.0  # still as well: within this many standard deviations of the noise at that end of the recordings
 CANCELS = 0.25  # noise: -(product of neighbouring steps) / square step above this; 0.5 for noise, 0 for a random walk
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
+SELDOM, FEW = 0.05, 3  # a goal changes in less than this share of the steps, and takes more values than this
 AS_FAR = 0.5  # of the mean square distance between any two frames: motions repeat above this
 LOOKED_AT = 20_000  # windows to check for repeating motions
 SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: warn below, suggest a rate that reaches this
@@ -51,7 +52,8 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     * State columns: constant, equal to another one, leaping, with marks of missing values, clocks, quaternions that
       change sign, angles a turn apart, or without unit and moving much farther than others; still frames at both ends.
     * Actions: another kind than declared, late, constant, leaping for one frame, or with marks of missing values.
-    * A command that no action follows; isolated labels; an unlikely rate; plans that are short against the motion.
+    * A command that no action follows; goals that the controller reads; isolated labels; an unlikely rate;
+      plans that are short against the motion.
 
     ``names`` labels each trajectory, for example by its file. Default: their numbers.
     """
@@ -85,6 +87,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         ),
         *_stillness(frames, called),
         *_clocks(frames, task),
+        *_goals(frames, task),
         *spike_warnings(labels, called, task.action_names),
         *mark_warnings(np.concatenate(labels), task.action_names, "action"),
         *scale_warnings(labels, called, task.action_names, "action"),
@@ -164,6 +167,20 @@ def _clocks(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
             yield f"column {task.state_names[column]!r} {said}"
     if not SLOWEST <= task.control_hz <= FASTEST:
         yield f"control_hz is {task.control_hz:g}: frames per second, not seconds per frame?"
+
+
+def _goals(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
+    """Finds columns of the robot that seldom change, for one step and to new values: goals, not switches or joints."""
+    changes = [frames[1:] != frames[:-1] for frames in trajectories]
+    number, steps = np.sum([part.sum(0) for part in changes], axis=0), sum(map(len, changes))
+    apart = 10 * np.sum([(part[1:] & part[:-1]).sum(0) for part in changes], axis=0) <= number
+    values = np.array([len(np.unique(column)) for column in np.concatenate(trajectories).T])
+    goals = apart & (number > 0) & (number < SELDOM * steps) & (values > FEW)
+    if found := [repr(task.state_names[column]) for column in task.robot if goals[column]]:
+        yield (
+            f"the controller reads {some(found)}, which keep one value and then leap to another: if these are goals,"
+            f" name the robot's columns in {option('robot')}"
+        )
 
 
 def _single_labels(known: Sequence[Tensor], called: Sequence[str]) -> Iterator[str]:
