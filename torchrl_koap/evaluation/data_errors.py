@@ -145,7 +145,7 @@ def errors_outside_budget(
     if not len(true):
         return {"note": "no trajectory outside the budget has labels"}, {}
     models = _with_baselines(predicted, true, labelled, data, outside, task)
-    return summarise_errors(models, true, episode, task), {"predicted": predicted, "true": true}
+    return summarise_errors(models, true, episode, task), {"predicted": models["controller"], "true": true}
 
 
 def _with_baselines(
