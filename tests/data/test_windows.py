@@ -157,6 +157,17 @@ def make(share):
     return make_window_buffer(data, 16, 6, labelled_share=share)
 
 
+def test_only_windows_with_a_label_on_one_frame_are_cut():
+    data = demonstrations((20, 20))
+    data["has_action"][:] = False
+    data["has_action"][[0, 4, 23, 30]] = True
+    cut = cut_windows(data, 6, pad_before=3, labelled_frame=3)
+    assert cut["has_action"][:, 3].all()
+    assert torch.equal(cut["step_count"][:, 3], data["step_count"][[0, 4, 23, 30]])
+    few = cut_windows(data, 6, pad_before=3, labelled_frame=3, most=2)
+    assert torch.equal(few["step_count"], cut["step_count"][[0, 3]])
+
+
 def test_windows_are_equally_likely():
     torch.manual_seed(0)
     data = demonstrations((16, 116))

@@ -155,6 +155,19 @@ def test_an_action_that_never_changes_is_commanded_right_whatever_is_decoded():
     assert (drawn["predicted"][:, 1] == 7.0).all()
 
 
+def test_few_of_many_labels_are_read_and_are_decoded_in_batches(monkeypatch):
+    data, episodes, wanted = counting(), range(len(LENGTHS)), Copy(2, shift=1)
+    everything = first_actions(wanted, data, episodes)
+    monkeypatch.setattr("torchrl_koap.evaluation.data_errors._BATCH", 4)
+    in_batches = first_actions(wanted, data, episodes)
+    assert all(torch.equal(part, whole) for part, whole in zip(in_batches, everything, strict=True))
+    monkeypatch.setattr("torchrl_koap.evaluation.data_errors._MOST_LABELS", 3)
+    chosen = first_actions(wanted, data, episodes)
+    total = len(everything[1])
+    rows = [0, round((total - 1) / 2), total - 1]
+    assert all(torch.equal(part, whole[rows]) for part, whole in zip(chosen, everything, strict=True))
+
+
 class Planner(nn.Module):
     """Moves by +- ``size`` per step, with a sign that the noise draws."""
 

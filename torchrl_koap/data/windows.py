@@ -239,6 +239,7 @@ def cut_windows(
     *,
     select: Sequence[NestedKey] | None = None,
     pad_before: int = 0,
+    labelled_frame: int | None = None,
     most: int | None = None,
 ) -> TensorDictBase:
     """Cuts windows of flat data at once: all, or some that are spread evenly over the data.
@@ -248,6 +249,7 @@ def cut_windows(
         window (int): frames per window.
         select (sequence of keys, optional): the entries to return. Default: all.
         pad_before (int): frames by which a window may begin before its trajectory; they repeat its first frame.
+        labelled_frame (int, optional): cut only windows with a label on this frame. Default: all.
         most (int, optional): largest number of windows. All of them take ``window`` times the memory of the data.
 
     Returns:
@@ -266,6 +268,9 @@ def cut_windows(
     """
     table = WindowTable.build(data, window, pad_before=pad_before)
     rows = torch.arange(len(table.starts), device=table.starts.device)
+    if labelled_frame is not None:
+        steps = (table.starts + labelled_frame).clamp(table.first, table.last)
+        rows = rows[data[keys.HAS_ACTION].squeeze(-1)[steps]]
     frames, padded = table.frames(rows if most is None else spread_evenly(rows, most))
     windows = (data if select is None else data.select(*select))[frames]
     return windows.set("padded", padded.unsqueeze(-1))

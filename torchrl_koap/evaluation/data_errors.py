@@ -36,6 +36,9 @@ SAMPLES = 16  # plans per situation
 SITUATIONS = 500  # scored at most
 # frames around a decoded action: enough history and look-ahead for every controller compared
 BEFORE, AFTER = 8, 11
+_MOST_LABELS = 20_000  # more of them hardly change the errors
+_ENTRIES = (STATE, ACTION, EPISODE)
+_BATCH = 2048  # windows that are decoded at once
 _MOST_FOLDS = 20  # largest number of labelled trajectories that are left out in turn
 
 
@@ -114,7 +117,7 @@ def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
 def first_actions(
     controller: nn.Module, data: TensorDictBase, episodes: Tensor | Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Decodes actions on the labelled steps of ``episodes``, the same steps for every controller.
+    """Decodes actions on at most 20,000 labelled steps of ``episodes``, the same steps for every controller.
 
     Returns predicted and true actions ``[N, act]`` in raw units, and the trajectory of every step ``[N]``.
     """
@@ -123,12 +126,13 @@ def first_actions(
     part = data[torch.isin(data[EPISODE], numbers[lengths > AFTER])]
     if not len(part):
         return data[ACTION][:0].cpu(), data[ACTION][:0].cpu(), data[EPISODE][:0].cpu()
-    windows = cut_windows(part, BEFORE + 1 + AFTER, select=[STATE, ACTION, EPISODE], pad_before=BEFORE)
-    windows = windows[windows[ACTION][:, BEFORE].isfinite().all(-1)]  # recordings may lack actions
-    past = min(controller.num_past, BEFORE)
-    states = windows[STATE][:, BEFORE - past :].to(device_of(controller))
-    predicted = controller(TensorDict({controller.in_keys[0]: states}, [len(states)]))[controller.out_keys[-1]]
-    return predicted[:, past].cpu(), windows[ACTION][:, BEFORE], windows[EPISODE][:, -1]
+    options: dict[str, Any] = {"select": _ENTRIES, "pad_before": BEFORE, "labelled_frame": BEFORE}
+    windows = cut_windows(part, BEFORE + 1 + AFTER, most=_MOST_LABELS, **options)
+    past, predicted = min(controller.num_past, BEFORE), []
+    for rows in windows[STATE][:, BEFORE - past :].split(_BATCH):
+        states = TensorDict({controller.in_keys[0]: rows.to(device_of(controller))}, [len(rows)])
+        predicted.append(controller(states)[controller.out_keys[-1]][:, past].cpu())
+    return torch.cat(predicted), windows[ACTION][:, BEFORE].cpu(), windows[EPISODE][:, -1].cpu()
 
 
 def errors_outside_budget(
@@ -207,15 +211,13 @@ def errors_of_chunks(
     """
     history, targets = policy.history, tuple(task.targets.items())
     episodes = episodes_outside(data, labelled)
-    keys = [STATE, ACTION, HAS_ACTION, EPISODE]
     now = history - 1
+    options: dict[str, Any] = {"select": _ENTRIES, "pad_before": now, "labelled_frame": now}
     outside = data[torch.isin(data[EPISODE], episodes)]
-    windows = cut_windows(outside, now + policy.horizon, select=keys, pad_before=now).cpu()
-    windows = spread_evenly(windows[windows[HAS_ACTION][:, now, 0]], SITUATIONS)
+    windows = cut_windows(outside, now + policy.horizon, most=SITUATIONS, **options).cpu()
     if not len(windows):
         return {"note": "no trajectory outside the budget has labels"}
-    known = cut_windows(labelled, history + 1, select=keys, pad_before=now).cpu()
-    known = known[known[HAS_ACTION][:, now, 0]]
+    known = cut_windows(labelled, history + 1, **options).cpu()
 
     def moved(action: Tensor, states: Tensor) -> Tensor:
         """Returns absolute actions relative to their state columns in the present frame."""

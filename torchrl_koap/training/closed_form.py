@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_koap.data.trajectories import labelled_episodes
-from torchrl_koap.data.windows import WindowTable, spread_evenly
-from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
+from torchrl_koap.data.windows import cut_windows
+from torchrl_koap.keys import ACTION, EPISODE, STATE
 from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.tasks import Task
 
@@ -26,13 +26,12 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels`.
     """
     data = data[torch.isin(data[EPISODE], labelled_episodes(data))]
-    table = WindowTable.build(data, controller.num_window_frames, pad_before=controller.num_past)
-    frames, _ = table.frames()
-    frames = spread_evenly(frames[data[HAS_ACTION].squeeze(-1)[frames[:, controller.num_past]]], MOST)
-    entries = {controller.in_key: STATE, controller.out_key: ACTION, EPISODE: EPISODE}
-    windows = TensorDict({own: data[name][frames] for own, name in entries.items()}, frames.shape)
-    mask = torch.zeros_like(frames, dtype=torch.bool)
-    mask[:, controller.num_past] = True  # other frames would use a step twice, with a clamped look-ahead
+    now, entries = controller.num_past, {controller.in_key: STATE, controller.out_key: ACTION, EPISODE: EPISODE}
+    options: dict[str, Any] = {"select": list(entries.values()), "pad_before": now, "labelled_frame": now}
+    cut = cut_windows(data, controller.num_window_frames, most=MOST, **options)
+    windows = TensorDict({own: cut[name] for own, name in entries.items()}, cut.shape)
+    mask = torch.zeros_like(cut[EPISODE], dtype=torch.bool)
+    mask[:, now] = True  # other frames would use a step twice, with a clamped look-ahead
     return controller.fit_labels(windows, mask, **known)
 
 
