@@ -31,6 +31,7 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
 from torchrl_koap.studies.study import DECIDED, Study
 
+LARGEST = 2**53  # larger whole numbers are not exact as floats
 _MAY_BE_INFINITE = ("limits",)
 AMOUNTS = ("--labels", "--labels.fraction", "--labels.count", "--labels.episodes")  # only one may be given
 Config = TypeVar("Config")
@@ -74,7 +75,7 @@ class Command:
 
 
 def check_options(options: Any) -> None:
-    """Refuses numbers that are NaN or infinite (except limits), and an ``out`` that is not writable."""
+    """Refuses numbers that are NaN, infinite (except limits) or beyond 2^53, and an ``out`` that is not writable."""
     for field in fields(options):
         value, option = getattr(options, field.name), f"--{field.name.replace('_', '-')}"
         if is_dataclass(value):
@@ -84,6 +85,8 @@ def check_options(options: Any) -> None:
                 continue
             if isinstance(number, float) and not math.isfinite(number):
                 raise ValueError(f"{option} must be a finite number, got {number}")
+            if isinstance(number, (int, float)) and abs(number) > LARGEST:
+                raise ValueError(f"{option} must be at most {LARGEST:,}, got {number:,}")
         if field.name == "out" and value is not None:
             try:
                 check_folder(value)
