@@ -127,14 +127,23 @@ def check_actions(action: Tensor, key: NestedKey, state: Tensor) -> Tensor:
     return action
 
 
-def check_window(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> None:
-    """Raises for states ``[T, d]`` of several trajectories: a flat batch of steps would be read as one window."""
+def check_window(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
+    """Returns states ``[*B, T, d]``.
+
+    Raises:
+        ValueError: if states ``[T, d]`` are of several trajectories: ``episode`` changes, or another state follows a
+            step that is done. A flat batch of steps would be read as one window.
+    """
     if state.ndim != 2 or torch.compiler.is_compiling():
-        return
-    episode = tensordict.get(EPISODE, None)
-    if episode is not None and len(episode.unique()) > 1:
-        flat = f"{key!r} {list(state.shape)} is one window, but its steps are of several trajectories ({EPISODE!r})"
+        return state
+    episode, done = tensordict.get(EPISODE, None), tensordict.get(NEXT_DONE, None)
+    several: NestedKey | None = EPISODE if episode is not None and len(episode.unique()) > 1 else None
+    if done is not None and (done.reshape(-1)[:-1] & (state[1:] != state[:-1]).any(-1)).any():
+        several = several or NEXT_DONE
+    if several is not None:
+        flat = f"{key!r} {list(state.shape)} is one window, but its steps are of several trajectories ({several!r})"
         raise ValueError(f"{flat}; reshape a flat batch, such as SliceSampler's, to [B, T]")
+    return state
 
 
 def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDictBase:

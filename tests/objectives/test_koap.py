@@ -197,11 +197,18 @@ def test_a_labelled_action_that_is_nan_gives_a_nan_loss():
 def test_a_flat_batch_of_several_trajectories_is_not_taken_for_one_window():
     network, batch = make_network(), make_batch(2)
     batch["episode"] = torch.tensor([[0] * T, [1] * T])
-    flat = TensorDict({key: value.flatten(0, 1) for key, value in batch.items()})
-    for loss in (KOAPLoss(network), LatentActionLoss(network)):
+    flat = TensorDict({key: value.flatten(0, 1) for key, value in batch.items()}, [2 * T])
+    done = torch.zeros(2, T, dtype=torch.bool)
+    done[:, -1] = True  # SliceSampler marks the last step of every slice
+    ended = flat.exclude("episode").set("next", {"done": done.reshape(-1, 1)})
+    for module in (KOAPLoss(network), LatentActionLoss(network), network, network.latent_action):
         with pytest.raises(ValueError, match=r"several trajectories \('episode'\); reshape a flat batch"):
-            loss(flat)
-        loss(batch), loss(batch[0])
+            module(flat.clone())
+        with pytest.raises(ValueError, match=r"several trajectories .*'done'"):
+            module(ended.clone())
+        module(batch.clone()), module(batch[0].clone()), module(ended[:T].clone())
+    repeated = torch.arange(T).clamp_max(T - 3)
+    network(ended[T:][repeated].set("next", {"done": (repeated == T - 3).unsqueeze(-1)}))  # padded at its end
     with pytest.raises(ValueError, match=r"several trajectories"):
         network.fit_labels(flat, flat["has_action"])
 

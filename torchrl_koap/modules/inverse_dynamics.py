@@ -170,8 +170,7 @@ class InverseDynamics(TensorDictModuleBase):
         ``read`` maps raw states ``[N, T, d]`` and a range of frames to the decoder's input ``[N, frames, m]``. Returns
         inputs ``[n, m]``, normalised actions ``[n, act]``, and trajectory numbers ``[n]``, None if unknown.
         """
-        states = read_entry(self, windows, self.in_key, "set_keys(state=...)")
-        check_window(windows, self.in_key, states)
+        states = self._read_window(windows)
         action = check_actions(read_entry(self, windows, self.out_key, "set_keys(action=...)"), self.out_key, states)
         mask, groups = frame_mask(mask, "mask", states), windows.get(EPISODE, None)
         if groups is not None:
@@ -188,10 +187,14 @@ class InverseDynamics(TensorDictModuleBase):
         action = self.normalize_action(action[:, part][mask])
         return inputs, action, None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)[mask]
 
+    def _read_window(self, tensordict: TensorDictBase) -> Tensor:
+        state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
+        return check_window(tensordict, self.in_key, state)
+
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action of every frame."""
-        state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
+        """Writes the action of every frame. Raises a ValueError for a flat batch of several trajectories."""
+        state = self._read_window(tensordict)
         return tensordict.set(self.out_key, self.raw_action(self.predict(state)))
 
 
@@ -230,7 +233,7 @@ class LatentInverseDynamics(InverseDynamics):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes latent and action of every frame."""
-        state = read_entry(self, tensordict, self.in_key, "set_keys(state=...)")
+        state = self._read_window(tensordict)
         latent = self.infer(state)
         tensordict.set(self.latent_key, latent)
         return tensordict.set(self.out_key, self.raw_action(self.decode(latent)))

@@ -121,7 +121,7 @@ class WindowLoss(NetworkLoss):
                 to or from padded frames count in no loss, labelled or not.
 
         Both masks may have a trailing 1. Reshape a flat batch ``[B * T]``, such as that of TorchRL's ``SliceSampler``,
-        to ``[B, T]``: it would be read as one window. It raises a ValueError if ``episode`` shows several trajectories.
+        to ``[B, T]``: it would be read as one window. It raises a ValueError if ``episode`` or ``done`` shows several.
         """
 
         state: NestedKey = STATE
@@ -150,8 +150,7 @@ class WindowLoss(NetworkLoss):
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Reads the raw states, and which transitions are between two recorded frames, bool ``[*B, T - 1]``."""
-        state = self._read(tensordict, "state")
-        check_window(tensordict, self.tensor_keys.state, state)
+        state = check_window(tensordict, self.tensor_keys.state, self._read(tensordict, "state"))
         return state, self._recorded(tensordict, state)
 
     def _targets(

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torchrl.modules import LSTM, MLP
 
-from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE, read_entry
+from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE, check_window, read_entry
 from torchrl_koap.modules.ridge import RidgeFit
 from torchrl_koap.modules.windows import WindowReader
 
@@ -96,8 +96,9 @@ class LatentActionModule(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the latent action of every frame of the window."""
-        return tensordict.set(self.out_keys[0], self.infer(self.gather(read_entry(self, tensordict, self.in_keys[0]))))
+        """Writes the latent action of every frame. Raises a ValueError for a flat batch of several trajectories."""
+        state = check_window(tensordict, self.in_keys[0], read_entry(self, tensordict, self.in_keys[0]))
+        return tensordict.set(self.out_keys[0], self.infer(self.gather(state)))
 
 
 class LatentActionLSTM(LatentActionModule):
