@@ -64,7 +64,9 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
     operator are used only in training, where :math:`z_{t+1} = K z_t + u_t` shapes the latent actions.
 
     The parts are TensorDictModules themselves, and each occurs once in the state dict. They read and write the entries
-    that they were made with, in the networks' units.
+    that they were made with, in the networks' units. The model does not call their ``forward``: a subclass of a part
+    overrides ``encode`` and ``decode`` (lifting), ``infer`` (latent action) or ``step`` (operator). For another decoder
+    override :meth:`decode` of the model.
 
     Args:
         latent_action (LatentActionModule): the network ``f``.

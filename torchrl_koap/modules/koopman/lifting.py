@@ -135,7 +135,8 @@ class KoopmanOperator(TensorDictModuleBase):
         input_dim (int, optional): size ``p`` of a latent action; adds the matrix ``B`` ``[m, p]``, zero at first.
             Default: no ``B``, as in the paper. With ``B`` a latent action may hold more than the next state reveals.
         in_keys (sequence of NestedKey): lifted state ``[*B, T, m]`` and latent action ``[*B, T, m or p]``.
-        out_key (NestedKey): predicted next lifted state ``[*B, T, m]``.
+        out_key (NestedKey): predicted next lifted state ``[*B, T, m]``. In a ``ModelBasedEnvBase`` of TorchRL it is
+            ``"lifted_state"``; with the default the environment ignores the prediction and stands still.
 
     Examples:
         >>> import torch
