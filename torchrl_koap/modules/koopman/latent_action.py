@@ -243,6 +243,8 @@ class LatentActionFourier(LatentActionModule):
 class LinearActionDecoder(TensorDictModuleBase):
     r"""Decodes latent actions linearly: :math:`a_t = D u_t + b`.
 
+    ``D`` is ``linear.weight``, ``[act, m]``; ``b`` is ``linear.bias``, ``[act]``.
+
     Args:
         latent_dim (int): size ``m`` of a latent action.
         action_dim (int): size of an action.

@@ -128,6 +128,8 @@ class KoopmanOperator(TensorDictModuleBase):
     .. math::
         z_{t+1} = K z_t + u_t \quad\text{or, with an input matrix,}\quad z_{t+1} = K z_t + B u_t
 
+    ``K`` is ``weight``, ``[m, m]``; ``B`` is ``input``, ``[m, p]`` or None.
+
     Args:
         latent_dim (int): size ``m`` of a lifted state (and of a latent action, without an input matrix).
 
