@@ -132,7 +132,9 @@ def test_files_that_cannot_be_used_are_named(own, trained_run, tmp_path):
         written("half", half, about): r"half \(controller\) does not fit the model: .*Missing key",
         written("wide", tensors, changed("planner", width=16)): r"wide \(planner\) does not fit .*size mismatch",
         written("lost", tensors, lost): "lost cannot be built: entry 'config' is missing",
-        written("typo", tensors, changed("planner", widht=16)): "unknown option of planner .widht.; did you mean .width.",
+        written(
+            "typo", tensors, changed("planner", widht=16)
+        ): "unknown option of planner .widht.; did you mean .width.",
         written("code", tensors, code): "code cannot be built: task 'my_arm' names code in env",
         written(
             "plugin", tensors, plugin

@@ -55,6 +55,17 @@ def expected_action(env, episode, step, interval, kind):
     return [before, x(planned_at) + 1000 * age, *following]
 
 
+class OneColumn(CountingPlanner):
+    def sample(self, history, noise=None):
+        return super().sample(history)[..., :1]
+
+
+def test_a_plan_of_fewer_columns_is_not_broadcast():
+    policy = PlanningPolicy(OneColumn(), InverseDynamicsFollower(EchoController(1), blend=0.0), state_of=(1, 2))
+    with pytest.raises(ValueError, match=r"a plan must be \[3, 6, 2\] .*, got \[3, 6, 1\]"):
+        policy.sample(torch.randn(3, 2, 2))
+
+
 def step_input(observed, **more):
     batch = observed.shape[:-2]
     init = torch.ones(*batch, 1, dtype=torch.bool)

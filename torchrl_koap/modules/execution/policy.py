@@ -64,7 +64,8 @@ class PlanningPolicy(TensorDictModuleBase):
 
     Raises:
         ValueError: for a replan interval longer than the horizon, a follower that does not support the execution, a
-            StatePlanner without follower or a DiffusionPolicy with one; at a call for another batch size or history.
+            StatePlanner without follower or a DiffusionPolicy with one; at a call for another batch size or history,
+            or a plan of another shape than ``[*B, H, d]``.
         KeyError: at a call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
 
     Examples:
@@ -181,7 +182,11 @@ class PlanningPolicy(TensorDictModuleBase):
             shape = (*states.shape[:-2], *self.noise_shape)
             noise = torch.randn(shape, dtype=states.dtype, device=states.device)
         seen = states[..., -self.planner.history :, :]
-        return self.planner.sample(seen, self.execution.temperature * noise, **options)
+        chunk = self.planner.sample(seen, self.execution.temperature * noise, **options)
+        wanted = (*seen.shape[:-2], self.planner.horizon, seen.shape[-1])
+        if self.follower is not None and chunk.shape != wanted:
+            raise ValueError(f"a plan must be {list(wanted)} ([*B, horizon, d]), got {list(chunk.shape)}")
+        return chunk
 
     def act(self, observations: Tensor, plan: Tensor, age: Tensor | int) -> Tensor:
         """Returns the action ``[*B, act]`` of a step, after command limits.
