@@ -236,6 +236,11 @@ def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):
     assert Trained.load(tmp_path / "other").task.name == "two"
     with pytest.raises(CheckpointError, match="was trained on task 'one', not on 'slow'"):
         train(TrainConfig(out=tmp_path / "wrong", dataset=str(tmp_path / "slow"), **shared))
+    names = [f"state_{column}" for column in (1, 0, 2)]  # the same name, as `koap suggest` asks for, another order
+    save_demonstrations(tmp_path / "next", states, actions, control_hz=10, name="one", state_names=names)
+    with pytest.raises(CheckpointError, match="with another state_names and control_hz than the demonstrations"):
+        train(TrainConfig(out=tmp_path / "wrong", dataset=str(tmp_path / "next"), **shared))
+    assert not (tmp_path / "wrong").exists()
 
 
 def test_a_training_leaves_the_caller_its_threads_and_random_numbers(tmp_path, demonstrations, planner):

@@ -26,7 +26,7 @@ from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, progress_bar
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import load_weights, save_tensors
+from torchrl_koap.runs.weights import CheckpointError, load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
 from torchrl_koap.training.controller import check_lengths, learn_controller
@@ -169,8 +169,14 @@ def planner_of_source(task: Task, config: TrainConfig) -> StatePlanner:
     facts, source = facts_of("planner", task, config), RunDirectory(config.planner.source)
     about, planner = source.read_json("config.json"), build_planner(task, config.planner)
     theirs = task_from(about["task"], about.get("task_definition"))
-    same = ("state_names", "state_units", "observation_origin", "control_hz", "env")
-    if all(getattr(theirs, name) == getattr(task, name) for name in same):
+    told = ("state_names", "state_units", "observation_origin", "control_hz")
+    others = [name for name in told if getattr(theirs, name) != getattr(task, name)]
+    if others and theirs.name == task.name:
+        raise CheckpointError(
+            f"the planner of {source.path} was trained with another {' and '.join(others)} than the demonstrations have"
+            " now: convert them again as then, or train without planner.source"
+        )
+    if not others and theirs.env == task.env:
         facts["task"] = theirs.name
     load_weights(source.path / "planner.safetensors", planner, facts)
     return planner
