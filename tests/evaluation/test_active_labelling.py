@@ -198,7 +198,8 @@ def test_hidden_labels_do_not_change_the_suggestions(copied_run, monkeypatch):
 
     def other_labels(*arguments, **options):
         data, task = load(*arguments, **options)
-        return data.set("action", torch.randn_like(data["action"]) * 1e3), task
+        seen = torch.isin(data["episode"], torch.tensor(first["labelled_episodes"])).unsqueeze(-1)
+        return data.set("action", torch.where(seen, data["action"], torch.randn_like(data["action"]) * 1e3)), task
 
     monkeypatch.setattr(trained, "open_dataset", other_labels)
     assert suggest(copied_run, SuggestConfig(count=6)) == first

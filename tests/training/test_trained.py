@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from offline_runs import fit_walks
+from offline_runs import fit_walks, save_arm, train_arm
 from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, load_policy
@@ -157,3 +157,15 @@ def test_what_cannot_be_saved_or_executed(own, tmp_path):
 def test_a_training_is_shown_in_one_line(own, trained_run):
     assert repr(own) == "Trained(task='my_arm', method='linear', folder=None)"
     assert repr(Trained.load(trained_run)) == f"Trained(task='avoiding', method='koap', folder='{trained_run}')"
+
+
+def test_labels_of_other_values_are_not_those_of_the_training(tmp_path):
+    arm = save_arm(tmp_path / "arm")
+    trained = Trained.load(train_arm(tmp_path / "run", arm, method="linear"))
+    data = trained.data()
+    outside = data["episode"] >= 3
+    data["action"][outside] *= -1  # these were never read
+    assert trained.hide_labels(data)[1].trajectories_touched == 3
+    data["action"][~outside] *= -1
+    with pytest.raises(RunDirectoryError, match="trajectories or labels differ; train again with it"):
+        trained.hide_labels(data)

@@ -14,7 +14,7 @@ from torch import nn
 
 from torchrl_koap.data import open_dataset
 from torchrl_koap.data.formats import find_format
-from torchrl_koap.data.label_budget import LabelReport
+from torchrl_koap.data.label_budget import LabelReport, subsample_trajectories
 from torchrl_koap.data.ted import CAMERAS, source_names
 from torchrl_koap.files import some
 from torchrl_koap.modules import Execution, ExecutionConfig, PlanningPolicy, StatePlanner, make_policy
@@ -26,7 +26,7 @@ from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, fin
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import task_from
-from torchrl_koap.training.datasets import within_budget
+from torchrl_koap.training.datasets import fingerprint, within_budget
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller, build_planner
@@ -250,10 +250,12 @@ class Trained:
         if "labels" not in self.results:
             raise RunDirectoryError(f"{self.folder}: summary.json has no entry 'labels'")
         recorded = self.results["labels"]
-        if {name: vars(report).get(name) for name in recorded} != recorded:
+        used = fingerprint(subsample_trajectories(hidden, self.config.labels.trajectories))
+        trained_on = self.folder and RunDirectory(self.folder).read_json("config.json").get("data")
+        if {name: vars(report).get(name) for name in recorded} != recorded or trained_on not in (None, used):
             raise RunDirectoryError(
                 f"the given data set is not the one that {self.folder} was trained on: its trajectories or labels"
-                " differ"
+                " differ; train again with it"
             )
         return hidden, report
 
