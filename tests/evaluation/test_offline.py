@@ -11,6 +11,7 @@ import pytest
 import torch
 from offline_runs import record, save_arm, train_arm
 
+from torchrl_koap import PlannerConfig
 from torchrl_koap.commands.cli import main
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
 from torchrl_koap.evaluation.data_errors import summarise_errors
@@ -149,6 +150,10 @@ def test_a_data_set_that_has_moved_or_changed(tmp_path):
         evaluate(run, FEW)
     moved = EvalConfig(threads=1, dataset=str(tmp_path / "elsewhere"))
     assert evaluate(run, moved)["plan_errors"]["trajectories"] == 2
+    save_arm(tmp_path / "others", joints=2, count=4)
+    taken = PlannerConfig(source=run)
+    again = train_arm(tmp_path / "again", tmp_path / "others", method="linear", planner=taken)
+    assert evaluate(again, FEW)["plan_errors"]["note"].endswith("held out from its planner are not in this data set")
     shutil.rmtree(tmp_path / "elsewhere")
     save_arm(tmp_path / "elsewhere", joints=2, labelled=4)
     with pytest.raises(RunDirectoryError, match="is not the one that .* trajectories or labels differ"):

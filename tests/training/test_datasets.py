@@ -64,6 +64,9 @@ def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
     assert held_out_by(run, data) == [8, 9]
     data["has_action"] = torch.ones_like(data["has_action"])  # labels that are added change nothing
     assert held_out_by(run, data) == [8, 9]
+    more = torch.cat([data[data["episode"] == 3], data])  # a recording that is added comes first
+    more["episode"] = torch.cat([torch.zeros(len(more) - len(data), dtype=torch.int64), data["episode"] + 1])
+    assert held_out_by(run, more) == [9, 10]
     data["state"] += 1.0  # others have these numbers now
     assert held_out_by(run, data) == []
     again = train_arm(

@@ -92,6 +92,9 @@ def _summary_of(action: Mapping[str, Any]) -> dict[str, Any]:
 def _plans(trained: Trained, data: TensorDictBase, seed: int) -> dict[str, Any]:
     if trained.planner is None:
         return {"note": f"method {trained.config.method!r} samples actions: it makes no plans"}
+    source = trained.config.planner.source
+    if not trained.held_out and source is not None and trained.config.planner.held_out:
+        return {"note": f"the recordings that {source} held out from its planner are not in this data set"}
     if not trained.held_out:
         return {"note": "no trajectory was held out from the planner (--planner.held-out; two trajectories at least)"}
     _, unseen, _ = split_held_out(data, trained.held_out)

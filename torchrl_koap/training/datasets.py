@@ -10,13 +10,14 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_koap.data.label_budget import LabelReport
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.keys import EPISODE, STATE
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import digest_of
+from torchrl_koap.runs.weights import digest_of, load_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.policy_facts import tells_commands
@@ -66,10 +67,28 @@ def held_out_facts(data: TensorDictBase, episodes: Sequence[int]) -> dict[str, A
 
 
 def held_out_by(source: Path, data: TensorDictBase) -> list[int]:
-    """Returns the numbers of the trajectories that a run's planner has never seen; none if ``data`` differ there."""
-    content = RunDirectory(source).read_json("config.json")
+    """Returns the numbers that the trajectories which a run's planner has never seen have in flat data ``[N]``.
+
+    If these numbers now mean others, they are found by their states; none if the run holds no demonstrations.
+    """
+    run = RunDirectory(source)
+    content, path = run.read_json("config.json"), run.path / "demonstrations.safetensors"
     episodes = content.get("held_out_episodes") or []
-    return episodes if held_out_facts(data, episodes).items() <= content.items() else []
+    if held_out_facts(data, episodes).items() <= content.items():
+        return episodes
+    if not path.exists():
+        return []
+    theirs = load_tensors(path)[0]
+    known, now = _by_states(theirs[EPISODE], theirs[STATE]), _by_states(data[EPISODE], data[STATE])
+    unseen = {digest for number, digest in known.items() if number in episodes}
+    return [number for number, digest in now.items() if digest in unseen]
+
+
+def _by_states(episode: Tensor, states: Tensor) -> dict[int, str]:
+    """Returns a checksum of the states ``[N, d]`` of each trajectory, by its number."""
+    numbers, lengths = episode.unique_consecutive(return_counts=True)
+    parts = states.split(lengths.tolist())
+    return {number: digest_of([("", part)]) for number, part in zip(numbers.tolist(), parts, strict=True)}
 
 
 def split_held_out(
