@@ -270,7 +270,11 @@ PARTLY = partly((20, 33, 16, 40), shown=(1, 3))
         (demonstrations((12, 3)), {"count": 1, "unit": "window"}, "longest: 12"),
         (PARTLY, {"count": 3}, "3 labelled trajectories asked for, only 2 of 4 have a label"),
         (PARTLY, {"fraction": 0.75}, "3 labelled trajectories asked for, only 2 of 4 have a label"),
-        (PARTLY, {"episodes": [2, 3]}, r"episodes \[2\] are to be labelled, but the data hold no actions for them"),
+        (
+            PARTLY,
+            {"episodes": [2, 3]},
+            r"episodes \[2\] are to be labelled, but the data hold no actions for them; .* file names: added",
+        ),
         (partly((20, 33), shown=()), {"count": 1}, "none of the 53 steps has an action: there are no labels to select"),
         (PARTLY.exclude("has_action", "action"), {"count": 1}, "no entry 'action', and thus no labels"),
     ],

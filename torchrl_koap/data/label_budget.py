@@ -219,7 +219,8 @@ def _positions(present: np.ndarray, usable: np.ndarray, wanted: tuple[int, ...])
         raise ValueError(f"there are no episodes {absent} to label; the data have {present.min()} to {present.max()}")
     unlabelled = sorted(set(wanted) - set(present[usable].tolist()))
     if unlabelled:
-        raise ValueError(f"episodes {unlabelled} are to be labelled, but the data hold no actions for them")
+        order = "episodes are counted in the order of file names: added or renamed files change their numbers"
+        raise ValueError(f"episodes {unlabelled} are to be labelled, but the data hold no actions for them; {order}")
     return np.flatnonzero(np.isin(present, wanted))
 
 
