@@ -26,6 +26,16 @@ def test_bad_liftings_are_refused():
         KoopmanLifting(3, 5).encode(torch.randn(6, 2))
 
 
+def test_a_decoded_state_of_fewer_columns_is_not_broadcast():
+    class OneColumn(KoopmanLifting):
+        def decode(self, lifted):
+            return super().decode(lifted)[..., :1]
+
+    lifting, state = OneColumn(3, 8), torch.randn(2, 5, 3)
+    with pytest.raises(ValueError, match=r"decode must return \[2, 5, 3\] .*, got \[2, 5, 1\]"):
+        lifting.reconstruction_error(lifting.encode(state), state)
+
+
 def test_linear_maps_are_the_principal_components_at_unit_spread():
     generator = torch.Generator().manual_seed(0)
     states = torch.randn(50, 16, 2, generator=generator) @ torch.randn(2, 6, generator=generator)

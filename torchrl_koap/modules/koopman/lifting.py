@@ -114,7 +114,10 @@ class KoopmanLifting(TensorDictModuleBase):
 
     def reconstruction_error(self, lifted: Tensor, state: Tensor) -> Tensor:
         """Computes the mean squared error ``[*B, T]`` of states mapped back from lifted ones ``[*B, T, m]``."""
-        return (self.decode(lifted) - state).square().mean(-1)
+        decoded = self.decode(lifted)
+        if decoded.shape != state.shape:
+            raise ValueError(f"decode must return {list(state.shape)} ([*B, T, d]), got {list(decoded.shape)}")
+        return (decoded - state).square().mean(-1)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
