@@ -126,8 +126,9 @@ def first_actions(
     part = data[torch.isin(data[EPISODE], numbers[lengths > AFTER])]
     if not len(part):
         return data[ACTION][:0].cpu(), data[ACTION][:0].cpu(), data[EPISODE][:0].cpu()
-    options: dict[str, Any] = {"select": _ENTRIES, "pad_before": BEFORE, "labelled_frame": BEFORE}
-    windows = cut_windows(part, BEFORE + 1 + AFTER, most=_MOST_LABELS, **options)
+    windows = cut_windows(
+        part, BEFORE + 1 + AFTER, select=_ENTRIES, pad_before=BEFORE, labelled_frame=BEFORE, most=_MOST_LABELS
+    )
     past, predicted = min(controller.num_past, BEFORE), []
     for rows in windows[STATE][:, BEFORE - past :].split(_BATCH):
         states = TensorDict({controller.in_keys[0]: rows.to(device_of(controller))}, [len(rows)])

@@ -27,8 +27,8 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
     """
     data = data[torch.isin(data[EPISODE], labelled_episodes(data))]
     now, entries = controller.num_past, {controller.in_key: STATE, controller.out_key: ACTION, EPISODE: EPISODE}
-    options: dict[str, Any] = {"select": list(entries.values()), "pad_before": now, "labelled_frame": now}
-    cut = cut_windows(data, controller.num_window_frames, most=MOST, **options)
+    select = list(entries.values())
+    cut = cut_windows(data, controller.num_window_frames, select=select, pad_before=now, labelled_frame=now, most=MOST)
     windows = TensorDict({own: cut[name] for own, name in entries.items()}, cut.shape)
     mask = torch.zeros_like(cut[EPISODE], dtype=torch.bool)
     mask[:, now] = True  # other frames would use a step twice, with a clamped look-ahead

@@ -176,7 +176,9 @@ def _other_frame(frames: np.ndarray, following: np.ndarray) -> int | None:
 
 
 def _shape(entry: Any) -> list[int]:
-    return list(getattr(entry, "shape", None) or ())  # groups have none
+    import h5py
+
+    return list(entry.shape or ()) if isinstance(entry, h5py.Dataset) else []
 
 
 def _number(name: str) -> tuple[int, str]:
