@@ -26,6 +26,7 @@ from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_d
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.denoisers import MLPDenoiser
 from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
+from torchrl_koap.modules.planning.object_denoiser import ObjectColumns, ObjectDenoiser
 from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.modules.planning.unet import TemporalUnet
 from torchrl_koap.modules.ridge import RidgeFit, ridge
@@ -52,6 +53,8 @@ __all__ = [
     "MLPDenoiser",
     "NonlinearInverseDynamics",
     "Normalizer",
+    "ObjectColumns",
+    "ObjectDenoiser",
     "PlanningPolicy",
     "PolicyEnv",
     "PrincipalInverseDynamics",

@@ -67,8 +67,9 @@ class PlannerConfig:
 
     Attributes:
         steps: updates at most.
-        network: "unet", "mlp" or one that a plugin registers.
-        width: channels of the first level of "unet" (the second has twice as many), or hidden width of "mlp".
+        network: "unet", "mlp", "objects" (for tasks with bodies in their state) or one that a plugin registers.
+        width: channels of the first level of "unet" (the second has twice as many), hidden width of "mlp", or width of
+            a token of "objects".
         octaves: octaves of the Fourier features of the observed states; 0: the states themselves.
         batch_size: windows per update.
         learning_rate: peak learning rate.

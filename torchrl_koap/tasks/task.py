@@ -254,12 +254,12 @@ class Task(Columns):
 
     def interchangeable_columns(self) -> list[list[list[int]]]:
         """Returns the state columns of the bodies that may be permuted, by group and body."""
+        return [[self.body_columns(name) for name in group] for group in self.interchangeable if len(group) > 1]
 
-        def columns_of(name: str) -> list[int]:
-            parts = [part for part in self.state_slices if part.startswith(f"{name}_")]
-            return [column for part in parts for column in range(self.state_dim)[self.state_slices[part]]]
-
-        return [[columns_of(name) for name in group] for group in self.interchangeable if len(group) > 1]
+    def body_columns(self, name: str) -> list[int]:
+        """Returns the state columns of a body: those of the parts whose names begin with its name."""
+        parts = [part for part in self.state_slices if part.startswith(f"{name}_")]
+        return [column for part in parts for column in range(self.state_dim)[self.state_slices[part]]]
 
     def planar_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Returns the state columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` of ``planar_parts``."""

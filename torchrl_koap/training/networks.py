@@ -11,7 +11,16 @@ from torch import nn
 
 from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import PRESETS, DiffusionPolicy, MLPDenoiser, Normalizer, StatePlanner, TemporalUnet
+from torchrl_koap.modules import (
+    PRESETS,
+    DiffusionPolicy,
+    MLPDenoiser,
+    Normalizer,
+    ObjectColumns,
+    ObjectDenoiser,
+    StatePlanner,
+    TemporalUnet,
+)
 from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig
 from torchrl_koap.tasks import HORIZON, Task
@@ -29,6 +38,7 @@ def _unet(columns: int, condition_dim: int, *, width: int, frequencies: int, hor
 NETWORKS: dict[str, dict[str, Any]] = {
     "unet": {"build": _unet, "width": 64, "octaves": 4, "batch_size": 128, "learning_rate": 3e-3},
     "mlp": {"build": MLPDenoiser, "width": 512, "octaves": 1, "batch_size": 512, "learning_rate": 1e-3},
+    "objects": {"build": ObjectDenoiser, "width": 192, "octaves": 1, "batch_size": 256, "learning_rate": 2e-3},
 }
 
 
@@ -62,28 +72,49 @@ def register_network(name: str, build: Callable[..., nn.Module], **defaults: flo
 
 def build_planner(task: Task, section: PlannerConfig) -> StatePlanner:
     """Builds a planner of states without statistics, from a section with all defaults filled in."""
-    return StatePlanner(**_diffusion(task, section, task.state_dim))
+    return StatePlanner(**_diffusion(task, section, plans=True))
 
 
 def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
     """Builds a Diffusion Policy with the network of :func:`build_planner`, without statistics."""
-    return DiffusionPolicy(action_dim=task.action_dim, **_diffusion(task, section, task.action_dim))
+    return DiffusionPolicy(action_dim=task.action_dim, **_diffusion(task, section, plans=False))
 
 
-def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
-    """Returns the arguments that planner and Diffusion Policy share; the denoiser's sequences have ``size`` columns."""
+def _diffusion(task: Task, section: PlannerConfig, *, plans: bool) -> dict[str, Any]:
+    """Returns the arguments that planner and Diffusion Policy share; sequences are ``plans`` or actions."""
     build = lookup(NETWORKS, section.network, "planner.network")["build"]
     pairs = task.relative_columns()
     features = RelativePositionFeatures(pairs) if pairs else None
     seen = section.frames * task.state_dim + (0 if features is None else features.num_features)
+    sizes: dict[str, Any] = {"width": section.width, "frequencies": section.octaves, "horizon": HORIZON}
+    if build is ObjectDenoiser:
+        sizes["objects"] = _objects(task, section.frames, plans=plans)
     return {
-        "denoiser": build(size, seen, width=section.width, frequencies=section.octaves, horizon=HORIZON),
+        "denoiser": build(task.state_dim if plans else task.action_dim, seen, **sizes),
         "state_dim": task.state_dim,
         "history": section.frames,
         "horizon": HORIZON,
         "relative": task.defaults.relative,
         "features": features,
     }
+
+
+def _objects(task: Task, frames: int, *, plans: bool) -> list[ObjectColumns]:
+    """Returns the columns of the bodies in the state; a relative position belongs to the only body that it names."""
+    own = {name: columns for name in task.objects if (columns := task.body_columns(name))}
+    if not own:
+        raise ValueError(f"planner.network 'objects': no body of task {task.name!r} is in the state; use 'mlp'")
+    seen = {name: [frame * task.state_dim + c for frame in range(frames) for c in own[name]] for name in own}
+    start = frames * task.state_dim
+    for parts, pair in zip(task.relative_positions, task.relative_columns(), strict=True):
+        stop = start + RelativePositionFeatures([pair]).num_features
+        owners = [name for name in own if any(part.startswith(f"{name}_") for part in parts)]
+        if len(owners) == 1:
+            seen[owners[0]] += range(start, stop)
+        start = stop
+    alike = dict.fromkeys(next((group for group in task.interchangeable if name in group), (name,)) for name in own)
+    kinds = {name: kind for kind, group in enumerate(alike) for name in group}
+    return [ObjectColumns(own[name] if plans else (), seen[name], kinds[name]) for name in own]
 
 
 def build_controller(
@@ -111,12 +142,15 @@ def build_controller(
 def sizes_of(planner: StatePlanner) -> dict[str, Any]:
     """Returns the options that a planner was built with; a ValueError if its network is not of this library."""
     network = planner.denoiser
-    unet = isinstance(network, TemporalUnet)
-    if not isinstance(network, TemporalUnet | MLPDenoiser):
+    if isinstance(network, TemporalUnet):
+        name, width, encoder = "unet", network.shrink[0].out_channels, network.encoder
+    elif isinstance(network, MLPDenoiser):
+        name, width, encoder = "mlp", network.first.out_features, network.encoder
+    elif isinstance(network, ObjectDenoiser):
+        name, width, encoder = "objects", network.width, network.robot_encoder
+    else:
         raise ValueError(
             f"planner: its denoiser is a {type(network).__name__}: register it (register_network), and name it as"
             ' {"network": NAME} instead'
         )
-    width = network.shrink[0].out_channels if unet else network.first.out_features
-    octaves = len(network.encoder.frequencies)
-    return {"network": "unet" if unet else "mlp", "width": width, "octaves": octaves, "frames": planner.history}
+    return {"network": name, "width": width, "octaves": len(encoder.frequencies), "frames": planner.history}

@@ -14,12 +14,15 @@ from torchrl_koap.modules.planning.denoisers import (
     RelativePositionFeatures,
     StepEmbedding,
 )
+from torchrl_koap.modules.planning.object_denoiser import ObjectColumns, ObjectDenoiser
 from torchrl_koap.modules.planning.unet import TemporalUnet
 from torchrl_koap.tasks import TASKS, get_task
 
+BOXES = [ObjectColumns([1], [1, 4]), ObjectColumns([2], [2, 5], 1)]
 MAKERS = {
     "unet": lambda **options: TemporalUnet(3, 6, channels=(16, 32), **options),
     "mlp": lambda **options: MLPDenoiser(3, 6, horizon=14, width=32, **options),
+    "objects": lambda **options: ObjectDenoiser(3, 6, horizon=14, width=32, objects=BOXES, **options),
 }
 DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
 

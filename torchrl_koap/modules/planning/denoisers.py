@@ -49,32 +49,26 @@ class ConditionEncoder(nn.Module):
         )
 
     def forward(self, condition: Tensor) -> Tensor:
-        """Maps conditions ``[B, c]`` to embeddings ``[B, width]``."""
-        angles = (condition[:, :, None] * self.frequencies).flatten(1)
+        """Maps conditions ``[*B, c]`` to embeddings ``[*B, width]``."""
+        angles = (condition.unsqueeze(-1) * self.frequencies).flatten(-2)
         return self.network(torch.cat([condition, angles.sin(), angles.cos()], -1))
 
 
 class Denoiser(nn.Module):
-    """Base class of denoisers: checks inputs, flattens batches, embeds time and condition. A subclass denoises.
+    """Base class of denoisers: checks inputs, flattens batches, embeds the time. A subclass denoises.
 
     Args:
         state_dim (int): number ``d`` of state columns.
         condition_dim (int): number ``c`` of condition columns.
-
-    Keyword Args:
-        frequencies (int): octaves of the condition's Fourier features.
-        condition_width (int): width ``w`` of the :class:`ConditionEncoder`.
     """
 
-    def __init__(self, state_dim: int, condition_dim: int, *, frequencies: int, condition_width: int):
+    def __init__(self, state_dim: int, condition_dim: int):
         super().__init__()
         self.state_dim, self.condition_dim = state_dim, condition_dim
         self.step_embedding = StepEmbedding(EMBEDDING_DIM)
-        self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=condition_width)
-        self.context_dim = EMBEDDING_DIM + condition_width
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
-        """Predicts ``[N, H, d]`` from sequences ``[N, H, d]``, embedded steps ``[N, 32]`` and conditions ``[N, w]``."""
+        """Predicts ``[N, H, d]`` from sequences ``[N, H, d]``, embedded steps ``[N, 32]`` and conditions ``[N, c]``."""
         raise NotImplementedError
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
@@ -88,7 +82,7 @@ class Denoiser(nn.Module):
         if condition.shape != wanted:
             raise ValueError(f"condition must be {list(wanted)} ([*B, condition_dim]), got {list(condition.shape)}")
         x, condition = sequence.reshape(-1, *sequence.shape[-2:]), condition.reshape(-1, self.condition_dim)
-        return self.denoise(x, self.step_embedding(time.reshape(-1)), self.encoder(condition)).reshape(sequence.shape)
+        return self.denoise(x, self.step_embedding(time.reshape(-1)), condition).reshape(sequence.shape)
 
 
 class MLPDenoiser(Denoiser):
@@ -123,9 +117,10 @@ class MLPDenoiser(Denoiser):
         depth: int = 4,
         frequencies: int = 1,
     ):
-        super().__init__(state_dim, condition_dim, frequencies=frequencies, condition_width=width)
+        super().__init__(state_dim, condition_dim)
+        self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=width)
         self.horizon = horizon
-        self.first = nn.Linear(horizon * state_dim + self.context_dim, width)
+        self.first = nn.Linear(horizon * state_dim + width + EMBEDDING_DIM, width)
         self.layers = nn.ModuleList(
             nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
             for _ in range(depth)
@@ -136,7 +131,7 @@ class MLPDenoiser(Denoiser):
         """Predicts ``[N, H d]`` from sequences ``[N, H, d]`` (:meth:`Denoiser.denoise`)."""
         if x.shape[1] != self.horizon:
             raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {x.shape[1]}")
-        x = self.first(torch.cat([x.flatten(1), condition, step], -1))
+        x = self.first(torch.cat([x.flatten(1), self.encoder(condition), step], -1))
         for layer in self.layers:
             x = x + layer(x)
         return self.last(x)

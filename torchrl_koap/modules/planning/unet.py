@@ -9,9 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrl_koap.modules.planning.denoisers import Denoiser
+from torchrl_koap.modules.planning.denoisers import EMBEDDING_DIM, ConditionEncoder, Denoiser
 
 KERNEL, GROUPS = 5, 8  # width of the convolutions in steps; groups of the group norm
+CONDITION = 128  # width of the embedded condition
 
 
 class TemporalUnet(Denoiser):
@@ -39,7 +40,8 @@ class TemporalUnet(Denoiser):
     """
 
     def __init__(self, state_dim: int, condition_dim: int, *, channels: Sequence[int] = (32, 64), frequencies: int = 4):
-        super().__init__(state_dim, condition_dim, frequencies=frequencies, condition_width=128)
+        super().__init__(state_dim, condition_dim)
+        self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=CONDITION)
         channels = tuple(channels)
         if not channels or any(width < 1 or width % GROUPS for width in channels):
             raise ValueError(f"channels must be multiples of {GROUPS}, got {channels}")
@@ -65,7 +67,7 @@ class TemporalUnet(Denoiser):
         )
         # One matrix product serves the FiLM of all blocks: at batch size 1 the number of calls determines the time.
         self._film_sizes = [2 * stage.width for (stage,) in (*self.down, self.middle, *self.up)]
-        self.film = nn.Sequential(nn.SiLU(), nn.Linear(self.context_dim, sum(self._film_sizes)))
+        self.film = nn.Sequential(nn.SiLU(), nn.Linear(EMBEDDING_DIM + CONDITION, sum(self._film_sizes)))
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
         """Predicts ``[N, H, d]`` from sequences ``[N, H, d]`` (:meth:`Denoiser.denoise`)."""
@@ -74,7 +76,7 @@ class TemporalUnet(Denoiser):
         surplus = -horizon % self.multiple
         if surplus:
             x = F.pad(x, (0, surplus), mode="replicate")
-        film = self.film(torch.cat([step, condition], -1))
+        film = self.film(torch.cat([step, self.encoder(condition)], -1))
         films = iter(film.unsqueeze(-1).split(self._film_sizes, 1))
 
         kept = []
