@@ -89,8 +89,10 @@ class TestThePlanner:
         assert resolved("stacking", planner=PlannerConfig(width=64)).planner.width == 64
         assert resolved().planner.width == 32
 
-    def test_of_a_network_that_samples_actions_sees_two_frames(self):
-        assert resolved("sorting", "dp").planner.frames == 2 and resolved("sorting").planner.frames == 1
+    def test_of_a_network_that_samples_actions_sees_two_frames_and_has_no_objects(self):
+        actions, plans = (resolved("sorting", method).planner for method in ("dp", "koap"))
+        assert (actions.frames, actions.network, actions.batch_size) == (2, "mlp", 512)
+        assert (plans.frames, plans.network, plans.batch_size) == (1, "objects", 256)
         for name, value in {"source": "run", "held_out": 0.5, "frames": 1}.items():
             with pytest.raises(ValueError, match=f"planner.{name}: method 'dp' samples actions and has no planner"):
                 resolved(method="dp", planner=PlannerConfig(**{name: value}))
@@ -135,6 +137,7 @@ class TestExecution:
         assert execution("avoiding", "koap_paper", blend=0.5).blend == 0.5
         assert execution("po_sorting").gain > 1 and execution("po_sorting", "mpc").gain == 1
         assert execution("avoiding", "dp").strategy == "open_loop"
+        assert (execution("sorting").temperature, execution("sorting", "dp").temperature) == (0.5, 1.0)
 
     def test_of_ones_own_data_follows_plans_near_their_mean(self):
         _, task = make_demonstrations([[[0.0, 0.0]] * 20], control_hz=30, action_dim=2)

@@ -70,10 +70,10 @@ def _planner(asked: PlannerConfig, method: Method, task: Task) -> PlannerConfig:
     if asked.source is not None:
         return _taken_over(asked)
     own, usual = dict(task.defaults.planner), OWN_DATA if task.env is None else {"network": "unet"}
+    if not method.plans:
+        own |= {"frames": HISTORY, "held_out": 0.0} | ({"network": "mlp"} if own.get("network") == "objects" else {})
     theirs = own.get("network", usual["network"])
     network = asked.network or theirs
-    if not method.plans:
-        own |= {"frames": HISTORY, "held_out": 0.0}
     layers = [own if network == theirs else _unsized(own), usual if network == usual["network"] else _unsized(usual)]
     library = {"steps": 12000, "frames": HISTORY, "held_out": 0.0, "network": network}
     return reduce(fill_in, [*layers, lookup(NETWORKS, network, "planner.network"), library], asked)
@@ -120,10 +120,10 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
 
 def _execution(asked: ExecutionConfig, method: Method, task: Task, preset: str) -> ExecutionConfig:
     own = ({"temperature": OWN_TEMPERATURE} if task.env is None else {}) | dict(task.defaults.execution)
+    if not method.plans:  # the temperature of a task with an environment is that of its planner
+        own |= {"strategy": "open_loop"} | ({} if task.env is None else {"temperature": 1.0})
     if asked.strategy == "oracle":
         raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
-    if not method.plans:
-        own["strategy"] = "open_loop"
     own |= method.execution
     usual = Execution().replaced(**own)
     method.check_execution(asked, usual)
