@@ -92,6 +92,7 @@ def publish(run: str | Path, folder: str | Path, card: str) -> Path:
     folder = Path(folder)
     (folder / "config.json").unlink(missing_ok=True)  # replaces an earlier policy of that name
     folder = copy_run(run, folder)
+    (folder / "demonstrations.safetensors").unlink(missing_ok=True)  # 40 MB for Sorting; recorded again by the card
     published = RunDirectory(folder)
     config = published.read_json("config.json")
     places = {name: Path(config[name]).name for name in PLACES if config.get(name) is not None}
