@@ -319,11 +319,11 @@ def _check_networks(study: Study, cell: Cell) -> None:
     if config.planner.source is not None and study.given_planner(cell.task) is None:  # not trained yet
         config = replace(config, planner=study.planner)
     config = resolve(config, task)
+    if config.planner.source is not None:
+        planner_of_source(task, config)
     try:
         networks = build_networks(task, config)
     except ValueError as error:
         read = f"the columns {config.controller.columns!r} of " if get_method(cell.method).plans else ""
         raise ValueError(f"method {cell.method!r} cannot read {read}task {task.name!r}: {error}") from error
-    if config.planner.source is not None:
-        planner_of_source(task, config)
     trained_policy(Trained(task, config, *networks), study.evaluation.execution)

@@ -156,9 +156,9 @@ def _check_networks(task: Task, config: TrainConfig) -> None:
     """Raises, before any work, if networks cannot read the task's state or weights of ``planner.source`` do not fit."""
     done = config.run.resume and (config.out / "planner.safetensors").exists()
     with torch.random.fork_rng(devices=[]):
-        build_networks(task, config)
         if config.planner.source is not None and not done:
             planner_of_source(task, config)
+        build_networks(task, config)
 
 
 def planner_of_source(task: Task, config: TrainConfig) -> StatePlanner:
@@ -167,7 +167,7 @@ def planner_of_source(task: Task, config: TrainConfig) -> StatePlanner:
     A CheckpointError names what does not fit.
     """
     facts, source = facts_of("planner", task, config), RunDirectory(config.planner.source)
-    about, planner = source.read_json("config.json"), build_planner(task, config.planner)
+    about = source.read_json("config.json")
     theirs = task_from(about["task"], about.get("task_definition"))
     told = ("state_names", "state_units", "observation_origin", "control_hz")
     others = [name for name in told if getattr(theirs, name) != getattr(task, name)]
@@ -176,9 +176,10 @@ def planner_of_source(task: Task, config: TrainConfig) -> StatePlanner:
             f"the planner of {source.path} was trained with another {' and '.join(others)} than the demonstrations have"
             " now: convert them again as then, or train without planner.source"
         )
-    if not others and theirs.env == task.env:
-        facts["task"] = theirs.name
-    load_weights(source.path / "planner.safetensors", planner, facts)
+    if theirs.name != task.name and (others or theirs.env != task.env):
+        raise CheckpointError(f"{source.path} was trained on task {theirs.name!r}, not on {task.name!r}")
+    planner = build_planner(task, config.planner)
+    load_weights(source.path / "planner.safetensors", planner, facts | {"task": theirs.name})
     return planner
 
 

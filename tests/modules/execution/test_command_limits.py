@@ -118,7 +118,7 @@ def test_a_trained_policy_has_the_limits_of_its_task_by_default(tmp_path):
     assert policy.limits.lead == policy.execution.lead == 0.1
     assert load_policy("pretrained:sorting", lead=0.0, limits=math.inf).limits is None
     saved = Trained.load("pretrained:sorting").save(tmp_path / "policy.safetensors")
-    assert load_policy(saved, gain=1.2).execution == Execution(lead=0.1, gain=1.2)
+    assert load_policy(saved, gain=1.2).execution == Execution(lead=0.1, gain=1.2, temperature=0.5)
     assert load_policy(saved, lead=0.0, gain=1.0, limits=math.inf).limits is None
 
 
