@@ -17,7 +17,7 @@ from torchrl_koap.modules.planning.denoisers import EMBEDDING_DIM, ConditionEnco
 class ObjectColumns(NamedTuple):
     """Columns of one object for :class:`ObjectDenoiser`.
 
-    Attributes:
+    Args:
         sequence (sequence of int): its columns in sequences, ascending; empty if these are actions.
         condition (sequence of int): its columns in conditions, ascending.
         kind (int): its kind, counted from 0.
