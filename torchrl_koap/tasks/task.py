@@ -257,9 +257,13 @@ class Task(Columns):
         return [[self.body_columns(name) for name in group] for group in self.interchangeable if len(group) > 1]
 
     def body_columns(self, name: str) -> list[int]:
-        """Returns the state columns of a body: those of the parts whose names begin with its name."""
-        parts = [part for part in self.state_slices if part.startswith(f"{name}_")]
-        return [column for part in parts for column in range(self.state_dim)[self.state_slices[part]]]
+        """Returns the state columns of a body."""
+        parts = (self.state_slices[part] for part in self.body_parts(name))
+        return [column for part in parts for column in range(part.start, part.stop)]
+
+    def body_parts(self, name: str) -> list[str]:
+        """Returns the parts of the state that belong to a body: their names begin with its name."""
+        return [part for part in self.state_slices if part.startswith(f"{name}_")]
 
     def planar_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Returns the state columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` of ``planar_parts``."""

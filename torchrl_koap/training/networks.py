@@ -108,7 +108,7 @@ def _objects(task: Task, frames: int, *, plans: bool) -> list[ObjectColumns]:
     start = frames * task.state_dim
     for parts, pair in zip(task.relative_positions, task.relative_columns(), strict=True):
         stop = start + RelativePositionFeatures([pair]).num_features
-        owners = [name for name in own if any(part.startswith(f"{name}_") for part in parts)]
+        owners = [name for name in own if not set(parts).isdisjoint(task.body_parts(name))]
         if len(owners) == 1:
             seen[owners[0]] += range(start, stop)
         start = stop

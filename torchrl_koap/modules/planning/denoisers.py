@@ -60,11 +60,14 @@ class Denoiser(nn.Module):
     Args:
         state_dim (int): number ``d`` of state columns.
         condition_dim (int): number ``c`` of condition columns.
+
+    Keyword Args:
+        horizon (int, optional): number ``H`` of steps that a sequence must have. Default: any.
     """
 
-    def __init__(self, state_dim: int, condition_dim: int):
+    def __init__(self, state_dim: int, condition_dim: int, *, horizon: int | None = None):
         super().__init__()
-        self.state_dim, self.condition_dim = state_dim, condition_dim
+        self.state_dim, self.condition_dim, self.horizon = state_dim, condition_dim, horizon
         self.step_embedding = StepEmbedding(EMBEDDING_DIM)
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
@@ -78,6 +81,8 @@ class Denoiser(nn.Module):
         """
         if sequence.ndim < 2 or sequence.shape[-1] != self.state_dim:
             raise ValueError(f"sequence must be [*B, H, {self.state_dim}] (state_dim), got {list(sequence.shape)}")
+        if self.horizon not in (None, sequence.shape[-2]):
+            raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {sequence.shape[-2]}")
         wanted = (*sequence.shape[:-2], self.condition_dim)
         if condition.shape != wanted:
             raise ValueError(f"condition must be {list(wanted)} ([*B, condition_dim]), got {list(condition.shape)}")
@@ -117,9 +122,8 @@ class MLPDenoiser(Denoiser):
         depth: int = 4,
         frequencies: int = 1,
     ):
-        super().__init__(state_dim, condition_dim)
+        super().__init__(state_dim, condition_dim, horizon=horizon)
         self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=width)
-        self.horizon = horizon
         self.first = nn.Linear(horizon * state_dim + width + EMBEDDING_DIM, width)
         self.layers = nn.ModuleList(
             nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
@@ -129,8 +133,6 @@ class MLPDenoiser(Denoiser):
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
         """Predicts ``[N, H d]`` from sequences ``[N, H, d]`` (:meth:`Denoiser.denoise`)."""
-        if x.shape[1] != self.horizon:
-            raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {x.shape[1]}")
         x = self.first(torch.cat([x.flatten(1), self.encoder(condition), step], -1))
         for layer in self.layers:
             x = x + layer(x)

@@ -68,20 +68,18 @@ class ObjectDenoiser(Denoiser):
         depth: int = 3,
         frequencies: int = 1,
     ):
-        super().__init__(state_dim, condition_dim)
+        super().__init__(state_dim, condition_dim, horizon=horizon)
         sizes = {(len(each.sequence), len(each.condition)) for each in objects}
         if len(sizes) != 1:
             raise ValueError(f"objects must have equally many columns, got {sorted(sizes)} (of sequences, conditions)")
         ((own_planned, own_seen),) = sizes
-        robot = [
-            [column for column in range(total) if column not in set(chain.from_iterable(owned))]
-            for total, owned in zip((state_dim, condition_dim), list(zip(*objects, strict=True))[:2], strict=True)
-        ]
-        planned, seen = map(len, robot)
-        self.horizon, self.width = horizon, width
+        sequences, conditions = [each.sequence for each in objects], [each.condition for each in objects]
+        robot_sequence, robot_condition = _others(state_dim, sequences), _others(condition_dim, conditions)
+        planned, seen = len(robot_sequence), len(robot_condition)
+        self.width = width
         # slices: lists of columns would be copied to a GPU in each call
-        self.planned = [_slices(columns) for columns in (robot[0], *(each.sequence for each in objects))]
-        self.seen = [_slices(columns) for columns in (robot[1], *(each.condition for each in objects))]
+        self.planned = [_slices(columns) for columns in (robot_sequence, *sequences)]
+        self.seen = [_slices(columns) for columns in (robot_condition, *conditions)]
         self.kind_of = [each.kind for each in objects]
         self.kinds = nn.ParameterList(torch.randn(width) for _ in range(1 + max(self.kind_of)))
         self.robot_plan = nn.Linear(horizon * planned, width)
@@ -96,8 +94,6 @@ class ObjectDenoiser(Denoiser):
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
         """Predicts ``[N, H, d]`` from sequences ``[N, H, d]`` (:meth:`Denoiser.denoise`)."""
-        if x.shape[1] != self.horizon:
-            raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {x.shape[1]}")
         plan, *plans = (_take(x, columns).flatten(1) for columns in self.planned)
         seen, *views = (_take(condition, columns) for columns in self.seen)
         robot = self.robot_plan(plan) + self.robot_encoder(seen)
@@ -132,6 +128,12 @@ class _Layer(nn.Module):
         robot, objects = x[:, 0], x[:, 1:]
         shared = self.shared(torch.cat([robot, objects.mean(1), objects.amax(1)], -1))
         return tokens + self.last(F.silu(self.own(x) + shared.unsqueeze(1)))
+
+
+def _others(total: int, owned: Sequence[Sequence[int]]) -> list[int]:
+    """Returns the columns out of ``total`` that no object owns."""
+    taken = set(chain.from_iterable(owned))
+    return [column for column in range(total) if column not in taken]
 
 
 def _slices(columns: Sequence[int]) -> list[slice]:
