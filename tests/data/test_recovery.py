@@ -58,7 +58,8 @@ def test_joints_follow_the_shifted_tool_and_return_with_it():
     bent = torch.tensor([0.0, 0.3, 0.0, -2.0, 0.0, 2.2, 0.8], dtype=torch.float64)  # rad, over a table
     joints = bent + 0.1 * torch.rand(30, 16, 7, dtype=torch.float64)
     state = torch.cat([joints, torch.rand(30, 16, 1).double(), tool_position(joints)], -1)
-    augment = RecoveryAugmentation(0.02, columns=range(7), tool=(8, 9, 10), kinematics=tool_position)
+    sizes = torch.tensor([0.0] * 8 + [0.02] * 3)
+    augment = RecoveryAugmentation(sizes, columns=range(7), tool=(8, 9, 10), kinematics=tool_position)
     found = augment(TensorDict({"state": state.clone()}, [30]))["state"]
     torch.testing.assert_close(found[..., 8:], tool_position(found[..., :7]))
     assert torch.equal(found[..., 7], state[..., 7])
@@ -69,6 +70,20 @@ def test_joints_follow_the_shifted_tool_and_return_with_it():
     moved = (found - state)[:, 1, :7]
     idle = moved - (torch.linalg.pinv(jacobian) @ jacobian @ moved[..., None])[..., 0]
     assert idle.norm(dim=-1).max() < 1e-4 * moved.norm(dim=-1).mean()
+
+
+def test_a_shift_of_the_joints_turns_the_tool_and_moves_it_only_as_drawn():
+    torch.manual_seed(0)
+    joints = torch.tensor([0.0, 0.3, 0.0, -2.0, 0.0, 2.2, 0.8]).double().expand(400, 16, 7)
+    state = torch.cat([joints, tool_position(joints)], -1)
+    augment = RecoveryAugmentation(
+        torch.tensor([0.1] * 7 + [0.004] * 3), columns=range(7), tool=(7, 8, 9), kinematics=tool_position
+    )
+    found = augment(TensorDict({"state": state.clone()}, [400]))["state"]
+    torch.testing.assert_close(found[..., 7:], tool_position(found[..., :7]))
+    away = (found - state)[:, 1].square().mean(0).sqrt()
+    assert (away[7:] < 0.008).all()  # m; the joints alone would move it by centimetres
+    assert 0.1 < away[6] < 0.13  # rad; the last joint turns the tool where it is
 
 
 def changed(widths, share=1.0, **options):

@@ -41,12 +41,13 @@ class RecoveryAugmentation(TensorDictModuleBase):
     the robot is already returning, as in later control steps: :math:`x'_{t-j} = x_{t-j} + \rho^{-j} \delta`. Choose
     this for smooth motions: where position determines velocity, a velocity that does not fit reveals the shift.
 
-    For a redundant arm the shift is drawn at the tool; the joints follow with least motion,
-    :math:`\delta = J(x_t)^+ \delta_{tool}`.
+    For a redundant arm, shifts are drawn for tool and joints. The joints take the shift nearest to theirs that moves
+    the tool by its own, :math:`\delta = \epsilon + J(x_t)^+ (\delta_{tool} - J(x_t) \epsilon)`; it turns the tool and
+    the elbow. Without it, planners tend to continue the turn that the arm has begun.
 
     Args:
         sigma (float or Tensor): typical size of the shift in the units of the state, for all columns or for each,
-            ``[d]``; with ``tool`` that of the tool (m).
+            ``[d]``.
 
     Keyword Args:
         history (int): observed frames of the window. Defaults to ``2``.
@@ -125,7 +126,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], shifted)
 
     def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
-        """Sets the joint columns of shifts ``[*B, 1, d]`` to the least motion that moves the tool by its columns."""
+        """Corrects the joint columns of shifts ``[*B, 1, d]`` so that they move the tool by its columns."""
         if self.tool is None:
             return shift
         joints = state[..., self.history - 1, self.columns]
@@ -133,7 +134,9 @@ class RecoveryAugmentation(TensorDictModuleBase):
         ends = (self.kinematics(joints.unsqueeze(-2) + sign * steps) for sign in (1, -1))  # each [*B, J, 3]
         jacobian = torch.sub(*ends).mT / (2 * _DIFFERENCE)  # [*B, 3, J]
         damped = jacobian @ jacobian.mT + _DAMPING * torch.eye(3, dtype=joints.dtype, device=joints.device)
-        follow = jacobian.mT @ torch.linalg.solve(damped, shift[..., 0, self.tool].unsqueeze(-1))
+        drawn = shift[..., 0, self.columns].unsqueeze(-1)
+        missing = shift[..., 0, self.tool].unsqueeze(-1) - jacobian @ drawn
+        follow = drawn + jacobian.mT @ torch.linalg.solve(damped, missing)
         return shift.index_copy(-1, torch.tensor(self.columns, device=shift.device), follow.mT)
 
 

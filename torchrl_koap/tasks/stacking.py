@@ -103,8 +103,9 @@ _STACKING = register_task(
         defaults=Defaults(
             method="mpc",
             demonstrations=1000,
-            planner={"steps": 18000, "network": "mlp"},
+            planner={"steps": 16000, "network": "objects", "frames": 1},
             recovery=0.004,
+            joint_recovery=0.03,  # else the plan turns on as the arm has begun to, whichever way that is
             commands=True,  # joints follow their commands in the same way in all poses
         ),
     )
@@ -136,6 +137,7 @@ register_task(
         defaults=replace(
             _STACKING.defaults,
             method="koap",
+            planner={"steps": 18000, "network": "mlp"},
             controller={"preset": "scene", "columns": "related", "steps": 3000},
         ),
     )

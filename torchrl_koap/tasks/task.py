@@ -40,6 +40,8 @@ class Defaults:
         relative (bool): plans are displacements from the present state.
         recovery (float, optional): typical shift of the recovery augmentation, in the units of the robot's columns.
             Default: the usual change of each column in a control step.
+        joint_recovery (float): typical size of the shift drawn in the joints (rad), if ``tool_kinematics`` are given;
+            ``recovery`` is then that of the tool (m).
         neighbor_recovery (float): largest displacement of a window towards the nearest other one, as a share of their
             difference; used if no column is a position that could be shifted.
         planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Sizes apply only to the network given here;
@@ -55,6 +57,7 @@ class Defaults:
     disturbance: float = 0.0
     relative: bool = True
     recovery: float | None = None
+    joint_recovery: float = 0.0
     neighbor_recovery: float = 0.0
     planner: Mapping[str, Any] = field(default_factory=dict)
     controller: Mapping[str, Any] = field(default_factory=dict)
