@@ -73,7 +73,8 @@ def fit(
             :class:`~torchrl_koap.PlannerConfig` such as ``{"steps": 5000}``; False trains a controller alone. Default:
             the task's options.
         controller (mapping, optional): options of :class:`~torchrl_koap.ControllerConfig`.
-        seed (int): seed of initialisation and batches; torch's generators and threads are restored afterwards.
+        seed (int): seed of initialisation and batches. Training takes one thread unless ``OMP_NUM_THREADS`` is set;
+            torch's generators and threads are restored afterwards.
         device (str): ``"cpu"`` or ``"cuda"``.
         precision (str): number type of the planner's matrix products, see :class:`~torchrl_koap.RunConfig`.
         progress (bool): show progress bars.
