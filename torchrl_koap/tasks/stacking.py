@@ -107,6 +107,7 @@ _STACKING = register_task(
             recovery=0.004,
             joint_recovery=0.03,  # else the plan turns on as the arm has begun to, whichever way that is
             commands=True,  # joints follow their commands in the same way in all poses
+            execution={"replan_interval": 8},  # plans begin slowly: after 4 steps the arm often lifts no box
         ),
     )
 )
@@ -138,6 +139,7 @@ register_task(
             _STACKING.defaults,
             method="koap",
             planner={"steps": 18000, "network": "mlp"},
+            execution={},
             controller={"preset": "scene", "columns": "related", "steps": 3000},
         ),
     )
