@@ -173,3 +173,19 @@ def test_the_robot_is_shifted_by_its_usual_step_in_any_unit_unless_the_task_says
     told = replace(task, defaults=replace(task.defaults, recovery=0.004))
     assert 0.004 < shift(told, torch.ones(3))[:, 0].square().mean().sqrt() < 0.006
     assert get_task("avoiding").defaults.recovery == 0.004  # m: the cylinders stand close
+
+
+def test_an_arm_is_turned_by_its_own_step_where_its_tool_is_shifted_by_another():
+    task = get_task("stacking")
+    states = torch.zeros(500, 16, task.state_dim).double()
+    states[..., :7] = torch.tensor([0.0, 0.3, 0.0, -2.0, 0.0, 2.2, 0.8])
+    states[..., task.tool_columns] = task.tool_position(states[..., :7])
+
+    def shift(task):
+        torch.manual_seed(0)
+        found = augmentation(task, states)(TensorDict({"state": states.clone()}, [500]))["state"] - states
+        return found[:, 1].square().mean(0).sqrt()
+
+    turned, still = shift(task), shift(replace(task, defaults=replace(task.defaults, joint_recovery=0.0)))
+    assert 0.03 < turned[6] < 0.04 and still[6] < 0.001  # rad; the last joint moves the tool by nothing
+    torch.testing.assert_close(turned[list(task.tool_columns)], still[list(task.tool_columns)], rtol=0.1, atol=0)
