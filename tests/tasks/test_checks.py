@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from toy_task import TOY
 
-from torchrl_koap.tasks import Action, Body, Modes, Scene, Task
+from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Task
 
 HERE = (((0.0, 0.1), (0.0, 0.1)),)
 BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE)
@@ -28,6 +28,7 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
         ),
         ({"actions": {"x": Action(column=5)}}, "actions: the state has 5 columns, got 5"),
         ({"actions": {"x": Action("m", "gripper"), "y": Action("m", "gripper")}}, "at most one is a gripper"),
+        ({"defaults": Defaults(joint_recovery=0.1)}, "defaults.joint_recovery: wanted tool_kinematics"),
         ({"robot": (0, 9)}, "robot: the state has 5 columns, got 9"),
         ({"interchangeable": (("box",),)}, "interchangeable: no body 'box'"),
         ({"relative_positions": (("tool", "command"),)}, "'command' is no part of the state"),

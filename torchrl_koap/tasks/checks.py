@@ -51,6 +51,8 @@ def _action_faults(task: Task) -> Iterator[str]:
             yield f"actions: {name!r} is raw, which has no column, got column {action.column}"
     if task.defaults.commands and (task.command is None or not task.delta_actions):
         yield "defaults.commands: no action is the change of a command that the observation repeats (command)"
+    if task.defaults.joint_recovery and task.tool_kinematics is None:
+        yield "defaults.joint_recovery: wanted tool_kinematics, without which recovery is that of the joints"
     if sum(action.kind == "gripper" for action in actions.values()) > 1:
         yield "actions: at most one is a gripper"
 

@@ -139,6 +139,7 @@ register_task(
             _STACKING.defaults,
             method="koap",
             planner={"steps": 18000, "network": "mlp"},
+            joint_recovery=0.0,
             execution={},
             controller={"preset": "scene", "columns": "related", "steps": 3000},
         ),

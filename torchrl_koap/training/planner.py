@@ -171,8 +171,9 @@ def augmentation(task: Task, windows: Tensor, *, actions: bool = False) -> Tenso
         if sigma is None:  # the usual change of a column in a control step
             sigma = (windows[:, 1] - windows[:, 0]).square().mean(0).sqrt()
         if task.tool_columns is not None:
-            joints = torch.zeros(task.state_dim, dtype=torch.bool).index_fill(0, torch.tensor(arm), True)
-            sigma = torch.where(joints, task.defaults.joint_recovery, sigma)
+            sizes = torch.as_tensor(sigma).expand(task.state_dim).clone()
+            sizes[arm] = task.defaults.joint_recovery
+            sigma = sizes
         steps.append(
             RecoveryAugmentation(
                 sigma,

@@ -91,7 +91,7 @@ class Denoiser(nn.Module):
 
 
 class MLPDenoiser(Denoiser):
-    """Residual network on the flattened sequence, of fixed horizon; default for recorded data and tasks with objects.
+    """Residual network on the flattened sequence, of fixed horizon; default for recorded data.
 
     On Avoiding, its plans touch obstacles more often than those of
     :class:`~torchrl_koap.modules.planning.unet.TemporalUnet`.
