@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,6 +46,8 @@ class Ground:
             return (
                 f"{self.data} is not there: set KOAP_SHARED to the folder that holds proving_grounds/{self.data.name}"
             )
-        if self.package is not None and importlib.util.find_spec(self.package) is None:
-            return f"no module {self.package}: {self.install}"
+        try:
+            importlib.import_module(self.package or "builtins")
+        except ImportError as error:  # of the package, or of one that it needs
+            return f"{error}: {self.install}"
         return None
