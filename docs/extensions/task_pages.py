@@ -186,8 +186,8 @@ def expert_blocks(expert: Any) -> list[str]:
 
 
 def measured_blocks(task: Task) -> list[str]:
-    """Returns the success of KOAP, the default method, `mpc` and the ridge in the current comparison."""
-    shown = ("koap", task.defaults.method, "mpc", "linear_steps")
+    """Returns the success of KOAP, `mpc` and the ridge in the current comparison."""
+    shown = ("koap", "mpc", "linear_steps")
     rows = [row for row in benchmark_rows(task=task.name) if row["method"] in shown]
     return [heading("Measured", 1), measured_table(rows, "method"), "More: :doc:`/results`."]
 

@@ -32,9 +32,10 @@ def test_nothing_is_left_open_and_a_second_pass_changes_nothing(task):
 
 
 def test_the_tasks_method_is_trained_unless_another_is_asked_for():
-    own = {"avoiding": "koap", "stacking": "mpc", "stacking_1": "mpc"}
-    for task, method in (own | {"stacking_unobserved_joints": "koap"}).items():
-        assert resolved(task).method == method and resolved(task, "linear").method == "linear"
+    assert {resolved(task).method for task in TASKS} == {"koap"} and resolved("stacking", "linear").method == "linear"
+    task = get_task("stacking")
+    own = replace(task, defaults=replace(task.defaults, method="mpc"))
+    assert resolve(TrainConfig(out="run"), own).method == "mpc"
 
 
 class TestTheTasksPreset:
@@ -138,6 +139,8 @@ class TestExecution:
         assert execution("po_sorting").gain > 1 and execution("po_sorting", "mpc").gain == 1
         assert execution("avoiding", "dp").strategy == "open_loop"
         assert (execution("sorting").temperature, execution("sorting", "dp").temperature) == (0.5, 1.0)
+        steps = {method: execution("stacking", method).replan_interval for method in ("koap", "dd", "dp")}
+        assert steps == {"koap": 8, "dd": 8, "dp": 4}
 
     def test_of_ones_own_data_follows_plans_near_their_mean(self):
         _, task = make_demonstrations([[[0.0, 0.0]] * 20], control_hz=30, action_dim=2)

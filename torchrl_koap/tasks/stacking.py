@@ -101,7 +101,6 @@ _STACKING = register_task(
             camera="front",
         ),
         defaults=Defaults(
-            method="mpc",
             demonstrations=1000,
             planner={"steps": 16000, "network": "objects", "frames": 1},
             recovery=0.004,
@@ -137,10 +136,7 @@ register_task(
         # the commanded joints are not observed, so commands are inferred from the scene
         defaults=replace(
             _STACKING.defaults,
-            method="koap",
-            planner={"steps": 18000, "network": "mlp"},
             joint_recovery=0.0,
-            execution={},
             controller={"preset": "scene", "columns": "related", "steps": 3000},
         ),
     )

@@ -67,8 +67,8 @@ def fit(
             ``observation``, if there is no state) are the robot's.
 
     Keyword Args:
-        method (str, optional): a name in :data:`~torchrl_koap.training.METHODS`. Default: the task's, mostly
-            ``"koap"``.
+        method (str, optional): a name in :data:`~torchrl_koap.training.METHODS`. Default: the task's,
+            ``"koap"`` unless it names another.
         planner (StatePlanner or mapping, optional): a planner to share instead of training one, or options of
             :class:`~torchrl_koap.PlannerConfig` such as ``{"steps": 5000}``; False trains a controller alone. Default:
             the task's options.
