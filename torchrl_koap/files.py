@@ -111,7 +111,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(path, f"it is no JSON: {error}") from error
+        raise DataError(path, f"it cannot be read as JSON: {error}") from error
     if not isinstance(content, dict):
         raise DataError(path, f"it must hold an object, got {type(content).__name__}")
     return content

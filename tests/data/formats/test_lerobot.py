@@ -203,7 +203,7 @@ def test_invalid_descriptions(tmp_path):
         read_lerobot(tmp_path)
     root = write(tmp_path / "set")
     for text, message in (
-        ("{", "info.json cannot be used: it is no JSON"),
+        ("{", "info.json cannot be used: it cannot be read as JSON"),
         ("[1]", "must hold an object, got list"),
         ('{"codebase_version": "v4.0"}', "info.json cannot be used: its codebase_version is v4.0, wanted 2.x or 3.x"),
     ):
