@@ -71,13 +71,22 @@ def test_frames_of_recorded_states_become_columns(monkeypatch, tmp_path):
 
 
 def test_grounds_with_missing_data_or_packages_are_skipped_by_name(monkeypatch, capsys, tmp_path):
+    (tmp_path / "half_simulator.py").write_text("import its_dependency")
+    monkeypatch.syspath_prepend(tmp_path)
     away = Ground(lambda folder: None, "success", (5,), 1, data=tmp_path / "away.npz")
-    bare = Ground(lambda folder: None, "success", (5,), 1, package="no_such_simulator", install="pip install it")
-    monkeypatch.setattr(run, "grounds", lambda: {"away": away, "bare": bare})
+    lacking = {"bare": "no_such_simulator", "half": "half_simulator"}
+    lacking = {
+        name: Ground(lambda folder: None, "success", (5,), 1, package=package, install="pip install it")
+        for name, package in lacking.items()
+    }
+    monkeypatch.setattr(run, "grounds", lambda: {"away": away} | lacking)
     run.main(results=tmp_path / "table.csv")
-    one, other = capsys.readouterr().out.splitlines()
+    one, *others = capsys.readouterr().out.splitlines()
     assert one.startswith("away is skipped: ") and "away.npz is not there" in one
-    assert other == "bare is skipped: no module no_such_simulator: pip install it"
+    assert others == [
+        "bare is skipped: No module named 'no_such_simulator': pip install it",
+        "half is skipped: No module named 'its_dependency': pip install it",
+    ]
 
 
 @pytest.mark.parametrize("asked", [{"methods": ("koap", "kaop")}, {"executions": ("slow",)}], ids=str)
