@@ -46,8 +46,9 @@ class Ground:
             return (
                 f"{self.data} is not there: set KOAP_SHARED to the folder that holds proving_grounds/{self.data.name}"
             )
-        try:
-            importlib.import_module(self.package or "builtins")
-        except ImportError as error:  # of the package, or of one that it needs
-            return f"{error}: {self.install}"
+        if self.package is not None:
+            try:
+                importlib.import_module(self.package)
+            except ImportError as error:  # of the package, or of one that it needs
+                return f"{error}: {self.install}"
         return None

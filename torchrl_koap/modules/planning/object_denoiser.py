@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A denoiser with one token per object, whose weights all objects share; default of Sorting and `stacking`."""
+"""A denoiser with one token per object, whose weights all objects share; default of Sorting and Stacking."""
 
 from __future__ import annotations
 
