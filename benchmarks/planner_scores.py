@@ -33,6 +33,7 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ExecutionConfig, StatePlanner
 from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
+from torchrl_koap.tasks import HISTORY
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.datasets import choose_held_out, split_held_out
 from torchrl_koap.training.defaults import OWN_TEMPERATURE
@@ -77,7 +78,7 @@ def study(name: str, ground: Ground | None, folder: Path, seed: int, n: int) -> 
     known, unseen, _ = split_held_out(data, choose_held_out(data, 0.1, seed=seed))
     controlled = fit(data, task, planner=False, seed=seed)
     for network, octaves, updates in missing:
-        options = {"network": network, "octaves": octaves, "steps": updates, "held_out": 0.0}
+        options = {"network": network, "octaves": octaves, "steps": updates, "held_out": 0.0, "frames": HISTORY}
         planner = fit(known, task, method="linear", planner=options, seed=seed).planner
         length = planner.history + planner.horizon
         windows = [cut_windows(part, length, select=["state"], pad_before=1)["state"] for part in (known, unseen)]

@@ -11,6 +11,7 @@ from command_calls import fails
 from tiny_runs import koap, write_demonstrations
 
 from torchrl_koap.data import formats, save_demonstrations
+from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.data.ted import load_ted
 
 
@@ -25,6 +26,8 @@ def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):
     assert koap("convert", arm, "--out", tmp_path / "plain", "--to", "npz") == 0
     assert "labelled steps" in capsys.readouterr().out
     assert koap("convert", tmp_path / "plain", "--out", tmp_path / "again", "--robot", "q1", "q2") == 0
+    frames = find_task_of(tmp_path / "again").defaults.planner["frames"]
+    assert re.search(rf"planner observes +{frames} frame", capsys.readouterr().out)
     one, other = (load_ted(folder / "ted")[0] for folder in (arm, tmp_path / "again"))
     assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
 

@@ -304,7 +304,7 @@ def test_plans_of_smooth_motions_at_a_high_rate_do_not_grow_in_a_loop():
     """Where velocity follows from position, their difference must not tell how far a window was displaced."""
     states, actions = drawn_to_a_goal()
     data, task = make_demonstrations(states, actions[:4] + [None] * 8, control_hz=500)
-    options = {"planner": {"network": "mlp", "steps": 2, **SMALL}, "controller": {"steps": 0}}
+    options = {"planner": {"network": "mlp", "frames": 2, "steps": 2, **SMALL}, "controller": {"steps": 0}}
     planner = fit(data, task, **options, progress=False).planner
     frames = torch.tensor(np.stack([rows[[0, 0]] for rows in states]), dtype=torch.float32)
     with torch.no_grad():

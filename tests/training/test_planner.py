@@ -175,6 +175,20 @@ def test_the_robot_is_shifted_by_its_usual_step_in_any_unit_unless_the_task_says
     assert get_task("avoiding").defaults.recovery == 0.004  # m: the cylinders stand close
 
 
+def test_shifts_of_a_fast_robot_are_those_of_a_thirtieth_of_a_second():
+    windows = torch.from_numpy(np.random.default_rng(0).normal(size=(500, 16, 2))).cumsum(1)
+
+    def shifts(rate):
+        torch.manual_seed(0)
+        _, task = make_demonstrations([path.numpy() for path in windows[:3]], control_hz=rate, action_dim=1)
+        return augmentation(task, windows)(TensorDict({"state": windows}, [500]))["state"] - windows
+
+    slow, usual, fast = map(shifts, (10, 30, 120))
+    torch.testing.assert_close(slow, usual)
+    torch.testing.assert_close(fast[:, 1], 4 * usual[:, 1])
+    torch.testing.assert_close(fast[:, 5], 4 * usual[:, 2])  # the same share is left after the same time
+
+
 def test_an_arm_is_turned_by_its_own_step_where_its_tool_is_shifted_by_another():
     task = get_task("stacking")
     states = torch.zeros(500, 16, task.state_dim).double()

@@ -18,12 +18,13 @@ from tensordict import TensorDict
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each, wrong_rate
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
+from torchrl_koap.data.observed_frames import observed_frames
 from torchrl_koap.data.quality import constant_columns, find_warnings
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state
 from torchrl_koap.files import option, refuse
 from torchrl_koap.lookup import lookup, unknown
-from torchrl_koap.tasks import Action, Task
+from torchrl_koap.tasks import Action, Defaults, Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
 # the kind of an action as a user names it -> as stored, once resampling is done
@@ -241,9 +242,10 @@ def make_demonstrations(
         robot=tuple(others.index(column) for column in own),
     )
     sources = recordings.sources if recordings is states or resample is not None else ()
-    for said in find_warnings(select_state(data, task.state_of), task, sources):
+    known = select_state(data, task.state_of)
+    for said in find_warnings(known, task, sources):
         warnings.warn(said, stacklevel=2)
-    return data, task
+    return data, replace(task, defaults=Defaults(planner={"frames": observed_frames(known, task)[0]}))
 
 
 _COMMAND = "command"

@@ -73,7 +73,7 @@ class PlannerConfig:
         octaves: octaves of the Fourier features of the observed states; 0: the states themselves.
         batch_size: windows per update.
         learning_rate: peak learning rate.
-        frames: observed frames that it reads, 1 or 2.
+        frames: observed frames that it reads, 1 or 2 (default for own data: as `koap convert` says).
         held_out: share of the trajectories that it is not trained on, those without labels first. Training keeps the
             weights that plan them best, and `koap eval` evaluates plans on them (default: 0.1 for a task without an
             environment, else 0).

@@ -39,7 +39,7 @@ class Defaults:
         disturbance (float): share of them in which the expert is disturbed.
         relative (bool): plans are displacements from the present state.
         recovery (float, optional): typical shift of the recovery augmentation, in the units of the robot's columns.
-            Default: the usual change of each column in a control step.
+            Default: the usual change of each column in a control step, or in 1/30 s if that is longer.
         joint_recovery (float): typical size of the shift drawn in the joints (rad), if ``tool_kinematics`` are given;
             ``recovery`` is then that of the tool (m).
         neighbor_recovery (float): largest displacement of a window towards the nearest other one, as a share of their

@@ -41,6 +41,8 @@ RECORDED = 8192  # recorded windows at most in which the nearest one to a plan i
 CHECKS = 30  # scores per training at most
 COST = 0.05  # share of the training time for scores at most
 BLIND = 1000  # updates at most if nothing can be held out
+SHIFTED = 1 / 30  # s, or a control step if that is longer: the recovery shift is the usual change in this time
+DECAY = 0.7  # share of the shift that is left after this time
 
 
 def learn_planner(
@@ -167,9 +169,10 @@ def augmentation(task: Task, windows: Tensor, *, actions: bool = False) -> Tenso
         steps.append(RandomPlanarTransform(points, directions, history=HISTORY, turned_actions=turned))
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
+        steps_shifted = max(SHIFTED * task.control_hz, 1.0)
         sigma: float | Tensor | None = task.defaults.recovery
-        if sigma is None:  # the usual change of a column in a control step
-            sigma = (windows[:, 1] - windows[:, 0]).square().mean(0).sqrt()
+        if sigma is None:  # the usual change of a column
+            sigma = steps_shifted * (windows[:, 1] - windows[:, 0]).square().mean(0).sqrt()
         if task.tool_columns is not None:
             sizes = torch.as_tensor(sigma).expand(task.state_dim).clone()
             sizes[arm] = task.defaults.joint_recovery
@@ -178,6 +181,7 @@ def augmentation(task: Task, windows: Tensor, *, actions: bool = False) -> Tenso
             RecoveryAugmentation(
                 sigma,
                 history=HISTORY,
+                decay=DECAY ** (1 / steps_shifted),
                 under_way=task.env is None,
                 columns=arm,
                 tool=task.tool_columns,
