@@ -6,7 +6,7 @@ from run_files import LABELS, run_of
 
 from torchrl_koap.reports.rows import Row, as_text, evaluation_rows, training_rows
 
-CONFIG = {"method": "koap", "planner": {"steps": 500, "source": None}}
+CONFIG = {"method": "koap", "planner": {"steps": 500, "frames": 1, "source": None}}
 PLANNER = {"updates": 500, "kept_update": 500, "best_held_out_score": 0.263}
 SUMMARY = {
     "labels": LABELS,
@@ -25,8 +25,8 @@ def rows_of(config=None, **summary):
 def test_a_training_in_five_rows():
     assert rows_of() == {
         "labels": "20 of 40 steps; in 1 of 2 recordings",
-        "planner": "500 updates in 22 s; kept update 500, with plan score 0.263 on held-out recordings"
-        " (smaller is better)",
+        "planner": "500 updates in 22 s, 1 observed frame; kept update 500, with plan score 0.263 on held-out"
+        " recordings (smaller is better)",
         "training ended": "with its last update; still improving: train again with --steps 1000",
         "controller": "koap, 500 updates in 11 s; fitted to 18 labels",
     }
@@ -45,7 +45,8 @@ def test_why_a_training_ended(updates, kept, said):
 
 
 def test_planners_that_nothing_was_held_out_from_or_that_are_no_part_of_the_run():
-    assert rows_of(planner={"updates": 20})["planner"] == "20 updates in 22 s; no recording was held out"
+    said = "20 updates in 22 s, 1 observed frame; no recording was held out"
+    assert rows_of(planner={"updates": 20})["planner"] == said
     resumed = {"planner": 0.1, "controller": 0.1}
     assert rows_of(train_seconds=resumed)["controller"] == "koap, 500 updates; fitted to 18 labels"
     assert rows_of({"planner": {"source": "runs/other"}})["planner"] == "that of runs/other; not trained here"

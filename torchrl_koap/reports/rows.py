@@ -67,7 +67,9 @@ def _planner(run: RunFacts) -> list[Row]:
     updates, kept, score = (entry_at(run.summary, "planner", name) for name in names)
     if updates is None:
         return []
-    value = f"{updates:,.0f} updates{_seconds(run, 'planner')}"
+    frames = asked.get("frames")
+    seen = "" if frames is None else f", {frames} observed frame{'s' * (frames > 1)}"
+    value = f"{updates:,.0f} updates{_seconds(run, 'planner')}{seen}"
     if kept is None or score is None:
         return [Row("planner", value, "no recording was held out")]
     note = f"kept update {kept:,.0f}, with plan score {score:.3g} on held-out recordings (smaller is better)"
