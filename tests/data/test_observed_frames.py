@@ -63,6 +63,11 @@ def test_only_the_robot_s_columns_are_predicted():
     assert gains[0] < 2 < gains[1]
 
 
+def test_other_windows_of_the_same_trajectory_predict_nothing():
+    """On a straight route they would predict it exactly, once the direction is known."""
+    assert 2 < motion_gain(*described(recorded(crossing))) < 100
+
+
 def test_units_do_not_count():
     data, task = described(recorded(crossing))
     scaled = data.copy().set("state", data["state"] * torch.tensor([1e3, 1e-3]))
