@@ -74,12 +74,25 @@ def test_units_do_not_count():
     assert motion_gain(data, task) == pytest.approx(motion_gain(scaled, task), 1e-3)
 
 
-@pytest.mark.parametrize(("number", "length"), [(1, FRAMES), (2, WINDOW - 1)])
+@pytest.mark.parametrize(("number", "length"), [(1, FRAMES), (2, WINDOW)])
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_without_two_trajectories_as_long_as_a_window_two_frames_are_observed(number, length):
     states = [np.random.default_rng(row).normal(size=(length, 2)).cumsum(0) for row in range(number)]
     _, task = described(states)
     assert task.defaults.planner == {"frames": 2}
+
+
+@pytest.mark.parametrize("length", [WINDOW + 1, WINDOW + 3])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_two_trajectories_as_long_as_a_window_are_enough(length):
+    states = [np.random.default_rng(row).normal(size=(length, 2)).cumsum(0) for row in range(2)]
+    assert "divides the error" in observed_frames(*described(states))[1]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_route_that_is_taken_both_ways_has_two_frames():
+    there = np.linspace(0, 1, FRAMES)[:, None] * np.array([1.0, 0.5])
+    assert observed_frames(*described([there, there[::-1]] * 6))[0] == 2
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -26,7 +26,7 @@ def observed_frames(data: TensorDictBase, task: Task) -> tuple[int, str]:
     lengths = trajectory_lengths(data)
     fits = lengths >= WINDOW
     if fits.sum() < 2:
-        return HISTORY, f"{HISTORY} frames: fewer than two trajectories have the {WINDOW} frames of a window"
+        return HISTORY, f"{HISTORY} frames: fewer than two trajectories have the {WINDOW} steps of a window"
     gain = motion_gain(data[fits.repeat_interleave(lengths)], task)
     frames = HISTORY if gain > ENOUGH else 1
     why = f"knowing the last change divides the error of predictions by {gain:.2f} ({HISTORY} frames above {ENOUGH:g})"
@@ -37,8 +37,8 @@ def motion_gain(data: TensorDictBase, task: Task) -> float:
     """Returns the factor by which the last change of the state lowers the squared error of predictions.
 
     The mean of the nearest windows of other trajectories predicts the displacements of the robot's columns in the next
-    frames. Nearness is that of present frames alone, or with their last changes. Columns and displacements
-    are divided by their standard deviations. Flat data ``[N]`` hold two or more trajectories, each as long as a window.
+    frames. Nearness is that of present frames alone, or with their last changes. Columns and displacements are divided
+    by their standard deviations. Flat data ``[N]`` hold two or more trajectories, each as long as a window.
     """
     windows = cut_windows(data, WINDOW, select=[STATE, EPISODE], most=WINDOWS)
     states, episode = windows[STATE].float(), windows[EPISODE][:, 0]
@@ -49,14 +49,16 @@ def motion_gain(data: TensorDictBase, task: Task) -> float:
     ahead = _scaled(ahead.flatten(0, 1)).view(len(states), -1)
     asked = spread_evenly(torch.arange(len(states), device=states.device), ASKED)
     place, change = (torch.cdist(part[asked], part).square() for part in map(_scaled, (present, present - past)))
-    place.masked_fill_(episode[asked, None] == episode, torch.inf)
+    own = episode[asked, None] == episode
+    place.masked_fill_(own, torch.inf)
+    neighbors = min(NEIGHBORS, int((~own).sum(1).min()))
 
     def error(weight: float) -> float:
-        nearest = (place + weight**2 * change).topk(NEIGHBORS, largest=False).indices
+        nearest = (place + weight**2 * change).topk(neighbors, largest=False).indices
         return float((ahead[nearest].mean(1) - ahead[asked]).square().mean())
 
-    blind = error(0.0)
-    return blind / min(map(error, WEIGHTS)) if blind else 1.0
+    blind, seeing = error(0.0), min(map(error, WEIGHTS))
+    return blind / seeing if seeing else torch.inf if blind else 1.0
 
 
 def _scaled(rows: Tensor) -> Tensor:
