@@ -95,7 +95,9 @@ def fit(
         >>> actions = [np.diff(states[0], axis=0), None, None]
         >>> data, task = make_demonstrations(states, actions, control_hz=30)
         >>> trained = fit(data, task, planner={"steps": 2, "width": 8}, controller={"steps": 2}, progress=False)
-        >>> trained.planner.sample(data["observation"][None, :2]).shape
+        >>> task.defaults.planner  # chosen for these data
+        {'frames': 1}
+        >>> trained.planner.sample(data["observation"][None, :1]).shape
         torch.Size([1, 14, 2])
         >>> other = fit(data, task, method="linear", planner=trained.planner, progress=False)
         >>> other.planner is trained.planner, other.results["decoder_fit"]["labels_used"]
