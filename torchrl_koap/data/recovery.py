@@ -16,6 +16,7 @@ from torchrl_koap.tasks.action_rules import OPEN_ABOVE, OPENING
 
 _DIFFERENCE = 1e-3  # rad, half step of the central differences in the Jacobian
 _DAMPING = 1e-4  # m2 / rad2, of the damped least squares: bounds the joint shifts where the arm is stretched out
+DECAY = 0.7  # rho, share of a shift left after each frame, or after 1/30 s at higher rates
 _NEIGHBOR_DECAY = 0.85  # rho towards a neighbour: share of the shift left after each frame
 _WIDTH_DECAY = 0.5  # factor per step of the width that opening fingers still lack
 EMPTY = 0.05  # m; fingers closer than this hold nothing: the boxes of Stacking are 0.06 m wide
@@ -82,7 +83,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         sigma: float | Tensor,
         *,
         history: int = 2,
-        decay: float = 0.7,
+        decay: float = DECAY,
         under_way: bool = False,
         columns: Sequence[int] | None = None,
         tool: Sequence[int] | None = None,

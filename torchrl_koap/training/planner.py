@@ -21,7 +21,7 @@ from torchrl_koap.data import (
     extrapolate_ends,
     make_window_buffer,
 )
-from torchrl_koap.data.recovery import GripperRecovery, NeighborRecovery
+from torchrl_koap.data.recovery import DECAY, GripperRecovery, NeighborRecovery
 from torchrl_koap.data.windows import spread_evenly
 from torchrl_koap.keys import STATE
 from torchrl_koap.modules import StatePlanner
@@ -42,7 +42,6 @@ CHECKS = 30  # scores per training at most
 COST = 0.05  # share of the training time for scores at most
 BLIND = 1000  # updates at most if nothing can be held out
 SHIFTED = 1 / 30  # s, or a control step if that is longer: the recovery shift is the usual change in this time
-DECAY = 0.7  # share of the shift that is left after this time
 
 
 def learn_planner(
