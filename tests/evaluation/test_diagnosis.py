@@ -181,11 +181,12 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     assert len(draw_experiments(result, RunFacts(tmp_path, task)).axes) == 2
     inspection.inspect(copied_run, replace(asked, execution=ExecutionConfig(replan_interval=4)))
     assert policies[-1].execution == Execution(**own | {"replan_interval": 4})
-    config = replace(trained.config, execution=ExecutionConfig(temperature=0.5))
+    config = replace(trained.config, execution=ExecutionConfig(temperature=0.5, candidates=3))
     cold = replace(trained, config=config)
     monkeypatch.setattr(Trained, "load", lambda run, plugins: cold)
     inspection.inspect(copied_run, asked)
-    assert [policy.execution.temperature for policy in policies[-2:]] == [0.5, 1]  # recordings are no noise
+    used = [(policy.execution.temperature, policy.execution.candidates) for policy in policies[-2:]]
+    assert used == [(0.5, 3), (1, 1)]  # recordings are no noise
 
 
 def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):

@@ -108,7 +108,7 @@ def follow_recordings(
         planner,
         policy.follower,
         state_of=policy.state_of,
-        execution=policy.execution.replaced(temperature=1.0),  # it would scale the futures, which replace noise
+        execution=policy.execution.replaced(temperature=1.0, candidates=1),  # futures replace noise
         limits=policy.limits,
     ).to(device_of(policy))
     futures = recorded_futures([paths[index] for index in chosen], planner.horizon)

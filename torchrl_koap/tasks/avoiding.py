@@ -86,6 +86,12 @@ register_task(
             camera="front",
         ),
         label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
-        defaults=Defaults(demonstrations=96, planner={"steps": 5000, "width": 32}, relative=False, recovery=0.004),
+        defaults=Defaults(
+            demonstrations=96,
+            planner={"steps": 5000, "width": 32},
+            execution={"candidates": 4},
+            relative=False,
+            recovery=0.004,
+        ),
     )
 )

@@ -150,7 +150,7 @@ for _method in (
         presets=("paper",),
         columns="all",
         updates=1000,
-        execution=_AS_PLANNED | {"temperature": 1.0},
+        execution=_AS_PLANNED | {"temperature": 1.0, "candidates": 1},
     ),
     Method(
         "koap_labelled_only",

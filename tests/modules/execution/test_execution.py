@@ -28,6 +28,8 @@ def test_missing_values_are_the_defaults():
         ({"strategy": "open-loop"}, "unknown strategy 'open-loop'; did you mean 'open_loop'?"),
         ({"replan_interval": 0}, "replan_interval must be an integer >= 1, got 0"),
         ({"replan_interval": 2.5}, "replan_interval must be an integer >= 1, got 2.5"),
+        ({"candidates": 0}, "candidates must be an integer >= 1, got 0"),
+        ({"candidates": True}, "candidates must be an integer >= 1, got True"),
         ({"blend": 1.0}, r"blend must be in \[0, 1\), got 1.0"),
         ({"blend": float("nan")}, "blend must be in"),
         ({"lead": -0.1}, "lead must be a number >= 0, got -0.1"),

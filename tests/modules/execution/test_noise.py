@@ -59,11 +59,55 @@ def test_the_temperature_is_a_factor_of_the_start_noise(given):
     assert plans[0].std() > 0.9 and torch.equal(plans[1], plans[0] / 2) and not plans[2].any()
 
 
-def test_the_episode_of_a_seed_in_an_evaluation_is_that_of_an_agent():
+@pytest.mark.parametrize("batch", [(), (2, 2)])
+def test_of_several_candidates_the_first_of_the_nearest_pair_is_planned(batch):
+    planner = Still(MLPDenoiser(4, 8, horizon=14, width=8), state_dim=4)
+    execution = Execution(temperature=0.5, candidates=4)
+    policy = make_policy(planner, make_koopman_inverse_dynamics(4, 2), state_of=range(4), execution=execution)
+    assert policy.noise_shape == (4, 14, 4)
+    noise = torch.tensor([0.0, 5.0, 9.0, 5.5]).reshape(4, 1, 1).expand(*batch, *policy.noise_shape).clone()
+    if batch:
+        noise[0, 1] = noise[0, 1].flip(0)  # 5.5 is now the first of the pair
+    plan = policy.plan(torch.zeros(*batch, policy.history, 4), noise)
+    expected = torch.full((*batch, 14, 4), 2.5)
+    if batch:
+        expected[0, 1] = 2.75
+    assert torch.equal(plan, expected)
+
+
+def test_candidates_are_compared_in_normalised_units_and_begin_with_the_prefix():
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2, num_steps=2)
+    planner.fit_normalizers(torch.tensor([1e3, 1e-3]) * torch.randn(50, 16, 2).cumsum(1))
+    given = {"state_of": (0, 1), "execution": Execution(candidates=3)}
+    policy = make_policy(planner, make_koopman_inverse_dynamics(2, 2), **given)
+    states, noise = torch.zeros(5, policy.history, 2), torch.randn(5, 3, 14, 2)
+    prefix = torch.tensor([1e2, 1e-4]) * torch.ones(5, 2, 2)
+    plans = torch.stack([planner.sample(states[:, -2:], noise[:, which], prefix=prefix) for which in range(3)], 1)
+    gaps = [(planner.encode(states[:, None, -2:], plans)[:, one] - planner.encode(states[:, None, -2:], plans)[:, two])
+            .square().sum((-1, -2)) for one, two in ((0, 1), (0, 2), (1, 2))]  # fmt: skip
+    first = torch.tensor([0, 0, 1])[torch.stack(gaps).argmin(0)]
+    assert len(first.unique()) == 2
+    plan = policy.sample(states, noise, prefix=prefix)
+    torch.testing.assert_close(plan, plans[torch.arange(5), first], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(plan[:, :2], prefix, rtol=1e-4, atol=1e-6)
+
+
+def test_planners_without_normalised_plans_have_one_candidate():
+    class Own(torch.nn.Module):
+        history, horizon, noise_key, noise_shape = 1, 14, None, (14, 2)
+
+    with pytest.raises(ValueError, match="candidates must be 1 for Own, which is no ConditionalSampler"):
+        make_policy(Own(), make_koopman_inverse_dynamics(2, 2), state_of=(0, 1), execution=Execution(candidates=2))
+
+
+@pytest.mark.parametrize("candidates", [1, 3])
+def test_the_episode_of_a_seed_in_an_evaluation_is_that_of_an_agent(candidates):
     torch.manual_seed(0)
     planner = StatePlanner(MLPDenoiser(2, 4, horizon=13, width=8), state_dim=2, horizon=13, num_steps=2)
     planner.fit_normalizers(0.01 * torch.randn(50, 15, 2).cumsum(1))
-    policy = make_policy(planner, make_koopman_inverse_dynamics(2, 2), state_of=(2, 3), max_steps=9)
+    options = {"state_of": (2, 3), "max_steps": 9, "execution": Execution(candidates=candidates)}
+    policy = make_policy(planner, make_koopman_inverse_dynamics(2, 2), **options)
     (episode,) = roll_out(policy, AvoidingEnv, [7], max_steps=9)
     agent = Agent(policy, seed=7)
     agent.reset()

@@ -34,7 +34,8 @@ class Execution:
     Examples:
         >>> from torchrl_koap.modules import Execution
         >>> Execution().replaced(strategy="open_loop", blend=None)
-        Execution(strategy='open_loop', replan_interval=4, blend=0.8, lead=0.0, gain=1.0, temperature=1.0, limits=0.5)
+        Execution(strategy='open_loop', replan_interval=4, blend=0.8, lead=0.0, gain=1.0, temperature=1.0, candidates=1,
+                  limits=0.5)
     """
 
     strategy: str = "feedback"
@@ -43,12 +44,14 @@ class Execution:
     lead: float = 0.0
     gain: float = 1.0
     temperature: float = 1.0
+    candidates: int = 1
     limits: float = 0.5
 
     def __post_init__(self):
         lookup(STRATEGIES, self.strategy, "strategy")
-        if type(self.replan_interval) is not int or self.replan_interval < 1:
-            raise ValueError(f"replan_interval must be an integer >= 1, got {self.replan_interval!r}")
+        for name in ("replan_interval", "candidates"):
+            if type(asdict(self)[name]) is not int or asdict(self)[name] < 1:
+                raise ValueError(f"{name} must be an integer >= 1, got {asdict(self)[name]!r}")
         if not 0 <= self.blend < 1:
             raise ValueError(f"blend must be in [0, 1), got {self.blend}")
         if not 0 <= self.lead < math.inf:
@@ -82,6 +85,8 @@ class ExecutionConfig:
         gain: factor of actions that are changes of a command; above 1 the robot moves faster than planned.
         temperature: factor of the noise that plans are sampled from, 0 to 1. Below 1 plans are more precise and vary
             less.
+        candidates: plans that are sampled together; one of the two that are nearest to each other is executed. With 3
+            or more, plans between two routes become rare, and so do rare routes.
         limits: commands stay in the demonstrated range, widened on each side by this share of it; inf: no limit.
 
     Raises:
@@ -99,6 +104,7 @@ class ExecutionConfig:
     lead: float | None = None
     gain: float | None = None
     temperature: float | None = None
+    candidates: int | None = None
     limits: float | None = None
 
     def __post_init__(self):

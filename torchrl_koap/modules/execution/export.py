@@ -78,7 +78,7 @@ def exportable(
     ``columns`` maps names to units, for the columns of ``"observations"`` and of ``"actions"``.
     """
     planner, generator = policy.planner, torch.Generator().manual_seed(0)
-    sizes = (1, policy.history, len(columns["observations"])), (1, *planner.noise_shape)
+    sizes = (1, policy.history, len(columns["observations"])), (1, *policy.noise_shape)
     seen, noise = (torch.randn(*size, generator=generator).to(next(planner.parameters())) for size in sizes)
     seen = 0.1 * seen
     if policy.origins is not None:

@@ -22,6 +22,7 @@ from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import Follower, remaining_plan
 from torchrl_koap.modules.planning.diffusion_policy import ACTION_CHUNK, DiffusionPolicy
 from torchrl_koap.modules.planning.planner import StatePlanner
+from torchrl_koap.modules.planning.sampler import ConditionalSampler, nearest_pair
 
 OBSERVATION_HISTORY = "observation_history"
 IS_INIT = "is_init"
@@ -103,6 +104,8 @@ class PlanningPolicy(TensorDictModuleBase):
             raise ValueError(f"{type(planner).__name__} samples {samples} decode them")
         if follower is None:  # the sampled actions are executed
             execution = execution.replaced(strategy="open_loop")
+        if execution.candidates > 1 and not isinstance(planner, ConditionalSampler):
+            raise ValueError(f"candidates must be 1 for {type(planner).__name__}, which is no ConditionalSampler")
         knows_command = follower is not None and follower.knows_command
         if knows_command and execution.strategy == "open_loop":
             raise ValueError(f"{type(follower).__name__} decodes at every step: strategy must not be 'open_loop'")
@@ -136,8 +139,9 @@ class PlanningPolicy(TensorDictModuleBase):
 
     @property
     def noise_shape(self) -> tuple[int, ...]:
-        """Shape of the start noise of one environment's plan."""
-        return self.planner.noise_shape
+        """Shape of the start noise of one environment's plan, ``[candidates, H, w]`` for several candidates."""
+        several = () if self.execution.candidates == 1 else (self.execution.candidates,)
+        return (*several, *self.planner.noise_shape)
 
     def check_rate(self, control_hz: float) -> None:
         """Warns if a control rate (Hz) is outside 0.8 to 1.25 times that of the data; raises if it is not positive."""
@@ -172,17 +176,25 @@ class PlanningPolicy(TensorDictModuleBase):
             return chunk
         return self.follower(observations, states, chunk, self.execution.replan_interval)
 
-    def sample(self, states: Tensor, noise: Tensor | None = None, **options: Any) -> Tensor:
+    def sample(self, states: Tensor, noise: Tensor | None = None, *, prefix: Tensor | None = None) -> Tensor:
         """Samples plans ``[*B, H, w]`` at the temperature of the execution.
 
-        The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`; options go to the planner's
-        ``sample``, for example ``prefix``.
+        The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`, a prefix ``[*B, k, w]`` as for
+        the planner's ``sample``. Of several candidates, the first of the two nearest to each other is returned
+        (:func:`~torchrl_koap.modules.planning.sampler.nearest_pair`).
         """
         if noise is None:
             shape = (*states.shape[:-2], *self.noise_shape)
             noise = torch.randn(shape, dtype=states.dtype, device=states.device)
         seen = states[..., -self.planner.history :, :]
+        options = {} if prefix is None else {"prefix": prefix}
+        several = self.execution.candidates > 1
+        if several:
+            seen, options = _repeated(seen, noise), {name: _repeated(value, noise) for name, value in options.items()}
         chunk = self.planner.sample(seen, self.execution.temperature * noise, **options)
+        if several:
+            chosen = nearest_pair(self.planner.encode(seen, chunk))
+            seen, chunk = seen[..., 0, :, :], torch.take_along_dim(chunk, chosen[..., None, None, None], -3).squeeze(-3)
         wanted = (*seen.shape[:-2], self.planner.horizon, seen.shape[-1])
         if self.follower is not None and chunk.shape != wanted:
             raise ValueError(f"a plan must be {list(wanted)} ([*B, horizon, d]), got {list(chunk.shape)}")
@@ -305,6 +317,11 @@ class _Chunk(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
         return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
+
+
+def _repeated(value: Tensor, noise: Tensor) -> Tensor:
+    """Repeats values ``[*B, n, d]`` for every candidate of noise ``[*B, candidates, H, w]``."""
+    return value.unsqueeze(-3).expand(*noise.shape[:-2], *value.shape[-2:])
 
 
 def columns_of(state_of: Callable[[Tensor], Tensor] | Sequence[int]) -> Callable[[Tensor], Tensor]:

@@ -170,6 +170,23 @@ class ConditionalSampler(TensorDictModuleBase):
         return self.encode(history, torch.cat([prefix, rest], -2))[..., :frames, :]
 
 
+def nearest_pair(sequences: Tensor) -> Tensor:
+    """Returns the first of the two most similar candidates of normalised sequences ``[*B, candidates, H, w]``.
+
+    The index is int64 ``[*B]``. Where several routes are possible, a sequence between them has no close neighbour.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.planning.sampler import nearest_pair
+        >>> nearest_pair(torch.tensor([0.0, 5.0, 9.0, 5.5]).reshape(4, 1, 1))
+        tensor(1)
+    """
+    flat = sequences.flatten(-2)
+    gaps = (flat.unsqueeze(-2) - flat.unsqueeze(-3)).square().sum(-1)
+    itself = torch.eye(flat.shape[-2], dtype=torch.bool, device=flat.device)
+    return gaps.masked_fill(itself, torch.inf).amin(-1).argmin(-1)
+
+
 def _check(value: Tensor, name: str, frames: int, columns: int, sizes: str) -> None:
     """Raises a ValueError for values that are not ``[*B, frames, columns]``."""
     if value.shape[-2:] != (frames, columns):
