@@ -53,7 +53,7 @@ def test_the_stateless_policy_is_the_open_loop_one():
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    what, path = exportable(policy(), columns=COLUMNS), tmp_path_factory.mktemp("exported") / "policy.pt2"
+    what, path = exportable(policy(candidates=3), columns=COLUMNS), tmp_path_factory.mktemp("exported") / "policy.pt2"
     return what, path, export_policy(what, path)
 
 
@@ -87,10 +87,10 @@ def test_a_diffusion_policy_is_exported_too(tmp_path):
 def test_onnx_is_called_as_its_metadata_say(tmp_path):
     import onnxruntime
 
-    frames, noise = torch.randn(5, 5, 4), torch.randn(5, 14, 2)
+    frames, noise = torch.randn(5, 5, 4), torch.randn(5, 3, 14, 2)
     with torch.no_grad():
-        usual = 0.99 * float(policy().decode_ahead(frames, noise)[0][..., 0].abs().median())
-        whole = policy(ranges=[(-usual / 2, usual / 2), None, None], replan_interval=3)  # widened by half
+        usual = 0.99 * float(policy(candidates=3).decode_ahead(frames, noise)[0][..., 0].abs().median())
+        whole = policy(ranges=[(-usual / 2, usual / 2), None, None], replan_interval=3, candidates=3)  # widened by half
         expected, held = whole.decode_ahead(frames, noise)
     export_policy(exportable(whole, columns=COLUMNS), tmp_path / "policy.onnx", kind="onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])

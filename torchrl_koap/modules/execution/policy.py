@@ -193,8 +193,8 @@ class PlanningPolicy(TensorDictModuleBase):
             seen, options = _repeated(seen, noise), {name: _repeated(value, noise) for name, value in options.items()}
         chunk = self.planner.sample(seen, self.execution.temperature * noise, **options)
         if several:
-            chosen = nearest_pair(self.planner.encode(seen, chunk))
-            seen, chunk = seen[..., 0, :, :], torch.take_along_dim(chunk, chosen[..., None, None, None], -3).squeeze(-3)
+            chosen = nearest_pair(self.planner.encode(seen, chunk))[..., None, None, None]
+            seen, chunk = seen[..., 0, :, :], chunk.gather(-3, chosen.expand_as(chunk[..., :1, :, :])).squeeze(-3)
         wanted = (*seen.shape[:-2], self.planner.horizon, seen.shape[-1])
         if self.follower is not None and chunk.shape != wanted:
             raise ValueError(f"a plan must be {list(wanted)} ([*B, horizon, d]), got {list(chunk.shape)}")
