@@ -137,7 +137,7 @@ class TestExecution:
         assert execution("avoiding", "koap_paper") == Execution("open_loop", blend=0.0)
         assert execution("avoiding", "koap_paper", blend=0.5).blend == 0.5
         assert execution("po_sorting").gain > 1 and execution("po_sorting", "mpc").gain == 1
-        assert execution("avoiding", "dp") == Execution("open_loop")
+        assert execution("avoiding", "dp") == Execution("open_loop", candidates=4)
         assert (execution("sorting").temperature, execution("sorting", "dp").temperature) == (0.5, 1.0)
         steps = {method: execution("stacking", method).replan_interval for method in ("koap", "dd", "dp")}
         assert steps == {"koap": 8, "dd": 8, "dp": 4}

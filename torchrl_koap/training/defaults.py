@@ -121,9 +121,7 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
 def _execution(asked: ExecutionConfig, method: Method, task: Task, preset: str) -> ExecutionConfig:
     own = ({"temperature": OWN_TEMPERATURE} if task.env is None else {}) | dict(task.defaults.execution)
     if not method.plans:
-        theirs = (
-            () if task.env is None else ("temperature", "candidates", "replan_interval")
-        )  # those of the task's planner
+        theirs = () if task.env is None else ("temperature", "replan_interval")  # those of the task's planner
         own = {name: value for name, value in own.items() if name not in theirs} | {"strategy": "open_loop"}
     if asked.strategy == "oracle":
         raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
