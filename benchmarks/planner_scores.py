@@ -46,12 +46,12 @@ HUMAN = "avoiding_human"
 
 
 def closed_loop(ground: Ground | None, trained: Trained, n: int) -> int:
-    """Returns the successes of ``n`` rollouts with the temperature used for a user's own data."""
+    """Returns the successes of ``n`` rollouts with the temperature and the single candidate of a user's own data."""
     execution = ExecutionConfig(temperature=OWN_TEMPERATURE)
     if ground is not None:
         return roll(ground, trained, execution, n)["successes"]
     where = find_environment(trained.task, EvalConfig(episodes=n, threads=1))
-    policy = load_policy(trained, temperature=OWN_TEMPERATURE)
+    policy = load_policy(trained, temperature=OWN_TEMPERATURE, candidates=1)
     episodes = roll_out(policy, where.make_env, list(range(100, 100 + n)), max_steps=where.max_steps, batch_size=n)
     return sum(outcome_of(episode) == "success" for episode in episodes)
 

@@ -88,6 +88,8 @@ def test_candidates_are_compared_in_normalised_units_and_begin_with_the_prefix()
             .square().sum((-1, -2)) for one, two in ((0, 1), (0, 2), (1, 2))]  # fmt: skip
     first = torch.tensor([0, 0, 1])[torch.stack(gaps).argmin(0)]
     assert len(first.unique()) == 2
+    with pytest.raises(ValueError, match=r"noise must be \[5, 3, 14, 2\] .* got \[5, 14, 2\]"):
+        policy.sample(states, noise[:, 0])
     plan = policy.sample(states, noise, prefix=prefix)
     torch.testing.assert_close(plan, plans[torch.arange(5), first], rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(plan[:, :2], prefix, rtol=1e-4, atol=1e-6)

@@ -190,6 +190,8 @@ class PlanningPolicy(TensorDictModuleBase):
         options = {} if prefix is None else {"prefix": prefix}
         several = self.execution.candidates > 1
         if several:
+            if noise.shape != (shape := (*states.shape[:-2], *self.noise_shape)):
+                raise ValueError(f"noise must be {list(shape)} ([*B, candidates, H, w]), got {list(noise.shape)}")
             seen, options = _repeated(seen, noise), {name: _repeated(value, noise) for name, value in options.items()}
         chunk = self.planner.sample(seen, self.execution.temperature * noise, **options)
         if several:
