@@ -56,7 +56,7 @@ class Trained:
         >>> from torchrl_koap import Trained
         >>> trained = Trained.load("pretrained:avoiding")  # or the folder of a run of yours
         >>> trained.task.name, trained.method.name, trained.planner.horizon
-        ('avoiding', 'mpc', 14)
+        ('avoiding', 'koap', 14)
     """
 
     task: Task
