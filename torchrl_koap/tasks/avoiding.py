@@ -89,7 +89,7 @@ register_task(
         defaults=Defaults(
             demonstrations=96,
             planner={"steps": 5000, "width": 32},
-            execution={"candidates": 4},
+            execution={"candidates": 4},  # plans between two routes collide
             relative=False,
             recovery=0.004,
         ),

@@ -65,8 +65,8 @@ class PlanningPolicy(TensorDictModuleBase):
 
     Raises:
         ValueError: for a replan interval longer than the horizon, a follower that does not support the execution, a
-            StatePlanner without follower or a DiffusionPolicy with one; at a call for another batch size or history,
-            or a plan of another shape than ``[*B, H, d]``.
+            StatePlanner without follower or a DiffusionPolicy with one, or several candidates of a planner that is no
+            ConditionalSampler; at a call for another batch size, history or noise, or a plan not ``[*B, H, d]``.
         KeyError: at a call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
 
     Examples:
