@@ -50,9 +50,9 @@ def test_a_run_as_one_file(trained_run, tmp_path):
     path = Trained.load(tmp_path / "run").save(tmp_path / "elsewhere" / "policy.safetensors")
     shutil.rmtree(tmp_path / "run")
     loaded = load_policy(path, strategy="open_loop", replan_interval=2)
-    assert loaded.execution == Execution("open_loop", replan_interval=2) and not loaded.training
+    assert loaded.execution == Execution("open_loop", replan_interval=2, candidates=4) and not loaded.training
     np.testing.assert_array_equal(actions(loaded), expected)
-    assert load_policy(str(path)).execution == Execution()
+    assert load_policy(str(path)).execution == Execution(candidates=4)
 
 
 def test_errors_distinguish_unfinished_from_damaged_trainings(trained_run, tmp_path):
@@ -85,7 +85,7 @@ def test_a_method_that_samples_actions(demonstrations, tmp_path):
     with pytest.raises(ValueError, match=r"blend 0\.2 was asked of method 'dp', which samples actions"):
         load_policy(tmp_path / "dp", blend=0.2)
     loaded = load_policy(Trained.load(tmp_path / "dp").save(tmp_path / "dp.safetensors"), replan_interval=3)
-    assert loaded.follower is None and loaded.execution == Execution("open_loop", replan_interval=3)
+    assert loaded.follower is None and loaded.execution == Execution("open_loop", replan_interval=3, candidates=4)
     np.testing.assert_array_equal(actions(loaded), actions(load_policy(tmp_path / "dp", replan_interval=3)))
 
 
