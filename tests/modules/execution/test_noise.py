@@ -76,22 +76,24 @@ def test_of_several_candidates_the_first_of_the_nearest_pair_is_planned(batch):
 
 
 def test_candidates_are_compared_in_normalised_units_and_begin_with_the_prefix():
+    def first_of_nearest(plans):
+        gaps = [(plans[:, one] - plans[:, two]).square().sum((-1, -2)) for one, two in ((0, 1), (0, 2), (1, 2))]
+        return torch.tensor([0, 0, 1])[torch.stack(gaps).argmin(0)]
+
     torch.manual_seed(0)
     planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2, num_steps=2)
     planner.fit_normalizers(torch.tensor([1e3, 1e-3]) * torch.randn(50, 16, 2).cumsum(1))
     given = {"state_of": (0, 1), "execution": Execution(candidates=3)}
     policy = make_policy(planner, make_koopman_inverse_dynamics(2, 2), **given)
-    states, noise = torch.zeros(5, policy.history, 2), torch.randn(5, 3, 14, 2)
-    prefix = torch.tensor([1e2, 1e-4]) * torch.ones(5, 2, 2)
+    states, noise = torch.zeros(20, policy.history, 2), torch.randn(20, 3, 14, 2)
+    prefix = torch.tensor([1e2, 1e-4]) * torch.ones(20, 2, 2)
     plans = torch.stack([planner.sample(states[:, -2:], noise[:, which], prefix=prefix) for which in range(3)], 1)
-    gaps = [(planner.encode(states[:, None, -2:], plans)[:, one] - planner.encode(states[:, None, -2:], plans)[:, two])
-            .square().sum((-1, -2)) for one, two in ((0, 1), (0, 2), (1, 2))]  # fmt: skip
-    first = torch.tensor([0, 0, 1])[torch.stack(gaps).argmin(0)]
-    assert len(first.unique()) == 2
-    with pytest.raises(ValueError, match=r"noise must be \[5, 3, 14, 2\] .* got \[5, 14, 2\]"):
+    first = first_of_nearest(planner.encode(states[:, None, -2:], plans))
+    assert len(first.unique()) == 2 and (first != first_of_nearest(plans)).any()
+    with pytest.raises(ValueError, match=r"noise must be \[20, 3, 14, 2\] .* got \[20, 14, 2\]"):
         policy.sample(states, noise[:, 0])
     plan = policy.sample(states, noise, prefix=prefix)
-    torch.testing.assert_close(plan, plans[torch.arange(5), first], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(plan, plans[torch.arange(20), first], rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(plan[:, :2], prefix, rtol=1e-4, atol=1e-6)
 
 
