@@ -43,9 +43,13 @@ def test_figures_of_the_readme_are_those_of_the_cells():
             low, high = wilson(successes, n)
             assert text.strip() == f"{100 * successes / n:.0f} ({100 * low:.0f}-{100 * high:.0f})"
     with (SOURCE / "facts.csv").open() as file:
-        facts = {row["key"]: f"{row['value']} {row['unit']}".strip() for row in csv.DictReader(file)}
+        rows = {row["key"]: row for row in csv.DictReader(file)}
+    facts = {key: f"{row['value']} {row['unit']}".strip() for key, row in rows.items()}
     assert f"The demo takes {facts['demo_total']}." in readme and f"about {facts['own_data_fit']} on" in readme
-    assert "57 of 60 rollouts" in readme and "86.3-98.3" in readme and "0.857" in readme
+    successes, n = (int(rows["demo_success"][key]) for key in ("successes", "n"))
+    low, high = wilson(successes, n)
+    shown = f"{successes} of {n} rollouts ({100 * successes / n:.1f} % ({100 * low:.1f}-{100 * high:.1f}))"
+    assert shown in readme and f"is {facts['demo_entropy']} of 1" in readme
 
 
 def wilson(successes, n, z=1.959963984540054):
