@@ -90,7 +90,7 @@ def test_candidates_are_compared_in_normalised_units_and_begin_with_the_prefix()
     plans = torch.stack([planner.sample(states[:, -2:], noise[:, which], prefix=prefix) for which in range(3)], 1)
     first = first_of_nearest(planner.encode(states[:, None, -2:], plans))
     assert len(first.unique()) == 2 and (first != first_of_nearest(plans)).any()
-    with pytest.raises(ValueError, match=r"noise must be \[20, 3, 14, 2\] .* got \[20, 14, 2\]"):
+    with pytest.raises(ValueError, match=r"'noise' must be \[20, 3, 14, 2\] .* got \[20, 14, 2\]"):
         policy.sample(states, noise[:, 0])
     plan = policy.sample(states, noise, prefix=prefix)
     torch.testing.assert_close(plan, plans[torch.arange(20), first], rtol=1e-4, atol=1e-6)

@@ -49,8 +49,9 @@ class Execution:
     def __post_init__(self):
         lookup(STRATEGIES, self.strategy, "strategy")
         for name in ("replan_interval", "candidates"):
-            if type(asdict(self)[name]) is not int or asdict(self)[name] < 1:
-                raise ValueError(f"{name} must be an integer >= 1, got {asdict(self)[name]!r}")
+            value = vars(self)[name]
+            if type(value) is not int or value < 1:
+                raise ValueError(f"{name} must be an integer >= 1, got {value!r}")
         if not 0 <= self.blend < 1:
             raise ValueError(f"blend must be in [0, 1), got {self.blend}")
         if not 0 <= self.lead < math.inf:

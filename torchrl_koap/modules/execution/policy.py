@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import Follower, remaining_plan
 from torchrl_koap.modules.planning.diffusion_policy import ACTION_CHUNK, DiffusionPolicy
 from torchrl_koap.modules.planning.planner import StatePlanner
-from torchrl_koap.modules.planning.sampler import ConditionalSampler, nearest_pair
+from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
 OBSERVATION_HISTORY = "observation_history"
 IS_INIT = "is_init"
@@ -176,27 +177,21 @@ class PlanningPolicy(TensorDictModuleBase):
             return chunk
         return self.follower(observations, states, chunk, self.execution.replan_interval)
 
-    def sample(self, states: Tensor, noise: Tensor | None = None, *, prefix: Tensor | None = None) -> Tensor:
-        """Samples plans ``[*B, H, w]`` at the temperature of the execution.
+    def sample(self, states: Tensor, noise: Tensor | None = None, **options: Any) -> Tensor:
+        """Samples plans ``[*B, H, w]`` at the temperature of the execution, from as many candidates as it says.
 
-        The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`, a prefix ``[*B, k, w]`` as for
-        the planner's ``sample``. Of several candidates, the first of the two nearest to each other is returned
-        (:func:`~torchrl_koap.modules.planning.sampler.nearest_pair`).
+        The last observed states are ``[*B, history, d]``, the noise as for :meth:`plan`; options go to the planner's
+        ``sample``, for example ``prefix``.
         """
         if noise is None:
             shape = (*states.shape[:-2], *self.noise_shape)
             noise = torch.randn(shape, dtype=states.dtype, device=states.device)
         seen = states[..., -self.planner.history :, :]
-        options = {} if prefix is None else {"prefix": prefix}
-        several = self.execution.candidates > 1
-        if several:
-            if noise.shape != (shape := (*states.shape[:-2], *self.noise_shape)):
-                raise ValueError(f"noise must be {list(shape)} ([*B, candidates, H, w]), got {list(noise.shape)}")
-            seen, options = _repeated(seen, noise), {name: _repeated(value, noise) for name, value in options.items()}
-        chunk = self.planner.sample(seen, self.execution.temperature * noise, **options)
-        if several:
-            chosen = nearest_pair(self.planner.encode(seen, chunk))[..., None, None, None]
-            seen, chunk = seen[..., 0, :, :], chunk.gather(-3, chosen.expand_as(chunk[..., :1, :, :])).squeeze(-3)
+        if self.execution.candidates > 1:
+            sample = partial(self.planner.sample_nearest, candidates=self.execution.candidates)
+        else:
+            sample = self.planner.sample
+        chunk = sample(seen, self.execution.temperature * noise, **options)
         wanted = (*seen.shape[:-2], self.planner.horizon, seen.shape[-1])
         if self.follower is not None and chunk.shape != wanted:
             raise ValueError(f"a plan must be {list(wanted)} ([*B, horizon, d]), got {list(chunk.shape)}")
@@ -319,11 +314,6 @@ class _Chunk(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
         return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
-
-
-def _repeated(value: Tensor, noise: Tensor) -> Tensor:
-    """Repeats values ``[*B, n, d]`` for every candidate of noise ``[*B, candidates, H, w]``."""
-    return value.unsqueeze(-3).expand(*noise.shape[:-2], *value.shape[-2:])
 
 
 def columns_of(state_of: Callable[[Tensor], Tensor] | Sequence[int]) -> Callable[[Tensor], Tensor]:

@@ -152,6 +152,26 @@ class ConditionalSampler(TensorDictModuleBase):
         )
         return self.decode(history, sequence)
 
+    def sample_nearest(
+        self, history: Tensor, noise: Tensor | None = None, *, candidates: int, prefix: Tensor | None = None
+    ) -> Tensor:
+        """Samples several sequences and returns one of the two nearest to each other, ``[*B, H, width]``.
+
+        Distances are those of normalised sequences. Where several routes are possible, a sequence between two has no
+        near neighbour. Arguments and errors as for :meth:`sample`; the noise is ``[*B, candidates, H, width]``.
+        """
+
+        def repeated(value: Tensor) -> Tensor:
+            return value.unsqueeze(-3).expand(*value.shape[:-2], candidates, *value.shape[-2:])
+
+        history, given = repeated(history), {} if prefix is None else {"prefix": repeated(prefix)}
+        found = self.sample(history, noise, **given)
+        flat = self.encode(history, found).flatten(-2)
+        gaps = (flat.unsqueeze(-2) - flat.unsqueeze(-3)).square().sum(-1)
+        itself = torch.eye(candidates, dtype=torch.bool, device=flat.device)
+        first = gaps.masked_fill(itself, torch.inf).amin(-1).argmin(-1)[..., None, None, None]
+        return found.gather(-3, first.expand_as(found[..., :1, :, :])).squeeze(-3)  # exports keep the batch dynamic
+
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the sampled sequence into the tensordict."""
@@ -168,23 +188,6 @@ class ConditionalSampler(TensorDictModuleBase):
             )
         rest = prefix[..., -1:, :].expand(*prefix.shape[:-2], self.horizon - frames, -1)
         return self.encode(history, torch.cat([prefix, rest], -2))[..., :frames, :]
-
-
-def nearest_pair(sequences: Tensor) -> Tensor:
-    """Returns the first of the two most similar candidates of normalised sequences ``[*B, candidates, H, w]``.
-
-    The index is int64 ``[*B]``. Where several routes are possible, a sequence between them has no close neighbour.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.planning.sampler import nearest_pair
-        >>> nearest_pair(torch.tensor([0.0, 5.0, 9.0, 5.5]).reshape(4, 1, 1))
-        tensor(1)
-    """
-    flat = sequences.flatten(-2)
-    gaps = (flat.unsqueeze(-2) - flat.unsqueeze(-3)).square().sum(-1)
-    itself = torch.eye(flat.shape[-2], dtype=torch.bool, device=flat.device)
-    return gaps.masked_fill(itself, torch.inf).amin(-1).argmin(-1)
 
 
 def _check(value: Tensor, name: str, frames: int, columns: int, sizes: str) -> None:
