@@ -95,4 +95,5 @@ for name, angle in COUNTED.items():
         data=DATA,
         package="gymnasium_robotics",
         install="pip install --no-deps gymnasium-robotics==1.4.2",
+        runs_of="adroit_door",
     )

@@ -28,6 +28,7 @@ class Ground:
         data (Path, optional): file or folder that must exist.
         package (str, optional): module of the simulator.
         install (str): command that installs that package.
+        runs_of (str, optional): ground whose data set and runs this one scores. Default: its own.
     """
 
     write: Callable[[Path], None]
@@ -39,6 +40,7 @@ class Ground:
     data: Path | None = None
     package: str | None = None
     install: str = ""
+    runs_of: str | None = None
 
     def missing(self) -> str | None:
         """Returns what is missing to run this ground and how to get it; None if nothing is missing."""

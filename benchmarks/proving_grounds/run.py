@@ -108,14 +108,14 @@ def run_cell(
     trained = train(config)
     seconds = time.process_time() - began
     part = trained.results["planner" if get_method(config.method).plans else "controller"]
-    held_out = part.get("best_held_out_score")
+    held_out, kept = part.get("best_held_out_score"), part.get("kept_update")
     rows = []
     for way, execution in executions.items():
         row = {"ground": name, "method": config.method, "labels": config.labels.count, "seed": config.run.seed}
         row |= {"execution": way, "n": n}
         row |= judge(trained) if ground.env is None else roll(ground, trained, execution, n)
         row["held_out_score"] = "" if held_out is None else f"{held_out:.4f}"
-        row |= {"kept_update": part.get("kept_update", ""), "train_core_seconds": f"{seconds:.0f}"}
+        row |= {"kept_update": "" if kept is None else int(kept), "train_core_seconds": f"{seconds:.0f}"}
         rows.append(tuple(row.get(column, "") for column in COLUMNS))
     return rows
 
@@ -163,6 +163,7 @@ def main(
         if missing := ground.missing():
             print(f"{name} is skipped: {missing}")
             continue
+        runs = ground.runs_of or name
         for seed in range(seeds):
             for count in labels or ground.labels:
                 trials = (n or ground.n) - count * (ground.env is None)
@@ -172,16 +173,16 @@ def main(
                     own = {way: each for way, each in own.items() if tuple(map(str, (*cell, way, trials))) not in done}
                     if not own:
                         continue
-                    if not (folder / name / "ted").is_dir():
-                        ground.write(folder / name)
+                    if not (folder / runs / "ted").is_dir():
+                        ground.write(folder / runs)
                     takes = method in planning[1:]
                     config = TrainConfig(
-                        dataset=str(folder / name),
-                        out=folder / "-".join(map(str, cell)),
+                        dataset=str(folder / runs),
+                        out=folder / f"{runs}-{method}-{count}-{seed}",
                         method=method,
                         labels=LabelConfig(count=count),
                         planner=PlannerConfig(
-                            source=folder / f"{name}-{planning[0]}-{count}-{seed}" if takes else None,
+                            source=folder / f"{runs}-{planning[0]}-{count}-{seed}" if takes else None,
                             steps=None if takes else steps,
                         ),
                         run=RunConfig(seed=seed, resume=True),

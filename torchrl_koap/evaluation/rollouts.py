@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
@@ -24,6 +24,14 @@ from torchrl_koap.tasks import Task
 
 SHOWN = 6  # most state columns that are drawn for a task without an environment
 AT_ONCE = 500  # default number of parallel episodes
+
+
+@runtime_checkable
+class EpisodeSeeds(Protocol):
+    """An environment or a transform that draws random numbers per episode."""
+
+    def seed_episodes(self, seeds: Sequence[int]) -> None:
+        """Seeds every parallel episode, so that none depends on the others."""
 
 
 @torch.no_grad()
@@ -56,8 +64,8 @@ def roll_out(
         part = seeds[begin : begin + size]
         env = make_env(len(part))
         env.set_seed(part[0])  # for the environment's own random numbers
-        for module in env.modules():  # transforms, and the environment itself, with a generator per episode
-            if hasattr(module, "seed_episodes"):
+        for module in env.modules():  # transforms, and the environment itself
+            if isinstance(module, EpisodeSeeds):
                 module.seed_episodes(part)
         transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
