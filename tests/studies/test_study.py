@@ -28,17 +28,19 @@ def asked(demonstrations, tmp_path):
     return make
 
 
-def test_cells_of_all_seeds_share_a_planner_that_knows_no_seed(asked):
+def test_cells_of_a_seed_share_a_planner_of_that_seed(asked):
     planner = PlannerConfig(network="mlp", width=64)
     study, cells = asked(methods=("koap", "dp"), planner=planner, controller=ControllerConfig(steps=7))
     assert [cell.folder for cell in cells] == [
         f"cells/avoiding/{method}-0.5-1-seed{seed}" for seed in (0, 1) for method in ("koap", "dp")
     ]
-    shared = study.out / "planners/avoiding/1-seed0"
-    alone = study.planner_config(cells[0])
-    assert (alone.out, alone.planner, alone.run.seed, alone.labels.fraction) == (shared, planner, 0, None)
     for cell in cells:
+        shared = study.out / f"planners/avoiding/1-seed{cell.seed}"
         config = study.train_config(cell)
+        if cell.method == "koap":
+            alone = study.planner_config(cell)
+            assert (alone.out, alone.planner, alone.labels.fraction) == (shared, planner, None)
+            assert alone.run.seed == cell.seed
         assert (config.labels.fraction, config.run.seed, config.controller.steps) == (0.5, cell.seed, 7)
         expected = planner if cell.method == "dp" else PlannerConfig(source=shared)
         assert config.planner == expected and config.out == study.out / cell.folder
@@ -46,7 +48,7 @@ def test_cells_of_all_seeds_share_a_planner_that_knows_no_seed(asked):
 
 def test_a_planner_per_share_of_the_demonstrations(asked):
     study, cells = asked(methods=("koap",), demonstrations=(0.5, 1.0), seeds=3)
-    assert {study.planner_folder(cell).name for cell in cells} == {"0.5-seed0", "1-seed0"}
+    assert {study.planner_folder(cell).name for cell in cells} == {f"{a}-seed{s}" for a in (0.5, 1) for s in range(3)}
     half = study.planner_config(cells[0])
     assert (half.labels.trajectories, half.run.seed) == (0.5, 0)
 
@@ -113,7 +115,7 @@ def test_levels_two_and_four_of_a_table_have_one_seed_unless_told_otherwise(aske
 
 def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
     study = complete(Study(out=tmp_path, preset="table1", tasks=("aligning", "sorting"), methods=("koap",), seeds=1))
-    assert (study.label_unit, study.labels, study.planner.width) == ("window", (), 512)
+    assert (study.label_unit, study.labels, study.planner) == ("window", (), PlannerConfig())
     shares = {task: [cell.labels for cell in study.cells() if cell.task == task] for task in study.tasks}
     assert shares == {"aligning": [0.02, 0.05, 0.1, 0.25, 0.5], "sorting": [0.01, 0.02, 0.05, 0.1, 0.25]}
     assert [config.split("=")[0] for config in study.datasets] == []

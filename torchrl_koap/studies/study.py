@@ -47,7 +47,6 @@ _TABLE_1: dict[str, Any] = {
     "levels": (1, 2, 3, 4, 5),
     "first_seed_only": (2, 4),
     "label_unit": "window",
-    "planner": {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3},
 }
 PRESETS: dict[str, dict[str, Any]] = {
     "table1": _TABLE_1,
@@ -71,7 +70,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "levels": (1,),
         "record": 48,
         "seeds": 1,
-        "planner": _TABLE_1["planner"] | {"steps": 2000, "width": 256, "batch_size": 128},
+        "planner": {"network": "mlp", "steps": 2000, "width": 256, "batch_size": 128},
         "controller": {"steps": 200},
         "evaluation": {"episodes": 10},
     },
@@ -112,7 +111,7 @@ class Study:
         demonstrations: shares of the demonstrations that planner and controller use at all (default: 1).
         seeds: number of seeds of label choice and training (default: 3).
         planners: finished run, or pretrained:NAME, whose planner all cells of a task share, or TASK=RUN for each
-            (default: one is trained). It must be trained on the same data; this is not checked.
+            (default: one is trained for each seed). It must be trained on the same data; this is not checked.
         planner: network and training of planners, and of methods that sample actions without a planner.
         controller: training of every controller.
         execution: how plans become actions.
@@ -167,9 +166,8 @@ class Study:
         """Returns the run whose planner a cell uses, None for a method without one."""
         if not get_method(cell.method).plans:
             return None
-        return Path(
-            self.given_planner(cell.task) or self.out / f"planners/{cell.task}/{cell.demonstrations:.15g}-seed0"
-        )
+        own = self.out / f"planners/{cell.task}/{cell.demonstrations:.15g}-seed{cell.seed}"
+        return Path(self.given_planner(cell.task) or own)
 
     def cells(self) -> list[Cell]:
         """Lists the cells of a complete study in the given order; repeated names count once."""
@@ -199,14 +197,14 @@ class Study:
         return union(self.labels, [shares[level - 1] for level in levels])
 
     def planner_config(self, cell: Cell) -> TrainConfig:
-        """Returns the options for training the planner that a cell shares, which sees no labels."""
+        """Returns the options for training the planner that a cell shares with others of its seed; it sees no labels."""
         return TrainConfig(
             out=self.planner_folder(cell),
             dataset=str(self.dataset_folder(cell.task)),
             task=cell.task,
             labels=LabelConfig(trajectories=cell.demonstrations),
             planner=self.planner,
-            run=replace(self.run, threads=1),
+            run=replace(self.run, seed=cell.seed, threads=1),
         )
 
     def train_config(self, cell: Cell) -> TrainConfig:
