@@ -27,7 +27,10 @@ def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):
     assert "labelled steps" in capsys.readouterr().out
     assert koap("convert", tmp_path / "plain", "--out", tmp_path / "again", "--robot", "q1", "q2") == 0
     frames = find_task_of(tmp_path / "again").defaults.planner["frames"]
-    assert re.search(rf"planner observes +{frames} frame", capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(rf"planner observes +{frames} frame", said) and re.search(
+        "planner trains +at most 3,000 updates", said
+    )
     one, other = (load_ted(folder / "ted")[0] for folder in (arm, tmp_path / "again"))
     assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
 

@@ -18,7 +18,7 @@ from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.action_kinds import describe_likely, likely_kinds
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings, write_recordings
-from torchrl_koap.data.observed_frames import observed_frames
+from torchrl_koap.data.planner_choices import observed_frames, planner_updates
 from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
 from torchrl_koap.data.sources import check_new, find_task_of
 from torchrl_koap.data.ted import source_names, stored_folder
@@ -192,6 +192,7 @@ class Convert(Command):
             "constant in each trajectory": ", ".join(goal_columns(recordings)) or "nothing",
             "subtracted": ", ".join(f"{value:.6g} from {name}" for name, value in origin if value) or "nothing",
             "planner observes": observed_frames(data, task)[1],
+            "planner trains": planner_updates(len(data))[1],
             "a plan covers": plan_coverage(data, task.control_hz)[0],
             **_numbered([str(warning.message) for warning in unlikely or ()], data),
             "next": _next(folder, task, recordings),

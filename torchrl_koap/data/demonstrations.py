@@ -18,7 +18,7 @@ from tensordict import TensorDict
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each, wrong_rate
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
-from torchrl_koap.data.observed_frames import observed_frames
+from torchrl_koap.data.planner_choices import observed_frames, planner_updates
 from torchrl_koap.data.quality import constant_columns, find_warnings
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state
@@ -245,7 +245,8 @@ def make_demonstrations(
     known = select_state(data, task.state_of)
     for said in find_warnings(known, task, sources):
         warnings.warn(said, stacklevel=2)
-    return data, replace(task, defaults=Defaults(planner={"frames": observed_frames(known, task)[0]}))
+    planner = {"frames": observed_frames(known, task)[0], "steps": planner_updates(len(known))[0]}
+    return data, replace(task, defaults=Defaults(planner=planner))
 
 
 _COMMAND = "command"

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.planner_choices import LEAST_UPDATES
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
@@ -27,7 +28,7 @@ CONTROLLER_UPDATES = 500
 PLACES = "absolute"  # default preset if decoded actions are positions
 FOLLOWED = "delayed"  # default preset if they are targets of state columns, which a robot reaches with a delay
 # planner options for recorded data, usually a hundred demonstrations or so: they avoid overfitting
-OWN_DATA: dict[str, Any] = {"steps": 3000, "network": "mlp", "octaves": 0, "held_out": 0.1}
+OWN_DATA: dict[str, Any] = {"steps": LEAST_UPDATES, "network": "mlp", "octaves": 0, "held_out": 0.1}
 OWN_TEMPERATURE = 0.4  # of plans in tasks without an environment, where no modes are counted
 PLAN_SECONDS = 0.1  # between plans with feedback, within limits: a new plan starts where the robot lags behind the last
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Chooses how many frames a planner of recorded data observes."""
+"""Chooses how many frames a planner of recorded data observes, and how many updates train it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,15 @@ from torchrl_koap.tasks import HISTORY, WINDOW, Task
 ENOUGH = 2.0  # the last change is observed if it lowers the error of predictions by more than this factor
 WEIGHTS = (0.5, 1.0, 2.0, 4.0)  # of the last change in distances; the best one counts
 NEIGHBORS, WINDOWS, ASKED = 5, 20_000, 2_000  # windows at most, and predictions
+PER_UPDATE = 8  # recorded steps; an update reads 512 windows, so all are read 64 times
+LEAST_UPDATES, MOST_UPDATES = 3000, 12_000
+
+
+def planner_updates(steps: int) -> tuple[int, str]:
+    """Chooses the most updates, in thousands, for a planner of recordings with ``steps`` in all; and says why."""
+    updates = min(max(round(steps // PER_UPDATE, -3), LEAST_UPDATES), MOST_UPDATES)
+    why = f"one for {PER_UPDATE} recorded steps, from {LEAST_UPDATES:,} to {MOST_UPDATES:,}"
+    return updates, f"at most {updates:,} updates: {why}"
 
 
 def observed_frames(data: TensorDictBase, task: Task) -> tuple[int, str]:

@@ -8,7 +8,7 @@ from env_test_base import HUMAN
 
 from torchrl_koap import PlannerConfig, TrainConfig
 from torchrl_koap.data import make_demonstrations, open_dataset, save_demonstrations, select_state
-from torchrl_koap.data.observed_frames import motion_gain, observed_frames
+from torchrl_koap.data.planner_choices import motion_gain, observed_frames, planner_updates
 from torchrl_koap.data.sources import find_task_of
 from torchrl_koap.tasks import WINDOW, get_task
 from torchrl_koap.training.defaults import resolve
@@ -79,7 +79,7 @@ def test_units_do_not_count():
 def test_without_two_trajectories_as_long_as_a_window_two_frames_are_observed(number, length):
     states = [np.random.default_rng(row).normal(size=(length, 2)).cumsum(0) for row in range(number)]
     _, task = described(states)
-    assert task.defaults.planner == {"frames": 2}
+    assert task.defaults.planner["frames"] == 2
 
 
 @pytest.mark.parametrize("length", [WINDOW + 1, WINDOW + 3])
@@ -98,7 +98,7 @@ def test_a_route_that_is_taken_both_ways_has_two_frames():
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_robot_that_rests_has_one_frame():
     _, task = described([np.zeros((FRAMES, 3))] * 3, robot=[0, 1])
-    assert task.defaults.planner == {"frames": 1}
+    assert task.defaults.planner["frames"] == 1
 
 
 @pytest.mark.skipif(not HUMAN.exists(), reason=f"no human demonstrations at {HUMAN}")
@@ -106,3 +106,18 @@ def test_human_demonstrations_of_avoiding_have_two_frames():
     task = get_task("avoiding")
     data, _ = open_dataset(HUMAN, task=task)
     assert observed_frames(data, task)[0] == 2
+
+
+@pytest.mark.parametrize(("steps", "updates"), [(2000, 3000), (25_444, 3000), (35_865, 4000), (185_026, 12_000)])
+def test_more_recorded_steps_get_more_updates(steps, updates):
+    assert planner_updates(steps) == (
+        updates,
+        f"at most {updates:,} updates: one for 8 recorded steps, from 3,000 to 12,000",
+    )
+
+
+def test_own_data_train_for_the_updates_that_their_size_asks_for(tmp_path):
+    task = described([np.random.default_rng(0).normal(size=(40_000, 2)).cumsum(0)] * 2)[1]
+    assert resolve(TrainConfig(out=tmp_path), task).planner.steps == 10_000
+    asked = TrainConfig(out=tmp_path, planner=PlannerConfig(steps=500, network="unet"))
+    assert resolve(asked, task).planner.steps == 500
