@@ -46,6 +46,8 @@ class StudyResult:
 def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
     """Runs the missing cells of a study and writes its report; ``koap curve`` calls this.
 
+    A script must call it under ``if __name__ == "__main__":``, because workers import the script.
+
     Args:
         study (Study): what to compare, and where to write it.
         machines (Machines, optional): where the cells run.
