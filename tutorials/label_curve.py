@@ -16,7 +16,7 @@ the same.
 # %%
 # A small curve
 # -------------
-# Three methods, two shares of labels and two seeds make twelve trainings, called cells. They share one planner. Few
+# Three methods, two shares of labels and two seeds make twelve trainings, called cells. Each seed has a planner. Few
 # updates and rollouts keep the time to minutes. ``koap curve`` has options of the same names.
 
 import importlib.util
@@ -40,7 +40,7 @@ if __name__ == "__main__":  # workers import this file
         record=40,
         planner=PlannerConfig(steps=600),
         controller=ControllerConfig(steps=100),
-        evaluation=EvalConfig(episodes=12, threads=1),
+        evaluation=EvalConfig(episodes=12),
     )
     machines = Machines(workers=2, launcher=launcher)
     result = run_study(study, machines)
