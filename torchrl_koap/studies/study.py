@@ -197,7 +197,7 @@ class Study:
         return union(self.labels, [shares[level - 1] for level in levels])
 
     def planner_config(self, cell: Cell) -> TrainConfig:
-        """Returns the options for training the planner that a cell shares with others of its seed; it sees no labels."""
+        """Returns the options for training the planner that all cells of a seed share, which sees no labels."""
         return TrainConfig(
             out=self.planner_folder(cell),
             dataset=str(self.dataset_folder(cell.task)),
