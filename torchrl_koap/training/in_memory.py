@@ -96,7 +96,7 @@ def fit(
         >>> data, task = make_demonstrations(states, actions, control_hz=30)
         >>> trained = fit(data, task, planner={"steps": 2, "width": 8}, controller={"steps": 2}, progress=False)
         >>> task.defaults.planner  # chosen for these data
-        {'frames': 1}
+        {'frames': 1, 'steps': 3000}
         >>> trained.planner.sample(data["observation"][None, :1]).shape
         torch.Size([1, 14, 2])
         >>> other = fit(data, task, method="linear", planner=trained.planner, progress=False)
