@@ -2,6 +2,7 @@
 """Tests proving grounds: data sets, and rows of rollouts or of errors on recordings."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,6 +141,21 @@ def test_a_row_is_the_mean_largest_reward(table_of):
 def test_a_row_counts_what_the_simulator_calls_success(table_of):
     _, (row,) = table_of("success")
     assert (row["successes"], row["n"], row["largest_reward"]) == ("12", "12", "")
+
+
+def test_a_ground_scores_the_runs_of_another(monkeypatch, tmp_path):
+    written, asked = [], []
+    first = Ground(
+        lambda folder: (written.append(folder.name), (folder / "ted").mkdir(parents=True)), "errors", (10,), 12
+    )
+    monkeypatch.setattr(run, "grounds", lambda: {"wide": first, "narrow": replace(first, runs_of="wide")})
+    monkeypatch.setattr(run, "train", lambda config: asked.append(config) or Ran)
+    monkeypatch.setattr(run, "judge", lambda trained: {})
+    run.main(seeds=1, methods=("koap", "linear_steps"), folder=tmp_path, results=tmp_path / "table.csv")
+    assert written == ["wide"] and asked[:2] == asked[2:]
+    assert asked[3].planner.source == asked[0].out == tmp_path / "wide-koap-10-0"
+    with (tmp_path / "table.csv").open() as file:
+        assert [row["ground"] for row in csv.DictReader(file)] == ["wide", "wide", "narrow", "narrow"]
 
 
 def test_a_row_has_errors_on_recordings_without_a_simulator(table_of):
