@@ -82,11 +82,9 @@ def main(
                 run=RunConfig(seed=seed, resume=True),
             )
             trained = train(config)
-            rate = evaluate(trained.folder, EvalConfig(env=ENV, episodes=N, seed=FIRST_SEED))["rates"]["success"][
-                "rate"
-            ]
-            found = trained.results["planner"]
-            write((*key, round(rate * N), f"{found['best_held_out_score']:.4f}", int(found["kept_update"])))
+            result = evaluate(trained.folder, EvalConfig(env=ENV, episodes=N, seed=FIRST_SEED))
+            successes, found = round(result["rates"]["success"]["rate"] * N), trained.results["planner"]
+            write((*key, successes, f"{found['best_held_out_score']:.4f}", int(found["kept_update"])))
 
 
 if __name__ == "__main__":
