@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from scipy.stats import spearmanr
 from tables import fact, percent, read_rows, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -134,6 +135,18 @@ def _beside(score: Score | None, seeds: int) -> str:
     if score is None:
         return "not run"
     return score.text + ONE_SEED * (score.seeds < seeds)
+
+
+def rank_correlations() -> str:
+    """Formats rank correlations of each score in ``planner_scores.csv`` with failures, for every ground and seed."""
+    rows, body = read_rows("planner_scores"), []
+    for name, seed in dict.fromkeys((row["ground"], row["seed"]) for row in rows):
+        cells = [row for row in rows if (row["ground"], row["seed"]) == (name, seed)]
+        failures = [int(row["n"]) - int(row["successes"]) for row in cells]
+        scores = [[float(row[kind]) for row in cells] for kind in ("plan_score", "energy_score")]
+        found = [f"{spearmanr(score, failures)[0]:.2f}" for score in scores]
+        body.append([name, seed, str(len(cells)), *found])
+    return table(["benchmark", "training seed", "planners", "plan score", "energy score alone"], body)
 
 
 def draw_grounds(path: Path) -> Path:

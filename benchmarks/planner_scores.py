@@ -19,10 +19,10 @@ from typing import Annotated
 
 import torch
 import tyro
+from ground_rows import rank_correlations
 from proving_grounds.ground import SHARED, Ground
 from proving_grounds.run import grounds, roll
-from scipy.stats import spearmanr
-from tables import open_table, read_rows
+from tables import open_table
 
 from torchrl_koap import EvalConfig, LabelConfig, Trained, fit, load_policy
 from torchrl_koap.data import cut_windows, open_dataset
@@ -90,16 +90,6 @@ def study(name: str, ground: Ground | None, folder: Path, seed: int, n: int) -> 
         print(*row, flush=True)
 
 
-def correlations() -> None:
-    """Prints the rank correlation of each score with failures, for every ground and seed."""
-    rows = read_rows("planner_scores")
-    for name, seed in dict.fromkeys((row["ground"], row["seed"]) for row in rows):
-        cells = [row for row in rows if (row["ground"], row["seed"]) == (name, seed)]
-        failures = [int(row["n"]) - int(row["successes"]) for row in cells]
-        found = {kind: spearmanr([float(row[kind]) for row in cells], failures)[0] for kind in COLUMNS[6:8]}
-        print(name, seed, *(f"{kind} {value:.2f}" for kind, value in found.items()), f"of {len(cells)} planners")
-
-
 def main(
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pusht", HUMAN),
     /,
@@ -124,7 +114,7 @@ def main(
             sys.exit(f"{name} has no simulator here: {ground.missing()}")
         for seed in range(seeds):
             study(name, ground, folder.resolve(), seed, n)
-    correlations()
+    print(rank_correlations())
 
 
 if __name__ == "__main__":

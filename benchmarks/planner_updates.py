@@ -1,8 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Measures how many updates suit the planner of more and fewer recordings: Aligning as if it were a user's own data.
+"""Measures which planner suits more and fewer recordings: Aligning as if it were a user's own data.
 
     koap demos --task aligning --episodes 1000 --disturbance 0.5 --out runs/aligning1000
     python benchmarks/planner_updates.py runs/aligning1000
+    python benchmarks/planner_updates.py runs/aligning1000 --demonstrations 1000 --updates 12000 --octaves 4
 
 The data sets hold the numbers that the simulator observes, 20 labelled demonstrations and no definition of the task.
 Rows of the table are not run again. ``torchrl_koap/data/planner_choices.py`` chooses updates by these rows.
@@ -22,7 +23,7 @@ from torchrl_koap import EvalConfig, LabelConfig, PlannerConfig, RunConfig, Trai
 from torchrl_koap.data import open_dataset, save_demonstrations
 
 RESULTS = Path(__file__).resolve().parent / "results" / "planner_updates.csv"
-KEYS = ("demonstrations", "updates", "seed", "n")
+KEYS = ("demonstrations", "network", "octaves", "updates", "seed", "n")
 COLUMNS = (*KEYS, "successes", "held_out_score", "kept_update")
 ENV, LABELLED, N, FIRST_SEED = "torchrl_koap/Aligning-v0", 20, 100, 1000
 
@@ -50,6 +51,8 @@ def main(
     *,
     demonstrations: tuple[int, ...] = (300, 1000),
     updates: tuple[int, ...] = (3000, 6000, 12_000),
+    network: str = "mlp",
+    octaves: int = 0,
     seed: int = 0,
     folder: Path = Path("runs/planner_updates"),
     results: Path = RESULTS,
@@ -60,6 +63,8 @@ def main(
         dataset: recorded demonstrations of Aligning.
         demonstrations: numbers of demonstrations.
         updates: most updates of the planner.
+        network: network of the planner.
+        octaves: octaves of its Fourier features.
         seed: training seed.
         folder: folder of data sets and runs.
         results: the table.
@@ -69,16 +74,16 @@ def main(
     for number in demonstrations:
         own = folder.resolve() / f"data_{number}"
         for most in updates:
-            key = (number, most, seed, N)
+            key = (number, network, octaves, most, seed, N)
             if tuple(map(str, key)) in done:
                 continue
             if not own.exists():
                 write_own_data(own, dataset, number)
             config = TrainConfig(
                 dataset=str(own),
-                out=folder.resolve() / f"{number}-{most}-{seed}",
+                out=folder.resolve() / "-".join(map(str, key[:5])),
                 labels=LabelConfig(count=LABELLED),
-                planner=PlannerConfig(steps=most),
+                planner=PlannerConfig(steps=most, network=network, octaves=octaves),
                 run=RunConfig(seed=seed, resume=True),
             )
             trained = train(config)

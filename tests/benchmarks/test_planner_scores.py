@@ -4,6 +4,7 @@
 from functools import partial
 from pathlib import Path
 
+import ground_rows
 import planner_scores
 import torch
 
@@ -32,10 +33,9 @@ def test_a_row_holds_scores_and_successes_of_a_planner(tmp_path, monkeypatch, ca
     assert all(float(number) > 0 for number in first.split(",")[6:8])
 
 
-def test_a_score_that_ranks_planners_like_their_failures_has_rank_correlation_one(monkeypatch, capsys):
+def test_a_score_that_ranks_planners_like_their_failures_has_rank_correlation_one(monkeypatch):
     keys = ("plan_score", "energy_score", "successes")
     scored = [(0.2, 0.3, 9), (0.3, 0.2, 7), (0.9, 0.1, 1)]
     rows = [{"ground": "toy", "seed": "0", "n": "10", **dict(zip(keys, map(str, row), strict=True))} for row in scored]
-    monkeypatch.setattr(planner_scores, "read_rows", lambda name: rows)
-    planner_scores.correlations()
-    assert capsys.readouterr().out == "toy 0 plan_score 1.00 energy_score -1.00 of 3 planners\n"
+    monkeypatch.setattr(ground_rows, "read_rows", lambda name: rows)
+    assert ground_rows.rank_correlations().splitlines()[-1] == "| toy | 0 | 3 | 1.00 | -1.00 |"
