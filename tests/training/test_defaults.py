@@ -90,10 +90,10 @@ class TestThePlanner:
         assert resolved("stacking", planner=PlannerConfig(width=64)).planner.width == 64
         assert resolved().planner.width == 32
 
-    def test_of_a_network_that_samples_actions_sees_two_frames_and_has_no_objects(self):
+    def test_lends_its_network_but_not_its_frames_to_methods_that_sample_actions(self):
         actions, plans = (resolved("sorting", method).planner for method in ("dp", "koap"))
-        assert (actions.frames, actions.network, actions.batch_size) == (2, "mlp", 512)
         assert (plans.frames, plans.network, plans.batch_size) == (1, "objects", 256)
+        assert actions == replace(plans, frames=2)
         for name, value in {"source": "run", "held_out": 0.5, "frames": 1}.items():
             with pytest.raises(ValueError, match=f"planner.{name}: method 'dp' samples actions and has no planner"):
                 resolved(method="dp", planner=PlannerConfig(**{name: value}))

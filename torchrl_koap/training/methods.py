@@ -9,7 +9,8 @@ the number of updates that were best on demonstrations that no table uses (``ben
 methods share their updates between the stages. Networks that may look ahead read the same frames, 4 before and up to 5
 after the present one. Three are defined differently: Decision Diffuser's controller (``dd``, and ``relabel``, the same
 trained on a teacher's actions) looks ahead to the next state only, ``koap_paper`` 8 steps; ``vae`` encodes the whole
-window. ``dp`` and ``vpt`` train no planner, but use its number of updates. Relabelling adds the teacher's updates.
+window. ``dp`` and ``vpt`` train no planner, but use its network and its number of updates. Relabelling adds those of
+the teacher.
 
 ``mpc`` is the only controller that is not an inverse dynamics model and shares nothing with KOAP: it follows plans with
 an identified model of how the robot answers commands.
