@@ -15,6 +15,7 @@ from torchrl_koap.modules.execution.policy_env import PolicyEnv, policy_transfor
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import (
+    FourierKernel,
     LatentActionFourier,
     LatentActionLSTM,
     LatentActionMLP,
@@ -40,6 +41,7 @@ __all__ = [
     "DiffusionPolicy",
     "Execution",
     "ExecutionConfig",
+    "FourierKernel",
     "InverseDynamics",
     "KoopmanInverseDynamics",
     "KoopmanLifting",

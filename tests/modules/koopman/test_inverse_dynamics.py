@@ -8,6 +8,7 @@ from inverse_dynamics_test_base import InverseDynamicsTestBase
 from tensordict import TensorDict
 
 from torchrl_koap.modules import (
+    FourierKernel,
     KoopmanInverseDynamics,
     KoopmanLifting,
     KoopmanOperator,
@@ -113,6 +114,30 @@ def test_fitting_takes_any_batch_and_leaves_the_mode_alone():
     assert nested.training and nested.latent_action.training
     nested.eval().fit_labels(data, mask)
     assert not nested.latent_action.training
+
+
+@pytest.mark.parametrize("kept", ["sharp", "smooth"])
+def test_labels_choose_the_kernel_of_their_function_and_its_decoder(kept):
+    """Actions are those of a network with one of the kernels, so only this one decodes held-out trajectories."""
+    kernels = {"sharp": FourierKernel(10.0, 1.0, 0.5), "smooth": FourierKernel(10.0, 1.0, 8.0)}
+
+    def make(seed):
+        torch.manual_seed(seed)
+        return make_koopman_inverse_dynamics(2, 2, num_features=256, num_past=0, look_ahead=2, kernels=kernels)
+
+    truth, model = make(1), make(2)
+    truth.latent_action.choose(kept)
+    states = torch.randn(60, 12, 2, generator=torch.Generator().manual_seed(0)).cumsum(-2) / 4
+    data = TensorDict({"state": states}, [60])
+    data["action"], data["episode"] = truth(data.clone())["action"].detach(), torch.arange(60) // 6
+    fit = model.fit_labels(data, torch.ones(60, 12, dtype=torch.bool))
+    assert fit["block"] == kept
+    alone = make_koopman_inverse_dynamics(2, 2, num_features=256, num_past=0, look_ahead=2, kernels={"": kernels[kept]})
+    alone.latent_action.load_state_dict(model.latent_action.state_dict(), strict=False)
+    alone.fit_labels(data, torch.ones(60, 12, dtype=torch.bool))
+    torch.testing.assert_close(model(data.clone())["action"], alone(data.clone())["action"])
+    few = data[:12]  # two trajectories
+    assert make(2).fit_labels(few, torch.ones(12, 12, dtype=torch.bool))["block"] == "sharp"
 
 
 def test_selected_entries_are_written_under_their_names():

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from torchrl_koap.modules import LatentActionFourier, LatentActionLSTM, LatentActionMLP
+from torchrl_koap.modules import FourierKernel, LatentActionFourier, LatentActionLSTM, LatentActionMLP
 
 
 def windows(*batch, dtype=torch.float32, num_frames=16, d=2):
@@ -33,9 +33,7 @@ def fourier_parts(num_features, curvature=0.3, motion_scale=0.7, position_scale=
         num_features,
         num_past=1,
         look_ahead=(2, 4),
-        curvature=curvature,
-        motion_scale=motion_scale,
-        position_scale=position_scale,
+        kernels={"": FourierKernel(curvature, motion_scale, position_scale)},
     ).double()
     frames = network.gather(windows(10, dtype=torch.float64), network.reader.valid_frames(16)).flatten(0, 1)
     motion = frames[:, [0, 2, 3]].flatten(1)  # D = 6 relative entries
@@ -54,6 +52,33 @@ def test_inner_products_approach_the_kernel_as_the_features_grow():
     assert errors[16384] < 0.02 * 0.3
     for number in (64, 1024):  # 16 times the features, a quarter of the error
         assert 2.5 < errors[number] / errors[16 * number] < 6.5, errors
+
+
+def test_a_chosen_kernel_is_that_of_a_network_with_no_other():
+    kernels, read = (
+        {"sharp": FourierKernel(10.0, 1.0, 1.0), "smooth": FourierKernel(0.3, 3.0, 4.0)},
+        windows(3)[:, None],
+    )
+    networks = []
+    for some in (kernels, *({name: kernel} for name, kernel in kernels.items())):
+        torch.manual_seed(0)
+        networks.append(LatentActionFourier(2, 64, num_past=1, look_ahead=range(2, 16), kernels=some))
+    both, *alone = networks
+    found = {name: both.infer(read) for name in kernels if both.choose(name) is None}
+    for name, network in zip(kernels, alone, strict=True):
+        assert torch.equal(found[name], network.infer(read)), name
+    assert not torch.allclose(found["sharp"], found["smooth"])
+    loaded = LatentActionFourier(2, 64, num_past=1, look_ahead=range(2, 16), kernels=kernels)
+    loaded.load_state_dict(both.state_dict())
+    assert torch.equal(loaded.infer(read), found["smooth"])  # the weights tell which kernel was chosen
+    assert "kernel" not in alone[0].state_dict()
+
+
+def test_three_labelled_trajectories_choose_a_kernel_and_fewer_keep_the_first():
+    network = LatentActionFourier(2, 8, kernels={"sharp": FourierKernel(), "smooth": FourierKernel(0.3, 3.0, 4.0)})
+    errors = {"sharp": 0.5, "smooth": 0.4}
+    assert [network.best_block(errors, trajectories) for trajectories in (0, 2, 3)] == ["sharp", "sharp", "smooth"]
+    assert network.best_block({"sharp": 0.3, "smooth": 0.4}, 3) == "sharp"
 
 
 def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.modules import PRESETS, LatentActionLSTM, Normalizer, make_koopman_inverse_dynamics
+from torchrl_koap.modules import PRESETS, FourierKernel, LatentActionLSTM, Normalizer, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss
 
 
@@ -46,11 +46,10 @@ def test_options_override_the_preset_and_reach_the_parts():
     reader = model.reader
     assert (reader.num_past, reader.look_ahead, reader.clamped) == (3, (2, 5), False)
     assert reader.scales is not None and model.latent_action.latent_dim == 10 and model.lifting.include_state
-    fourier = make_koopman_inverse_dynamics(
-        2, 2, num_features=32, curvature=0.5, motion_scale=2.0, position_scale=3.0
-    ).latent_action
-    assert fourier.amplitude == pytest.approx((2 * 0.5 / 32) ** 0.5)
-    assert (fourier.motion_scale, fourier.position_scale, fourier.phase.numel()) == (2.0, 3.0, 32)
+    kernels = {"one": FourierKernel(0.5, 2.0, 3.0)}
+    fourier = make_koopman_inverse_dynamics(2, 2, num_features=32, kernels=kernels).latent_action
+    assert fourier.kernel.tolist() == pytest.approx([(2 * 0.5 / 32) ** 0.5, 2.0, 3.0])
+    assert fourier.blocks == ("one",) and fourier.phase.numel() == 32
 
 
 @pytest.mark.parametrize(
@@ -60,7 +59,7 @@ def test_options_override_the_preset_and_reach_the_parts():
         ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, delayed, absolute, semi_supervised, scene, paper"),
         ({"preset": None}, "unknown preset None"),
         ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
-        ({"preset": "paper", "curvature": 0.1}, "option .* preset 'paper': 'curvature'"),
+        ({"preset": "paper", "kernels": {}}, "option .* preset 'paper': 'kernels'"),
     ],
 )
 def test_unknown_names_are_refused(options, message):

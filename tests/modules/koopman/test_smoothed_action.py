@@ -116,7 +116,7 @@ def test_the_raw_block_is_kept_where_its_held_out_error_is_clearly_smaller(colum
             errors[block] = fit_closed_form(model, data)["held_out_error"]
     ratio = errors[RAW] / errors[LIFTED]
     for share, kept in ((1.01 * ratio, RAW), (0.99 * ratio, LIFTED)):
-        monkeypatch.setattr("torchrl_koap.modules.koopman.inverse_dynamics.RAW_SHARE", share)
+        monkeypatch.setattr("torchrl_koap.modules.koopman.smoothed_action.RAW_SHARE", share)
         fit = fit_closed_form(model, data)
         assert fit["block"] == model.latent_action.chosen == kept
         assert fit["held_out_error"] == pytest.approx(errors[kept], rel=1e-4)

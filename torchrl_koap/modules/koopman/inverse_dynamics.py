@@ -14,13 +14,8 @@ from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule, LinearActionDecoder
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.koopman.smoothed_action import RAW
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, RidgeFit, ridge, shared_filter
 from torchrl_koap.modules.windows import WindowReader
-
-# A smoothed latent action reads the raw window if its held-out error is below this share of the lifted window's. The
-# share is below 1: few held-out labels say little, and the lifted window was fitted to unlabelled windows.
-RAW_SHARE = 0.85
 
 
 class LiftedInverseDynamics(LatentInverseDynamics):
@@ -178,10 +173,11 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
                 fits[block] = self._fit_decoder(inputs, action, axes, guessed, groups=groups, **options)
         finally:
             self.train(was_training)
-        best = min(fits, key=lambda block: fits[block].error / (RAW_SHARE if block == RAW else 1.0))
+        trajectories = 0 if groups is None else len(groups.unique())
+        best = self.latent_action.best_block({block: fit.error for block, fit in fits.items()}, trajectories)
         self.action_decoder.assign(fits[best])
         self.latent_action.choose(best)
-        return fits[best].summary() | ({"block": best} if best else {})
+        return fits[best].summary() | ({"block": best} if len(fits) > 1 else {})
 
     def _fit_decoder(
         self, latent: Tensor, action: Tensor, axes: Sequence[int], guessed: bool, **options: Any

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -84,8 +86,15 @@ class LatentActionModule(TensorDictModuleBase):
         """
         return None
 
+    def best_block(self, errors: Mapping[str, float], trajectories: int) -> str:
+        """Returns the block that labels choose: the one with the least of its held-out ``errors``, by block.
+
+        ``trajectories`` is the number of labelled ones; fewer than three are too few to choose, and the first is kept.
+        """
+        return min(errors, key=lambda block: errors[block]) if trajectories > 2 else self.blocks[0]
+
     def choose(self, block: str) -> None:
-        """Selects one of :attr:`blocks`; the entries of the others become 0."""
+        """Selects one of :attr:`blocks`."""
 
     def prepare(self, windows: Tensor) -> None:
         """Computes, before training, the spread of the steps from windows ``[*B, T, d]`` without labels."""
@@ -154,6 +163,20 @@ class LatentActionMLP(LatentActionModule):
         return self.network(read.flatten(-2))
 
 
+class FourierKernel(NamedTuple):
+    """The covariance of a function that is linear in the features of :class:`LatentActionFourier`.
+
+    Args:
+        curvature (float): prior variance ``c`` of the Fourier part, relative to the linear one.
+        motion_scale (float): length scale ``l_v``, in spreads of the steps.
+        position_scale (float): length scale ``l_x``, in units of the normalised state.
+    """
+
+    curvature: float = 0.1
+    motion_scale: float = 1.0
+    position_scale: float = 4.0
+
+
 class LatentActionFourier(LatentActionModule):
     r"""Computes latent actions as observables of the window, with a linear and a trainable Fourier part.
 
@@ -163,7 +186,8 @@ class LatentActionFourier(LatentActionModule):
     with ``v_t`` the ``D`` entries of the steps between neighbouring frames. A linear decoder under a ridge penalty is
     then Gaussian process regression with a linear plus ``c`` times a squared-exponential kernel (random Fourier
     features). The Koopman loss trains frequencies and phases, so the operator needs an input matrix
-    (``KoopmanOperator(input_dim=...)``).
+    (``KoopmanOperator(input_dim=...)``). Of several kernels, it trains with the first; then the labels choose one
+    (:meth:`best_block`).
 
     Keywords as for :class:`LatentActionModule`, ``relative`` always on, and those below.
 
@@ -173,9 +197,7 @@ class LatentActionFourier(LatentActionModule):
             part is left.
 
     Keyword Args:
-        curvature (float): prior variance ``c`` of the Fourier part, relative to the linear one. Defaults to ``0.1``.
-        motion_scale (float): length scale ``l_v``, in spreads of the steps. Defaults to ``1``.
-        position_scale (float): length scale ``l_x``, in units of the normalised state. Defaults to ``4``.
+        kernels (dict): a :class:`FourierKernel` for each name, the name of its block. Defaults to one.
         position_weight (float): prior standard deviation, relative to the linear part's, of a second linear part in
             ``x_t`` itself, for absolute actions; ``latent_dim`` grows by ``d``. Defaults to ``0``: none.
         trainable (bool): train frequencies and phases; otherwise they stay as drawn. Defaults to ``True``.
@@ -191,15 +213,14 @@ class LatentActionFourier(LatentActionModule):
 
     frequency: Tensor
     phase: Tensor
+    kernel: Tensor
 
     def __init__(
         self,
         state_dim: int,
         num_features: int,
         *,
-        curvature: float = 0.1,
-        motion_scale: float = 1.0,
-        position_scale: float = 4.0,
+        kernels: Mapping[str, FourierKernel] = MappingProxyType({"": FourierKernel()}),
         position_weight: float = 0.0,
         trainable: bool = True,
         **kwargs,
@@ -208,8 +229,11 @@ class LatentActionFourier(LatentActionModule):
         self.motion_dim = self.reader.num_features - state_dim
         self.latent_dim = num_features + self.motion_dim + (state_dim if position_weight else 0)
         self.position_weight = position_weight / math.sqrt(state_dim)
-        self.amplitude = math.sqrt(2 * curvature / max(num_features, 1))
-        self.motion_scale, self.position_scale = motion_scale, position_scale
+        self.num_features, self.kernels = num_features, kernels
+        self.blocks = tuple(kernels) if num_features else ("",)
+        # amplitude of the features and both length scales of the chosen kernel
+        self.register_buffer("kernel", torch.ones(3), persistent=len(self.blocks) > 1)
+        self.choose(next(iter(kernels)))
         shapes = {"frequency": (self.motion_dim + state_dim, num_features), "phase": (num_features,)}
         for name, shape in shapes.items():
             if trainable:
@@ -223,13 +247,22 @@ class LatentActionFourier(LatentActionModule):
         nn.init.normal_(self.frequency)
         nn.init.uniform_(self.phase, 0.0, 2 * math.pi)
 
+    @torch.no_grad()
+    def choose(self, block: str) -> None:
+        """Selects the kernel of this name."""
+        if self.num_features:
+            curvature, motion_scale, position_scale = self.kernels[block]
+            amplitude = math.sqrt(2 * curvature / self.num_features)
+            self.kernel.copy_(self.kernel.new_tensor([amplitude, motion_scale, position_scale]))
+
     def infer(self, read: Tensor) -> Tensor:
         """Evaluates the observables ``[*B, T, m]``."""
         n = self.reader.num_past
         present = read[..., n, :]
         motion = torch.cat([read[..., :n, :], read[..., n + 1 :, :]], -2).flatten(-2) / math.sqrt(self.motion_dim)
-        where = torch.cat([motion / self.motion_scale, present / self.position_scale], -1)
-        curved = self.amplitude * torch.cos(where @ self.frequency + self.phase)
+        amplitude, motion_scale, position_scale = self.kernel
+        where = torch.cat([motion / motion_scale, present / position_scale], -1)
+        curved = amplitude * torch.cos(where @ self.frequency + self.phase)
         return torch.cat([motion, curved, *((self.position_weight * present,) if self.position_weight else ())], -1)
 
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,6 +16,9 @@ from torchrl_koap.modules.windows import WindowReader
 
 LIFTED, RAW = "lifted", "raw"
 RAW_PAST, RAW_LOOK_AHEAD = 4, (2, 3, 4, 5)  # frames that the raw block reads
+# The raw window is read if its held-out error is below this share of the lifted window's. The share is below 1: few
+# held-out labels say little, and the lifted window was fitted to unlabelled windows.
+RAW_SHARE = 0.85
 
 
 class WienerSmoother(nn.Module):
@@ -108,6 +111,10 @@ class LatentActionSmoothed(LatentActionModule):
         self.smoother = WienerSmoother(self.reader.num_frames, dim)
         self.register_buffer("spread", torch.ones(dim))
         self.register_buffer("gates", torch.tensor([1.0, 0.0]))
+
+    def best_block(self, errors: Mapping[str, float], trajectories: int) -> str:
+        """Returns the raw block if its held-out error is below 85 % of the lifted one's, else the lifted one."""
+        return min(errors, key=lambda block: errors[block] / (RAW_SHARE if block == RAW else 1.0))
 
     @torch.no_grad()
     def choose(self, block: str) -> None:
