@@ -240,6 +240,7 @@ RIVALS = {
     "dd_lookahead": "supervised, look-ahead",
     "dd": "Decision Diffuser",
     "lapo": "LAPO",
+    "dp": "Diffusion Policy",
 }
 
 
