@@ -48,7 +48,7 @@ def test_options_override_the_preset_and_reach_the_parts():
     assert reader.scales is not None and model.latent_action.latent_dim == 10 and model.lifting.include_state
     kernels = {"one": FourierKernel(0.5, 2.0, 3.0)}
     fourier = make_koopman_inverse_dynamics(2, 2, num_features=32, kernels=kernels).latent_action
-    assert fourier.kernel.tolist() == pytest.approx([(2 * 0.5 / 32) ** 0.5, 2.0, 3.0])
+    assert fourier.kernel == pytest.approx(((2 * 0.5 / 32) ** 0.5, 2.0, 3.0))
     assert fourier.blocks == ("one",) and fourier.phase.numel() == 32
 
 

@@ -213,7 +213,7 @@ class LatentActionFourier(LatentActionModule):
 
     frequency: Tensor
     phase: Tensor
-    kernel: Tensor
+    kernel: Tensor | tuple[float, float, float]
 
     def __init__(
         self,
@@ -229,11 +229,13 @@ class LatentActionFourier(LatentActionModule):
         self.motion_dim = self.reader.num_features - state_dim
         self.latent_dim = num_features + self.motion_dim + (state_dim if position_weight else 0)
         self.position_weight = position_weight / math.sqrt(state_dim)
-        self.num_features, self.kernels = num_features, kernels
+        self.num_features, self.kernels = num_features, dict(kernels)
         self.blocks = tuple(kernels) if num_features else ("",)
-        # amplitude of the features and both length scales of the chosen kernel
-        self.register_buffer("kernel", torch.ones(3), persistent=len(self.blocks) > 1)
-        self.choose(next(iter(kernels)))
+        first = self._numbers(next(iter(kernels)))
+        if len(self.blocks) > 1:  # stored with the weights, which hold a decoder for the chosen kernel
+            self.register_buffer("kernel", torch.tensor(first))
+        else:
+            self.kernel = first
         shapes = {"frequency": (self.motion_dim + state_dim, num_features), "phase": (num_features,)}
         for name, shape in shapes.items():
             if trainable:
@@ -247,13 +249,16 @@ class LatentActionFourier(LatentActionModule):
         nn.init.normal_(self.frequency)
         nn.init.uniform_(self.phase, 0.0, 2 * math.pi)
 
+    def _numbers(self, name: str) -> tuple[float, float, float]:
+        """Returns the amplitude of the features and both length scales of a kernel."""
+        curvature, motion_scale, position_scale = self.kernels[name]
+        return math.sqrt(2 * curvature / max(self.num_features, 1)), motion_scale, position_scale
+
     @torch.no_grad()
     def choose(self, block: str) -> None:
-        """Selects the kernel of this name."""
-        if self.num_features:
-            curvature, motion_scale, position_scale = self.kernels[block]
-            amplitude = math.sqrt(2 * curvature / self.num_features)
-            self.kernel.copy_(self.kernel.new_tensor([amplitude, motion_scale, position_scale]))
+        """Selects the kernel of this name, if there are several."""
+        if isinstance(self.kernel, Tensor):
+            self.kernel.copy_(self.kernel.new_tensor(self._numbers(block)))
 
     def infer(self, read: Tensor) -> Tensor:
         """Evaluates the observables ``[*B, T, m]``."""
