@@ -72,6 +72,8 @@ def test_a_chosen_kernel_is_that_of_a_network_with_no_other():
     loaded.load_state_dict(both.state_dict())
     assert torch.equal(loaded.infer(read), found["smooth"])  # the weights tell which kernel was chosen
     assert "kernel" not in alone[0].state_dict()
+    with pytest.raises(ValueError, match="kernels: at least one"):
+        LatentActionFourier(2, 64, kernels={})
 
 
 def test_three_labelled_trajectories_choose_a_kernel_and_fewer_keep_the_first():

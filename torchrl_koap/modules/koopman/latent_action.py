@@ -202,6 +202,9 @@ class LatentActionFourier(LatentActionModule):
             ``x_t`` itself, for absolute actions; ``latent_dim`` grows by ``d``. Defaults to ``0``: none.
         trainable (bool): train frequencies and phases; otherwise they stay as drawn. Defaults to ``True``.
 
+    Raises:
+        ValueError: without a kernel, and as the :class:`~torchrl_koap.modules.WindowReader`.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -225,6 +228,8 @@ class LatentActionFourier(LatentActionModule):
         trainable: bool = True,
         **kwargs,
     ):
+        if not kernels:
+            raise ValueError("kernels: at least one FourierKernel is needed, there is none")
         super().__init__(state_dim, 0, relative=True, **kwargs)
         self.motion_dim = self.reader.num_features - state_dim
         self.latent_dim = num_features + self.motion_dim + (state_dim if position_weight else 0)
