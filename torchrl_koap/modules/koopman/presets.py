@@ -32,7 +32,7 @@ _DEFAULT: dict[str, Any] = {
 }
 
 _FOURIER: dict[str, Any] = {"num_features": 512, "kernels": {"sharp": FourierKernel()}, "position_weight": 0.0}
-# offered to the labels of robots whose actions are targets or raw: it lowers held-out errors on most
+# offered to the labels where actions are targets or raw: lower errors on Adroit's door, Unitree G1 and Stacking
 _SMOOTH = {"smooth": FourierKernel(0.3, 3.0, 4.0)}
 
 # the paper: g MLP, f LSTM, dense K, look-ahead k = 8
