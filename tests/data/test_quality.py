@@ -176,6 +176,12 @@ def test_frames_and_actions_are_cut_together():
     assert uncut.skipped == ("0 still frames of 0 trajectories",)
 
 
+def test_a_slow_trajectory_is_not_cut_from_both_ends_at_once():
+    slow = np.linspace(0, 0.0025, 50)[:, None] * (LINE.max() - LINE.min())  # barely more than what counts as still
+    found = trim_still(make_recordings([np.repeat(slow, LINE.shape[1], 1), LINE], action_dim=1))
+    assert [len(frames) for frames in found.states] == [50, len(LINE)]
+
+
 def test_noise_of_sensors_is_no_movement():
     generator, ramp = np.random.default_rng(0), np.repeat(np.linspace(0, 1, 20)[:, None], 3, 1)
     frames = [np.concatenate([np.zeros((40, 3)), ramp]) + generator.normal(size=(60, 3)) / 100 for _ in range(6)]

@@ -201,7 +201,7 @@ def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
     """Counts the frames at both ends of trajectories ``[T_i, d]`` in which no column moves, int ``[n, 2]``.
 
     Sensor noise is not movement. The still frames next to the movement are not counted. A trajectory in which nothing
-    ever moves has none.
+    ever moves, or so slowly that both ends overlap, has none.
     """
     least = STILL * np.ptp(np.concatenate(trajectories), axis=0)
     found = np.zeros((len(trajectories), 2), dtype=int)
@@ -210,7 +210,8 @@ def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
         for number, frames in enumerate(trajectories):
             moves = (np.abs(frames[::order] - frames[::order][0]) > room).any(-1)
             found[number, end] = max(int(moves.argmax()) - 1, 0)
-    return found
+    lengths = np.array([len(frames) for frames in trajectories])
+    return np.where(found.sum(1, keepdims=True) + 2 > lengths[:, None], 0, found)
 
 
 def _noise(parts: Sequence[np.ndarray]) -> np.ndarray | float:
