@@ -10,11 +10,13 @@ import torch
 from torchrl_koap.data import (
     DataError,
     make_demonstrations,
+    make_recordings,
     open_dataset,
     read_recordings,
     save_demonstrations,
     select_state,
 )
+from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.keys import validate
 from torchrl_koap.runs.config import ControllerConfig
@@ -243,6 +245,22 @@ def test_an_action_column_that_is_mostly_empty_is_named():
         DataError, match=r"29 steps have actions, but action column 'action_1' \(known in 4\) is mostly"
     ):
         make_demonstrations(STATES, [sparse, None, None], control_hz=20)
+
+
+def test_camera_frames_are_resampled_with_their_recordings(tmp_path):
+    films = [Clip("top.npy", tuple(range(30)))] * 3
+    recordings = make_recordings(STATES, action_dim=1, control_hz=20, sources=["a", "b", "c"], cameras={"top": films})
+    found = read_recordings(save_demonstrations(tmp_path / "arm", recordings, resample=10))
+    assert found.sources == ("a", "b", "c") and found.control_hz == 10
+    assert [clip.numbers for clip in found.cameras["top"]] == [tuple(range(0, 30, 2))] * 3
+    assert [len(frames) for frames in found.states] == [15] * 3
+
+
+@pytest.mark.parametrize("rate", [0, -20, "20"])
+def test_a_wrong_rate_is_named_before_recordings_are_resampled(rate):
+    recordings = make_recordings(STATES, action_dim=1)
+    with pytest.raises(DataError, match="control_hz .* must be a positive number of frames per second"):
+        make_demonstrations(recordings, control_hz=rate, resample=10)
 
 
 def test_nothing_is_written_if_anything_is_wrong(tmp_path):

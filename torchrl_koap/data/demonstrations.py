@@ -70,11 +70,13 @@ def save_demonstrations(
     """
     folder = Path(folder)
     name = description.pop("name", None) or re.sub(r"\W+", "_", folder.resolve().name).strip("_") or "robot"
-    data, task = make_demonstrations(states, actions, name=name, **description)
     notes: dict[str, Any] = {}
     if isinstance(states, Recordings):
+        rates = description.pop("control_hz", None), description.pop("resample", None)
+        states = _at_rate(states, *rates, description.get("action_kind", "delta"))
         cameras = {name: [asdict(clip) for clip in clips] for name, clips in states.cameras.items()}
-        notes = {"sources": [] if "resample" in description else states.sources, "cameras": cameras}
+        notes = {"sources": states.sources, "cameras": cameras}
+    data, task = make_demonstrations(states, actions, name=name, **description)
     return save_ted(data, folder / "ted", task, notes).parent
 
 
@@ -165,10 +167,9 @@ def make_demonstrations(
         if recordings is not states and kind_of(column)[0]
     ]
     names, acting = recordings.state_names, recordings.action_names
-    rate = recordings.control_hz if control_hz is None else control_hz
-    if resample is not None:
-        recordings = resampled(replace(recordings, control_hz=rate), resample, action_kind)
-        rate = resample
+    named = recordings is states or resample is not None
+    recordings = _at_rate(recordings, control_hz, resample, action_kind)
+    rate = recordings.control_hz
     if rate is None:
         problems.append(f"{option('control_hz')} is missing: frames per second")
     else:
@@ -241,15 +242,22 @@ def make_demonstrations(
         command=_COMMAND if commanded else None,
         robot=tuple(others.index(column) for column in own),
     )
-    sources = recordings.sources if recordings is states or resample is not None else ()
     known = select_state(data, task.state_of)
-    for said in find_warnings(known, task, sources):
+    for said in find_warnings(known, task, recordings.sources if named else ()):
         warnings.warn(said, stacklevel=2)
     planner = {"frames": observed_frames(known, task)[0], "steps": planner_updates(len(known))[0]}
     return data, replace(task, defaults=Defaults(planner=planner))
 
 
 _COMMAND = "command"
+
+
+def _at_rate(
+    recordings: Recordings, control_hz: float | None, resample: float | None, action_kind: str | Sequence[str]
+) -> Recordings:
+    """Sets the rate of recordings if one is given, then resamples them if another one is wanted."""
+    recordings = recordings if control_hz is None else replace(recordings, control_hz=control_hz)
+    return recordings if resample is None else resampled(recordings, resample, action_kind)
 
 
 def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str, tuple[str, ...]]:

@@ -52,6 +52,8 @@ def resampled(
     problems = wrong_rate(control_hz, "resample")
     if times is None and known is None:
         problems.append(f"the rate of the recordings is not known: pass {option('control_hz')}")
+    elif times is None:
+        problems += wrong_rate(known, "control_hz")
     refuse("these recordings", problems)
     if times is None:
         times = [np.arange(len(frames)) / known for frames in recordings.states]
