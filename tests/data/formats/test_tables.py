@@ -30,6 +30,19 @@ def test_archives(tmp_path):
     assert recordings.sources == ("a.npz", "b.npz")
 
 
+def test_archives_without_names_keep_the_names_of_other_entries(tmp_path):
+    beside = {"time": np.arange(6) / 25, "timeouts": np.arange(6) == 2}
+    np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((6, 1)), state_names=["x", "y"], **beside)
+    np.savez(tmp_path / "b.npz", states=FRAMES, actions=np.ones((6, 1)), **dict(reversed(beside.items())))
+    recordings = read_tables(tmp_path)
+    assert recordings.state_names == ("x", "y") and recordings.control_hz == pytest.approx(25)
+    assert recordings.sources == ("a.npz[0]", "a.npz[1]", "b.npz[0]", "b.npz[1]")
+    np.testing.assert_array_equal(recordings.states[0], recordings.states[2])
+    np.savez(tmp_path / "b.npz", states=FRAMES[:, :1], actions=np.ones((6, 1)), speed=FRAMES[:, 1], **beside)
+    with pytest.raises(DataError, match="its state columns are not those of a.npz"):
+        read_tables(tmp_path)
+
+
 def test_csv_with_gaps_in_its_labels(tmp_path):
     write_csv(tmp_path / "run.csv", columns_of(action_vx=[0.5, None, 0.25, 0.5, 1.0, 9.0]))
     recordings = read_tables(tmp_path)

@@ -168,17 +168,25 @@ def _declared(entry: np.ndarray | None) -> float | None:
 
 
 def _named_alike(pieces: list[Piece]) -> list[Piece]:
-    """Names the columns of archives without names like those of the first named archive of the same width."""
+    """Names the columns of archives without names like those of the first named archive of the same width.
 
-    def named(columns: Any, made_up: str, others: list[Any]) -> Any:
-        if not columns or made_up not in columns:
+    Other entries, such as time stamps, keep their names.
+    """
+
+    def named(columns: Any, kind: str, others: list[Any]) -> Any:
+        made_up = [name for index, name in enumerate(columns or ()) if name == f"{kind}_{index}"]
+        if not made_up:
             return columns
-        fits = (other for other in others if other and len(other) == len(columns) and made_up not in other)
-        return dict(zip(next(fits, columns), columns.values(), strict=True))
+        known = [other for other in others if other and made_up[0] not in other]
+        fits = ([name for name in other if name not in columns] for other in known)
+        names = next((given for given in fits if len(given) == len(made_up)), made_up)
+        return {new: columns[name] for new, name in zip(names, made_up, strict=True)} | {
+            name: values for name, values in columns.items() if name not in made_up
+        }
 
     states, actions = [piece.states for piece in pieces], [piece.actions for piece in pieces]
     return [
-        replace(piece, states=named(piece.states, "state_0", states), actions=named(piece.actions, "action_0", actions))
+        replace(piece, states=named(piece.states, "state", states), actions=named(piece.actions, "action", actions))
         for piece in pieces
     ]
 
