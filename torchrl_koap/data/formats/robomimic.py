@@ -67,10 +67,10 @@ def read_robomimic(
         several = len(files) > 1 and len(found) > 1
         pieces += [replace(piece, name=f"{each.stem}/{piece.name}") if several else piece for piece in found]
         skipped += unread
-    if len({*rates.values()}) > 1:
-        raise DataError(
-            file, f"its files declare different rates: {', '.join(f'{each.name} {hz}' for each, hz in rates.items())}"
-        )
+    if len({*rates.values()}) > 1 and "control_hz" not in options:
+        said = ", ".join(f"{each.name} {hz}" for each, hz in rates.items())
+        cure = f"if all have the same, pass {option('control_hz')}"
+        raise DataError(file, f"its files declare different rates: {said}; {cure}")
     return assemble(
         pieces,
         str(file),
