@@ -39,6 +39,14 @@ def test_an_unknown_data_set_and_rate(dataset):
         read_minari(dataset)
 
 
+def test_columns_that_would_replace_each_other_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    space = Dict({"a": Box(-9, 9, (3,)), "a_0": Box(-9, 9, (1,))})
+    name = write(tmp_path, space, {"a": [np.repeat(place, 3) for place in PLACES], "a_0": PLACES})
+    with pytest.raises(DataError, match="episode 0, episode 1: two entries have a column a_0: rename one of them"):
+        read_minari(name, control_hz=25)
+
+
 @pytest.mark.parametrize("width", [1, 2])
 def test_observations_that_are_a_tuple(width, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))

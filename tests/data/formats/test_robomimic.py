@@ -89,6 +89,14 @@ def test_a_folder_of_files_that_agree_on_their_rate(file, tmp_path):
         stream["data"].attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": 50}})
     with pytest.raises(DataError, match=r"different rates: a_1.hdf5 20.0, a_2.hdf5 50.0; .* pass control_hz"):
         read_robomimic(tmp_path / "more")
+    assert read_robomimic(tmp_path / "more", control_hz=20).control_hz == 20
+
+
+def test_columns_that_would_replace_each_other_are_refused(file):
+    with h5py.File(file, "a") as stream:
+        stream["data/demo_2/obs/eef_0"] = np.zeros(4)
+    with pytest.raises(DataError, match="data/demo_2: two entries have a column eef_0: rename one of them"):
+        read_robomimic(file, observations=["eef", "eef_0"])
 
 
 def test_chosen_observations(file):

@@ -100,6 +100,16 @@ def test_parquet_is_read_as_csv_is(tmp_path):
     np.testing.assert_allclose(recordings.states[0], FRAMES)
 
 
+@pytest.mark.parametrize("kind", [int, float])
+def test_columns_of_parquet_that_would_replace_each_other_are_refused(kind, tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = pyarrow.table(columns_of(q=FRAMES[:6].tolist(), q_0=np.zeros(6, kind)))
+    parquet.write_table(table, tmp_path / "run.parquet")
+    with pytest.raises(DataError, match="two entries have a column q_0: rename one of them"):
+        read_tables(tmp_path)
+
+
 def test_what_is_not_read_is_named(tmp_path):
     extra = {"obs": np.ones((6, 3)), "reward": np.zeros(5)}
     np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((5, 1)), control_hz=30.0, **extra)

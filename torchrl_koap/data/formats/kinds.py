@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.files import some
+
 _NUMBERED = "(_?(id|uuid|idx|index|number|num|nr|no|name|key))?"
 _ONE = (
     "(episode|ep|traj|trajectory|demo|demonstration|run|rollout|trial|segment|take|session|attempt|recording|sequence"
@@ -67,6 +69,12 @@ def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the columns of a table ``[T]`` or ``[T, d]`` as float64, numbered if there are several."""
     columns = numbered(name, values)
     return {name: columns[f"{name}_0"]} if len(columns) == 1 else columns
+
+
+def named_twice(columns: Mapping[str, Any], more: Mapping[str, Any]) -> list[str]:
+    """Returns a list with a message if an entry has a column that another one has, else an empty list."""
+    both = sorted(columns.keys() & more.keys())
+    return [f"two entries have a column {some(both)}: rename one of them"] if both else []
 
 
 def kind_of(name: str) -> tuple[str | None, float]:

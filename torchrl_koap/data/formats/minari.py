@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.columns import Piece, assemble
-from torchrl_koap.data.formats.kinds import leaves, numbered, spread
+from torchrl_koap.data.formats.kinds import leaves, named_twice, numbered, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import gathered, refuse
 from torchrl_koap.lookup import import_extra
@@ -41,7 +41,9 @@ def read_minari(source: str, **options: Any) -> Recordings:
             if array.ndim > 2 or array.dtype.kind not in "fiub":
                 unread.append(name or "observation")
             else:
-                states |= spread(name or "state", array)
+                columns = spread(name or "state", array)
+                faults += [(called, fault) for fault in named_twice(states, columns)]
+                states |= columns
         if not states:
             faults.append((called, "observations hold images, matrices or text only, no vectors of numbers"))
         if isinstance(episode.actions, (Mapping, tuple)):

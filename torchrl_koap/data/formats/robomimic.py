@@ -29,7 +29,7 @@ import numpy as np
 from torchrl_koap.data.formats.clocks import declared_rate
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import MAGIC, Clip
-from torchrl_koap.data.formats.kinds import as_numbers, kind_of, numbered, spread
+from torchrl_koap.data.formats.kinds import as_numbers, kind_of, named_twice, numbered, spread
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, option, refuse
 from torchrl_koap.lookup import import_extra
@@ -142,7 +142,9 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
                 f" order? if next_obs is unused, drop it with {option('drop_columns')} next_obs"
             )
         else:
-            states |= spread(entry, np.concatenate([part, last[-1:]] if has_next else [part]))
+            columns = spread(entry, np.concatenate([part, last[-1:]] if has_next else [part]))
+            faults += [(f"data/{name}", fault) for fault in named_twice(states, columns)]
+            states |= columns
             continue
         faults.append((f"data/{name}", said))
     if not has_next:  # time stamps, counters and ends of episodes may be beside obs

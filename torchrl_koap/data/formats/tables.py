@@ -30,7 +30,7 @@ import numpy as np
 from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import clips_beside
-from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, number_of, numbered
+from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, named_twice, number_of, numbered
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
@@ -288,10 +288,13 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> Piece:
         whole = pyarrow.types.is_integer(values.type)
         if kind is None or whole:  # text, dates, pictures, numbers of episodes
             plain = whole or pyarrow.types.is_temporal(values.type)
-            columns[name] = as_numbers(name, values.to_numpy() if plain else np.array(values.to_pylist(), dtype=object))
-            continue
-        block = numbers(values.cast(kind, safe=False), name)
-        columns |= numbered(name, block) if pyarrow.types.is_list(kind) else {name: block[:, 0]}
+            found = {name: as_numbers(name, values.to_numpy() if plain else np.array(values.to_pylist(), dtype=object))}
+        else:
+            block = numbers(values.cast(kind, safe=False), name)
+            found = numbered(name, block) if pyarrow.types.is_list(kind) else {name: block[:, 0]}
+        for fault in named_twice(columns, found):
+            raise ValueError(fault)
+        columns |= found
     return _split(file, columns, action_columns)
 
 
