@@ -302,7 +302,7 @@ def _even(pieces: Sequence[Piece]) -> set[str]:
 
 def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
     acting = any(piece.actions for piece in pieces)
-    cure = f"; drop columns that some files lack with {option('drop_columns')}"
+    cure = f"; name columns alike in all files, or drop those that some lack with {option('drop_columns')}"
     cure = cure if acting else f"; name the action columns of tables in {option('action_columns')}"
     for kind in ("state", "action"):
         named = [(piece.name, piece.states if kind == "state" else piece.actions) for piece in pieces]
