@@ -115,7 +115,7 @@ def test_the_order_of_columns_does_not_count_but_their_names_do():
     with pytest.raises(DataError, match="c, d: its state columns are not those of a: it lacks y and has Y besides"):
         assemble(pieces, "data", control_hz=20, action_dim=1)
     told = [replace(piece, actions={"v": X}) for piece in pieces]
-    with pytest.raises(DataError, match=r"Y besides; name columns alike in all files, or drop those that some lack with drop_"):
+    with pytest.raises(DataError, match="Y besides; name columns alike in all files, or drop those that some lack"):
         assemble(told, "data", control_hz=20)
     chosen = {"drop_columns": ["y", "Y"]}, {"state_columns": ["x"]}
     assert all(assemble(pieces, "data", control_hz=20, action_dim=1, **only).state_names == ("x",) for only in chosen)
