@@ -71,7 +71,7 @@ def test_many_columns_that_leap_are_counted():
     scan = np.hstack([TIME + 9 * (TIME > 0.3 + 0.035 * ray) for ray in range(36)])
     (warning,) = seen(scan)
     assert "'q4' from" in warning and "'q5'" not in warning
-    assert " and 31 more: a switch" in warning and "range scans may leap" in warning
+    assert " and 31 more: a switch" in warning and "grippers and scans may leap" in warning
 
 
 def test_switches_and_smooth_columns_do_not_leap():
@@ -141,6 +141,16 @@ def test_a_trajectory_in_another_unit():
     assert warning.startswith(
         "most columns move less than a twentieth as far as usual in b: another unit, or sensors that saw nothing?"
     )
+
+
+@pytest.mark.parametrize("other", range(1, 10))
+def test_recordings_of_two_laboratories_with_their_own_units(other):
+    frames = [np.hstack([np.sin(TIME + index), np.cos(2 * TIME), TIME * (index % 3)]) for index in range(10)]
+    called = [f"take {index}" for index in range(10)]
+    assert not [*scale_warnings(frames, called, ["x", "y", "z"], "column")]
+    degrees = [np.degrees(part) if index < other else part for index, part in enumerate(frames)]
+    said = " ".join(scale_warnings(degrees, called, ["x", "y", "z"], "column"))
+    assert "another unit" in said and ("take 0" if other <= 5 else "take 9") in said
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_each_warning_is_said_once_and_names_its_trajectory():
         "c.pkl: nothing moves in its 19 steps",
         "d.pkl: x reaches 3.6e+37 m",
         "e.pkl: all 19 labelled actions are zero",
-        "columns reach farther than usual, 'x' 1.89e+36 times, 'y' 1.9e+36 times, in d.pkl: another unit, or a"
+        "columns reach farther than usual, 'x' 2e+36 times, 'y' 2e+36 times, in d.pkl: another unit, or a"
         " measurement that failed?",
     ]
 

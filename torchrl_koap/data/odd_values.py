@@ -84,8 +84,8 @@ def _cause(values: np.ndarray, near: float, flipped: bool, most: bool, wraps: bo
     if wraps:
         return f"a counter or an angle wrapped by {leap:.3g}? np.unwrap it with that period"
     return (
-        "a switch, or a measurement that failed? fill it from its neighbours, or leave it out; range scans may leap;"
-        " where the robot was reset, mark the end of an episode (a column 'episode_index' or 'timeouts')"
+        "a switch, or a measurement that failed? fill it from its neighbours, or leave it out; grippers and scans may"
+        " leap; where the robot was reset, mark the end of an episode (a column 'episode_index' or 'timeouts')"
     )
 
 
@@ -145,6 +145,7 @@ def scale_warnings(
 ) -> Iterator[str]:
     """Finds trajectories in which a column reaches twenty times as far as in three quarters of the others.
 
+    If most columns of a trajectory reach twenty times as far as in half of the others, all are compared with that half.
     Also finds those in which most columns move, but less than a twentieth as far as in half of the others.
     """
     known = [(name, rows) for name, rows in zip(called, trajectories, strict=True) if len(rows)]
@@ -152,7 +153,9 @@ def scale_warnings(
         return
     middle = np.median(np.concatenate([rows for _, rows in known]), axis=0)
     reach = np.stack([np.abs(rows - middle).max(0) for _, rows in known])
-    usual = np.sort(reach, axis=0)[3 * (len(known) - 1) // 4]
+    half, usual = (np.sort(reach, axis=0)[quarters * (len(known) - 1) // 4] for quarters in (2, 3))
+    far = (reach > OTHER * half) & (half > 0)
+    usual = half if (2 * far.sum(1) > (half > 0).sum()).any() else usual
     odd = (reach > OTHER * usual) & (usual > 0)
     if odd.any():
         said = [
