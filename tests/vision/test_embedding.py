@@ -1,18 +1,20 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests camera frames as columns of a data set: choice, fitting, resuming, errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from camera_sets import episode, write_filmed
 from camera_sets import write_camera_set as write
 
-from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
+from torchrl_koap.data import make_recordings, open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
 from torchrl_koap.vision import Observer, Projection, backbones, load_encoder
-from torchrl_koap.vision.embedding import embed_recordings, read_sources
+from torchrl_koap.vision.embedding import embed_recordings, join_recordings, read_sources
 from torchrl_koap.vision.encoder import load_cameras
 
 OWN = "tiny_network:random_layer"
@@ -122,6 +124,23 @@ def test_a_task_with_embeddings_of_its_own_takes_several_sources(tmp_path):
     frames, states, _ = (torch.from_numpy(part) for part in episode("robot"))
     torch.testing.assert_close(data["observation"][:6, :96], wanted.embed(frames)[:6], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(data["observation"][:6, 96:], states[:6], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rate", "names", "fault"),
+    [
+        (30.0, ["x", "y"], "the source of b cannot be used: it has 30 frames per second, the first 10: convert"),
+        (10.0, ["y", "x"], "the source of b cannot be used: its actions are y, x; those of the first x, y"),
+    ],
+)
+def test_sources_of_another_rate_or_with_other_actions_are_refused(rate, names, fault):
+    def recorded(source, **about):
+        return make_recordings([np.zeros((3, 1))], [np.ones((2, 2))], sources=[source], **about)
+
+    first = recorded("a", control_hz=10.0, action_names=["x", "y"])
+    assert len(join_recordings([first, replace(first, control_hz=11.0)]).states) == 2
+    with pytest.raises(DataError, match=fault):
+        join_recordings([first, recorded("b", control_hz=rate, action_names=names)])
 
 
 def embedder_of(size):

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted
 from torchrl_koap.data.formats import Recordings
+from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.ted import CAMERAS, stored_folder, stored_task
 from torchrl_koap.files import DataError, option, replacing_file, some
 from torchrl_koap.lookup import lookup
@@ -50,8 +51,8 @@ class CameraReport:
 def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Recordings, Task]:
     """Reads data sets with camera frames as one: outputs of ``koap convert``, or any recordings if a task is given.
 
-    The task has columns for the embeddings; by default it is that of the first source. Raises a DataError if columns of
-    the sources differ, or without task if a source is not converted.
+    The task has columns for the embeddings; by default it is that of the first source. Raises a DataError if columns or
+    rates of the sources differ, or without task if a source is not converted.
     """
     found = []
     for source in sources:
@@ -67,9 +68,17 @@ def join_recordings(parts: Sequence[Recordings]) -> Recordings:
     """Concatenates recordings with the same columns, with the cameras that all of them have."""
     first = parts[0]
     for other in parts[1:]:
+        source, both = f"the source of {other.sources[0]}", (other, first)
         if other.state_names != first.state_names or other.actions[0].shape[1] != first.actions[0].shape[1]:
-            columns = "; those of the first ".join(", ".join(part.state_names) for part in (other, first))
-            raise DataError(f"the source of {other.sources[0]}", f"its columns are {columns}")
+            columns = "; those of the first ".join(", ".join(part.state_names) for part in both)
+            raise DataError(source, f"its columns are {columns}")
+        if other.action_names != first.action_names and all(part.num_labels for part in both):
+            columns = "; those of the first ".join(", ".join(part.action_names) for part in both)
+            raise DataError(source, f"its actions are {columns}")
+        rates = [part.control_hz for part in both if part.control_hz is not None]
+        if rates and max(rates) > (1 + UNEVEN) * min(rates):
+            said = f"it has {other.control_hz:g} frames per second, the first {first.control_hz:g}"
+            raise DataError(source, f"{said}: convert it with {option('resample')} {first.control_hz:g}")
     shared = [name for name in first.cameras if all(name in other.cameras for other in parts)]
     return replace(
         first,
