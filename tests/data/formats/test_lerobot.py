@@ -59,6 +59,15 @@ def test_names_rate_and_images(tmp_path):
     assert [frames.shape for frames in recordings.states] == [(6, 8), (6, 8)] and recordings.num_labels == 10
 
 
+@pytest.mark.parametrize("feature", ["observation.state", "action"])
+def test_columns_whose_names_repeat_are_numbered(feature, tmp_path):
+    names = ["gripper", *JOINTS[:5], "gripper"]  # of two arms
+    recordings = read_lerobot(write(tmp_path, features=FEATURES | {feature: {**FEATURES[feature], "names": names}}))
+    found = recordings.action_names if feature == "action" else recordings.state_names[:7]
+    assert found == tuple(f"{feature.removeprefix('observation.')}_{index}" for index in range(7))
+    assert [steps.shape for steps in recordings.actions] == [(5, 7), (5, 7)]
+
+
 VERSIONS = pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 
 

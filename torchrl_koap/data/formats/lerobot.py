@@ -231,13 +231,17 @@ def _announced(info: Mapping[str, Any], feature: str = ACTION) -> int:
 
 
 def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
-    """Returns a feature's column names: a list (in a list), ``{"motors": [...]}``, ``{"pan": 0, ...}``, or numbers."""
+    """Returns a feature's column names: a list (in a list), ``{"motors": [...]}``, ``{"pan": 0, ...}``, or numbers.
+
+    Names of another number, or that repeat, are not used.
+    """
     given, short = feature.get("names"), name.removeprefix(PREFIX)
     if isinstance(given, Mapping):
         listed = next(iter(given.values()), None)
         given = listed if isinstance(listed, list) else sorted(given, key=given.get)
     if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
         given = given[0]
-    if isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given):
+    named = isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given)
+    if named and len(set(given)) == width:
         return given if name != SURROUNDINGS else [f"{short}_{label}" for label in given]
     return [short] if width == 1 else [f"{short}_{index}" for index in range(width)]
