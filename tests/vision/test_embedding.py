@@ -100,6 +100,20 @@ def test_an_interrupted_embedding_goes_on(tmp_path, monkeypatch):
     assert torch.equal(one["observation"], other["observation"])
 
 
+def test_an_interrupted_embedding_leaves_no_camera_behind(tmp_path):
+    own = write_own(tmp_path, cameras=("side", "top"))
+
+    def stop(done, total):
+        if done > 2 * total // 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        embed(own, tmp_path / "seen", progress=stop)
+    assert load_cameras(tmp_path / "seen" / "cameras").keys() == {"side"}
+    embed(own, tmp_path / "seen", cameras=["top"])
+    assert load_cameras(tmp_path / "seen" / "cameras").keys() == {"top"}
+
+
 def test_without_components_there_is_nothing_to_embed_into(tmp_path):
     recordings, task = read_sources([write_own(tmp_path)], None)
     with pytest.raises(ValueError, match=r"components \(--components\) must be at least 1, got 0"):

@@ -145,6 +145,9 @@ def embed_recordings(
         fitted = Projection.load(fitted.save(out / CAMERAS / f"{name}.safetensors"))  # in half precision, as in use
         embedded[name] = [fitted(features) for features in stored.features()]
         reports[name] = stored.report(fitted)
+    for file in (out / CAMERAS).glob("*.safetensors"):
+        if file.stem not in chosen:  # of an interrupted call
+            file.unlink()
     task, states = _with_columns(task, recordings, embedded)
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))  # read_recordings has added them
     data = flatten_trajectories(
