@@ -150,17 +150,25 @@ def test_pictures_of_lerobot(tmp_path, embodiment):
     assert bool(recordings.num_labels) == (embodiment == "robot")
 
 
-def test_several_cameras_of_lerobot_are_told_apart(tmp_path):
+@pytest.mark.parametrize(
+    ("other", "names"),
+    [
+        ("observation.images.wrist", ("third_person", "wrist")),
+        ("observation.images.depth.third_person", ("images_third_person", "images_depth_third_person")),
+    ],
+)
+def test_several_cameras_of_lerobot_are_told_apart(other, names, tmp_path):
     root = write_camera_set(tmp_path / "set", "robot", count=1)
     info = json.loads((root / "meta/info.json").read_text())
-    other, own = "observation.images.wrist", "observation.images.third_person"
+    own = "observation.images.third_person"
     info["features"][other] = info["features"][own]
     (root / "meta/info.json").write_text(json.dumps(info))
     (file,) = (root / "data").rglob("*.parquet")
     table = pq.read_table(file)
     pq.write_table(table.append_column(other, table[own].take(list(range(len(table)))[::-1])), file)
     recordings = read_recordings(root)
-    assert np.array_equal(read(recordings, "third_person")[::-1], read(recordings, "wrist"))
+    assert tuple(recordings.cameras) == names
+    assert np.array_equal(read(recordings, names[0])[::-1], read(recordings, names[1]))
 
 
 def write_videos(root, version, lengths=(14, 11)):

@@ -254,17 +254,17 @@ def _nearest(stamps: np.ndarray, clock: np.ndarray, camera: str) -> np.ndarray:
 
 
 def lerobot_clips(
-    root: str | Path, info: Mapping[str, Any], cameras: Sequence[str], rows: Mapping[int, Mapping[str, Any]]
+    root: str | Path, info: Mapping[str, Any], cameras: Mapping[str, str], rows: Mapping[int, Mapping[str, Any]]
 ) -> dict[int, dict[str, Clip]]:
     """Returns references to the camera frames of every episode of a LeRobot data set.
 
-    A camera whose videos are missing or have no rate is left out. ``rows`` holds for every episode its ``file``, its
-    ``frame_index`` ``[T]`` and optionally ``timestamp`` ``[T, 1]``.
+    A camera whose videos are missing or have no rate is left out. ``cameras`` maps features to the cameras' names.
+    ``rows`` holds for every episode its ``file``, its ``frame_index`` ``[T]`` and optionally ``timestamp`` ``[T, 1]``.
     """
     found: dict[int, dict[str, Clip]] = {number: {} for number in rows}
     fps = declared_rate(info.get("fps"))
-    for camera in cameras:
-        name, video = camera.split(".")[-1], info["features"][camera].get("dtype") == "video"
+    for camera, name in cameras.items():
+        video = info["features"][camera].get("dtype") == "video"
         begins = _video_starts(Path(root), camera) if video else {}
         for number, columns in rows.items():
             if not video:

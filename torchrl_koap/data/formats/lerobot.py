@@ -46,7 +46,7 @@ def read_lerobot(
     info = _read_info(root)
     known = info["features"]
     observed = [name for name in known if name.startswith(PREFIX)]
-    cameras = [name for name in observed if known[name].get("dtype") in IMAGES]
+    cameras = _camera_names([name for name in observed if known[name].get("dtype") in IMAGES])
     images = [name for name in observed if name in cameras or len(known[name].get("shape") or [1]) > 1]
     usable = [name for name in observed if name not in images and known[name].get("dtype") != "string"]
     chosen = usable if observations is None else list(observations)
@@ -83,7 +83,7 @@ def read_lerobot(
         names = [label for name in chosen for label in _names({}, name, first[name].shape[1])]
     acting = _names(known.get(ACTION) or {}, ACTION, first[ACTION].shape[1] if ACTION in first else width)
     clips, pieces = lerobot_clips(root, info, cameras, rows), []
-    unseen = [name for name in images if name.split(".")[-1] not in clips[min(rows)]]
+    unseen = [name for name in images if cameras.get(name) not in clips[min(rows)]]
     rate = declared_rate(info.get("fps"))
     why = "its videos are not here" if rate is not None else "info.json holds no fps, by which its frames are found"
     absent = [f"{name} ({why})" if name in cameras else name for name in unseen]
@@ -228,6 +228,15 @@ def _announced(info: Mapping[str, Any], feature: str = ACTION) -> int:
     """Returns the number of columns of a feature in ``info.json``, 0 if it gives none."""
     shape = (info["features"].get(feature) or {}).get("shape") or [0]
     return int(shape[0]) if isinstance(shape, list) and isinstance(shape[0], int) else 0
+
+
+def _camera_names(features: Sequence[str]) -> dict[str, str]:
+    """Returns the names of cameras by feature: its last part, or all behind ``observation.`` if cameras share that."""
+    last = [feature.split(".")[-1] for feature in features]
+    return {
+        feature: name if last.count(name) == 1 else feature.removeprefix(PREFIX).replace(".", "_")
+        for feature, name in zip(features, last, strict=True)
+    }
 
 
 def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
