@@ -79,6 +79,7 @@ def change(path, **entries):
         (lambda path: change(path, format=1), "no description of a data set in format 2"),
         (lambda path: change(path, steps=5), "its entries do not have 5 steps"),
         (lambda path: change(path, lengths="many"), "missing or invalid: lengths"),
+        (lambda path: change(path, notes=None), "missing or invalid: notes"),
         (lambda path: change(path, definition={"name": "x"}), "about.json cannot be used: the task is damaged"),
         (lambda path: change(path, definition=AVOIDING.to_json()), "names code in env, expert, .*register it by"),
     ],

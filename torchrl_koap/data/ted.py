@@ -110,7 +110,7 @@ def read_about(folder: str | Path) -> dict[str, Any]:
     if about.get("format") != FORMAT:
         raise DataError(path, f"it is no description of a data set in format {FORMAT}")
     kinds: dict[str, type] = dict.fromkeys(("trajectories", "steps", "labelled_steps", "bytes"), int)
-    kinds |= {"task": str, "sha256": str, "lengths": list}
+    kinds |= {"task": str, "sha256": str, "lengths": list, "notes": dict}
     wrong = [name for name, kind in kinds.items() if not isinstance(about.get(name), kind)]
     if wrong:
         raise DataError(path, f"missing or invalid: {', '.join(wrong)}")
