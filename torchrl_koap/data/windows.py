@@ -198,9 +198,8 @@ class WindowSampler(RandomSampler):
             )
         self.labelled_share = labelled_share
         everything = torch.arange(len(labelled), device=labelled.device)
-        stratified = labelled_share is not None
-        self._labelled = everything[labelled] if stratified else everything[:0]
-        self._others = everything[~labelled] if stratified and not labelled.all() else everything
+        apart = labelled_share is not None and not labelled.all()
+        self._labelled, self._others = everything[labelled], everything[~labelled] if apart else everything
 
     def number_labelled(self, batch_size: int) -> int:
         """Returns the number of windows of a batch that have a label.
