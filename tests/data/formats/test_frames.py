@@ -106,17 +106,17 @@ def test_episodes_of_one_table_have_their_own_frames(tmp_path):
     np.testing.assert_array_equal(read(recordings, "top", 1), film(8)[4:])
 
 
-@pytest.mark.parametrize("behind", [False, True])
-def test_cameras_of_robomimic(tmp_path, behind):
+@pytest.mark.parametrize(("behind", "name"), [(False, "demo.hdf5"), (True, "demo.H5")])
+def test_cameras_of_robomimic(tmp_path, behind, name):
     h5py = pytest.importorskip("h5py")
     frames, joints = film(7), np.random.default_rng(0).normal(size=(7, 2))
-    with h5py.File(tmp_path / "demo.hdf5", "w") as file:
+    with h5py.File(tmp_path / name, "w") as file:
         demo = file.create_group("data/demo_0")
         demo["obs/joints"], demo["obs/agentview_image"] = joints[:6], frames[:6]
         demo["actions"] = np.zeros((6, 2))
         if behind:
             demo["next_obs/joints"], demo["next_obs/agentview_image"] = joints[1:], frames[1:]
-    recordings = read_recordings(tmp_path / "demo.hdf5", control_hz=20)
+    recordings = read_recordings(tmp_path / name, control_hz=20)
     assert len(recordings.states[0]) == 6 + behind and not recordings.skipped
     np.testing.assert_array_equal(read(recordings, "agentview_image"), frames[: 6 + behind])
 

@@ -60,7 +60,7 @@ class Clip:
             ValueError: if a frame is missing, damaged, or has another size or type; the message begins with it.
             RuntimeError: if an extra for reading them is missing.
         """
-        suffix = Path(self.file).suffix
+        suffix = Path(self.file).suffix.lower()
         read = _READERS.get("folder" if Path(self.file).is_dir() else suffix, _video)
         if not Path(self.file).exists():
             raise ValueError(f"frame {self.numbers[0]}: {self.file} is missing: convert the data again")
