@@ -80,6 +80,12 @@ def test_a_data_set_is_not_written_among_recordings(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
 
 
+def test_a_folder_that_exists_is_refused_before_anything_is_read(tmp_path, capsys):
+    missing = tmp_path / "raw"
+    said = fails(capsys, "convert", missing, "--to", "npz", "--out", tmp_path)
+    assert "exists already; choose another folder" in said
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -17,7 +17,7 @@ from torchrl_koap.commands.options import Command, training_call
 from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.action_kinds import describe_likely, likely_kinds
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
-from torchrl_koap.data.formats import FORMATS, Recordings, write_recordings
+from torchrl_koap.data.formats import Recordings, write_recordings, writer_of
 from torchrl_koap.data.planner_choices import observed_frames, planner_updates
 from torchrl_koap.data.quality import drop_short, find_warnings, goal_columns, plan_coverage, trim_still
 from torchrl_koap.data.sources import check_new, find_task_of
@@ -199,7 +199,7 @@ class Convert(Command):
         }
 
     def _take_out(self, kind: str) -> dict[str, Any]:
-        lookup([name for name, form in FORMATS.items() if form.write is not None], kind, "format")
+        writer_of(kind, self.out)  # raises before anything is read
         reading = self._reading()
         for name in self._given([name for name in _DESCRIBING if name not in reading]):
             raise ValueError(f"--{name.replace('_', '-')} was given, but format {kind!r} does not hold it")

@@ -182,17 +182,26 @@ def find_format(source: str | Path) -> str | None:
     return next((name for name, form in FORMATS.items() if form.matches(str(source))), None)
 
 
-def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path:
-    """Writes recordings into a new folder as ``"npz"`` or ``"lerobot"`` and returns the folder.
+def writer_of(name: str, out: str | Path) -> Callable[[Recordings, Path], None]:
+    """Returns the function that writes recordings as ``"npz"`` or ``"lerobot"``.
 
     Raises:
         ValueError: if the format cannot be written; the message suggests the nearest.
-        FileExistsError: if ``out`` exists.
-        DataError: if the format needs a rate, and none is known.
-        RuntimeError: if the format's package is not installed; the message names the extra.
+        FileExistsError: if the folder ``out`` exists.
     """
     write = lookup({key: form.write for key, form in FORMATS.items() if form.write is not None}, name, "format")
     if Path(out).exists():
         raise FileExistsError(f"{out} exists already; choose another folder (--out)")
-    write(recordings, Path(out))
+    return write
+
+
+def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path:
+    """Writes recordings into a new folder by :func:`writer_of` and returns the folder.
+
+    Raises:
+        ValueError, FileExistsError: as :func:`writer_of`.
+        DataError: if the format needs a rate, and none is known.
+        RuntimeError: if the format's package is not installed; the message names the extra.
+    """
+    writer_of(name, out)(recordings, Path(out))
     return Path(out)
