@@ -1,9 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests the lookup of names in tables, and the errors of unknown names."""
 
+import pickle
+
 import pytest
 
-from torchrl_koap.lookup import lookup
+from torchrl_koap.lookup import lookup, resolve
 
 TABLE = {"dense": 1, "diagonal": 2, "dpm++2m": None}
 
@@ -29,3 +31,12 @@ def test_without_a_near_name_all_are_listed(name):
     with pytest.raises(ValueError) as error:
         lookup(TABLE, name, "thing")
     assert str(error.value) == f"unknown thing {name!r}; known: dense, diagonal, dpm++2m"
+
+
+def test_a_file_may_define_dataclasses_and_its_objects_can_be_pickled(tmp_path):
+    code = "from __future__ import annotations\nfrom dataclasses import dataclass\n\n"
+    for folder, number in (("a", 1), ("b", 2)):  # files of the same name
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "own.py").write_text(f"{code}@dataclass\nclass Options:\n    number: int = {number}\n")
+    made = [resolve(f"{tmp_path}/{folder}/own.py:Options", "options")() for folder in "ab"]
+    assert [each.number for each in made] == [1, 2] and pickle.loads(pickle.dumps(made)) == made
