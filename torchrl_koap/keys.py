@@ -138,8 +138,10 @@ def check_window(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> T
         return state
     episode, done = tensordict.get(EPISODE, None), tensordict.get(NEXT_DONE, None)
     several: NestedKey | None = EPISODE if episode is not None and len(episode.unique()) > 1 else None
-    if done is not None and (done.reshape(-1)[:-1] & (state[1:] != state[:-1]).any(-1)).any():
-        several = several or NEXT_DONE
+    if done is not None and done.numel() == len(state):  # one flag per frame
+        moved = (state[1:] != state[:-1]).any(-1)
+        if (done.reshape(-1)[:-1] & moved).any():
+            several = several or NEXT_DONE
     if several is not None:
         flat = f"{key!r} {list(state.shape)} is one window, but its steps are of several trajectories ({several!r})"
         raise ValueError(f"{flat}; reshape a flat batch, such as SliceSampler's, to [B, T]")

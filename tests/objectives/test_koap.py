@@ -207,6 +207,8 @@ def test_a_flat_batch_of_several_trajectories_is_not_taken_for_one_window():
         with pytest.raises(ValueError, match=r"several trajectories .*'done'"):
             module(ended.clone())
         module(batch.clone()), module(batch[0].clone()), module(ended[:T].clone())
+    alone = batch[0].exclude("episode").auto_batch_size_(0)
+    network(alone.set("next", {"done": torch.zeros(1, dtype=torch.bool)}))  # one flag for the whole window
     repeated = torch.arange(T).clamp_max(T - 3)
     network(ended[T:][repeated].set("next", {"done": (repeated == T - 3).unsqueeze(-1)}))  # padded at its end
     with pytest.raises(ValueError, match=r"several trajectories"):
