@@ -246,6 +246,8 @@ def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held()
 def test_parts_that_do_not_fit_are_refused(parts, message):
     with pytest.raises(ValueError, match=message):
         make_model(normalizers=False, parts=parts)
+    with pytest.raises(TypeError, match=r"must be a LinearActionDecoder; .* got Linear"):
+        make_model(parts={"action_decoder": torch.nn.Linear(4, 2)})
 
 
 def test_parts_are_called_with_tensors_as_well():

@@ -74,6 +74,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         **kwargs: normalisers, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
+        TypeError: if the decoder is no LinearActionDecoder.
         ValueError: if sizes of the parts differ.
 
     Examples:
@@ -91,13 +92,16 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
     def __init__(
         self,
         latent_action: LatentActionModule,
-        action_decoder: LinearActionDecoder,
+        action_decoder: nn.Module,
         *,
         lifting: KoopmanLifting | CompactLifting,
         operator: KoopmanOperator,
         penalty: float = DEFAULT_PENALTY,
         **kwargs,
     ):
+        if not isinstance(action_decoder, LinearActionDecoder):
+            wanted, got = "a LinearActionDecoder; for another map override decode()", type(action_decoder).__name__
+            raise TypeError(f"action_decoder must be {wanted}; got {got}")
         sizes = {
             "latent_action": latent_action.latent_dim,
             "action_decoder": action_decoder.linear.in_features,
