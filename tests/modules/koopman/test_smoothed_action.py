@@ -73,6 +73,7 @@ def test_the_choice_comes_with_weights_that_are_copied_as_tensors():
 def test_the_raw_block_must_not_read_further_frames():
     with pytest.raises(ValueError, match="reads 4 frames back and 5 ahead: .* got 3 and 8"):
         make_infer(num_past=3)
+    assert make_infer(look_ahead=8).reader.look_ahead == (8,)
 
 
 def test_steps_of_the_state_are_at_the_declared_positions():

@@ -89,19 +89,20 @@ class LatentActionSmoothed(LatentActionModule):
         num_features: int,
         *,
         num_past: int = 8,
-        look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
+        look_ahead: int | Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
         **kwargs,
     ):
-        if RAW_PAST > num_past or max(RAW_LOOK_AHEAD) > max(look_ahead):
-            raise ValueError(
-                f"the raw block reads {RAW_PAST} frames back and {max(RAW_LOOK_AHEAD)} ahead: the lifted one must read"
-                f" as many, got {num_past} and {max(look_ahead)}"
-            )
         dim = lifting.latent_dim
         frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead}
         raw_frames: dict[str, Any] = {"num_past": RAW_PAST, "look_ahead": RAW_LOOK_AHEAD}
         # random features are not trained: training them had no measurable effect
         lifted = LatentActionFourier(dim, num_features, trainable=False, **frames)
+        ahead = lifted.reader.look_ahead[-1]
+        if RAW_PAST > num_past or max(RAW_LOOK_AHEAD) > ahead:
+            raise ValueError(
+                f"the raw block reads {RAW_PAST} frames back and {max(RAW_LOOK_AHEAD)} ahead: the lifted one must read"
+                f" as many, got {num_past} and {ahead}"
+            )
         raw = LatentActionFourier(lifting.state_dim, num_features, trainable=False, **raw_frames)
         super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **frames, **kwargs)
         self.reader = WindowReader(dim, relative=False, **frames)  # reads the lifted frames that are smoothed together
