@@ -136,8 +136,22 @@ def test_labels_choose_the_kernel_of_their_function_and_its_decoder(kept):
     alone.latent_action.load_state_dict(model.latent_action.state_dict(), strict=False)
     alone.fit_labels(data, torch.ones(60, 12, dtype=torch.bool))
     torch.testing.assert_close(model(data.clone())["action"], alone(data.clone())["action"])
-    few = data[:12]  # two trajectories
-    assert make(2).fit_labels(few, torch.ones(12, 12, dtype=torch.bool))["block"] == "sharp"
+
+
+@pytest.mark.parametrize(("trajectories", "fitted"), [(2, ["sharp"]), (3, ["sharp", "smooth"])])
+def test_fewer_than_three_labelled_trajectories_fit_only_the_first_kernel(trajectories, fitted, monkeypatch):
+    kernels = {"sharp": FourierKernel(), "smooth": FourierKernel(0.3, 3.0, 4.0)}
+    model = make_koopman_inverse_dynamics(3, 2, num_past=0, look_ahead=2, kernels=kernels)
+    compared = []
+
+    def last(errors):
+        compared.extend(errors)
+        return compared[-1]
+
+    monkeypatch.setattr(model.latent_action, "best_block", last)
+    data, mask = labelled(6)
+    assert model.fit_labels(data.set("episode", torch.arange(6) % trajectories), mask)["block"] == fitted[-1]
+    assert compared == fitted
 
 
 def test_selected_entries_are_written_under_their_names():

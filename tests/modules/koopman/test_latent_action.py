@@ -76,13 +76,6 @@ def test_a_chosen_kernel_is_that_of_a_network_with_no_other():
         LatentActionFourier(2, 64, kernels={})
 
 
-def test_three_labelled_trajectories_choose_a_kernel_and_fewer_keep_the_first():
-    network = LatentActionFourier(2, 8, kernels={"sharp": FourierKernel(), "smooth": FourierKernel(0.3, 3.0, 4.0)})
-    errors = {"sharp": 0.5, "smooth": 0.4}
-    assert [network.best_block(errors, trajectories) for trajectories in (0, 2, 3)] == ["sharp", "sharp", "smooth"]
-    assert network.best_block({"sharp": 0.3, "smooth": 0.4}, 3) == "sharp"
-
-
 def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():
     network = LatentActionFourier(3, 8, num_past=2, look_ahead=(2, 5))
     state = torch.randn(40, 16, 3, generator=torch.Generator().manual_seed(0)).cumsum(1)

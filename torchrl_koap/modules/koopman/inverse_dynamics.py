@@ -161,7 +161,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         of the steps that all axes share, instead of towards 0. Guessed axes are used only if they lower the held-out
         error. The summary names the ``block`` if there were several.
         """
-        normalizer = self.action_normalizer
+        network, normalizer = self.latent_action, self.action_normalizer
         options = {
             "default_penalty": self.penalty,
             "input_noise": INPUT_NOISE,
@@ -171,17 +171,18 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         was_training, fits = self.training, {}
         self.eval()
         try:
-            for block in self.latent_action.blocks:
-                self.latent_action.choose(block)
+            for block in network.blocks:
+                network.choose(block)
                 inputs, action, groups = self.labelled_frames(self.infer, windows, mask)
                 fits[block] = self._fit_decoder(inputs, action, axes, guessed, groups=groups, **options)
+                if (0 if groups is None else len(groups.unique())) < network.min_trajectories:
+                    break
         finally:
             self.train(was_training)
-        trajectories = 0 if groups is None else len(groups.unique())
-        best = self.latent_action.best_block({block: fit.error for block, fit in fits.items()}, trajectories)
+        best = network.best_block({block: fit.error for block, fit in fits.items()})
         self.action_decoder.assign(fits[best])
-        self.latent_action.choose(best)
-        return fits[best].summary() | ({"block": best} if len(fits) > 1 else {})
+        network.choose(best)
+        return fits[best].summary() | ({"block": best} if len(network.blocks) > 1 else {})
 
     def _fit_decoder(
         self, latent: Tensor, action: Tensor, axes: Sequence[int], guessed: bool, **options: Any

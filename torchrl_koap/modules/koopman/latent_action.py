@@ -50,6 +50,7 @@ class LatentActionModule(TensorDictModuleBase):
     """
 
     blocks: tuple[str, ...] = ("",)  # alternative parts of a latent action, of which labels choose one
+    min_trajectories = 3  # labelled ones needed to choose; with fewer, the first block is kept
 
     def __init__(
         self,
@@ -86,12 +87,9 @@ class LatentActionModule(TensorDictModuleBase):
         """
         return None
 
-    def best_block(self, errors: Mapping[str, float], trajectories: int) -> str:
-        """Returns the block that labels choose: the one with the least of its held-out ``errors``, by block.
-
-        ``trajectories`` is the number of labelled ones; fewer than three are too few to choose, and the first is kept.
-        """
-        return min(errors, key=lambda block: errors[block]) if trajectories > 2 else self.blocks[0]
+    def best_block(self, errors: Mapping[str, float]) -> str:
+        """Returns the block that labels choose: the one with the least of the held-out ``errors``, by block."""
+        return min(errors, key=lambda block: errors[block])
 
     def choose(self, block: str) -> None:
         """Selects one of :attr:`blocks`."""
@@ -186,8 +184,8 @@ class LatentActionFourier(LatentActionModule):
     with ``v_t`` the ``D`` entries of the steps between neighbouring frames. A linear decoder under a ridge penalty is
     then Gaussian process regression with a linear plus ``c`` times a squared-exponential kernel (random Fourier
     features). The Koopman loss trains frequencies and phases, so the operator needs an input matrix
-    (``KoopmanOperator(input_dim=...)``). Of several kernels, it trains with the first; then the labels choose one
-    (:meth:`best_block`).
+    (``KoopmanOperator(input_dim=...)``). Of several kernels, it trains with the first; then the labels of three
+    or more trajectories choose one (:meth:`best_block`).
 
     Keywords as for :class:`LatentActionModule`, ``relative`` always on, and those below.
 

@@ -82,6 +82,7 @@ class LatentActionSmoothed(LatentActionModule):
     gates: Tensor
     spread: Tensor
     blocks = (LIFTED, RAW)
+    min_trajectories = 0  # RAW_SHARE is strict enough for few labels
 
     def __init__(
         self,
@@ -113,7 +114,7 @@ class LatentActionSmoothed(LatentActionModule):
         self.register_buffer("spread", torch.ones(dim))
         self.register_buffer("gates", torch.tensor([1.0, 0.0]))
 
-    def best_block(self, errors: Mapping[str, float], trajectories: int) -> str:
+    def best_block(self, errors: Mapping[str, float]) -> str:
         """Returns the raw block if its held-out error is below 85 % of the lifted one's, else the lifted one."""
         return min(errors, key=lambda block: errors[block] / (RAW_SHARE if block == RAW else 1.0))
 
