@@ -64,9 +64,6 @@ class NetworkLoss(LossModule):
         """Mandatory entries, as renamed by ``set_keys``."""
         return [getattr(self.tensor_keys, name) for name in self.required]
 
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """Does nothing: there is no value estimator."""
-
     def _read(self, tensordict: TensorDictBase, name: str) -> Tensor:
         return read_entry(self, tensordict, getattr(self.tensor_keys, name), f"set_keys({name}=...)")
 
