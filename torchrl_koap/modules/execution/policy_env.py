@@ -139,9 +139,10 @@ class PolicyEnv(TransformedEnv):
         if policy.origins is not None:
             raise ValueError("PolicyEnv does not support policies with origins: use an Agent, which applies them")
         key = policy.planner.noise_key  # None: the planner draws its own noise
-        noise = [] if key is None else [NoiseTransform(policy.noise_shape, block=policy.max_steps, noise_key=key)]
         transforms = policy_transforms(policy.history, observation_key=observation_key, history_key=policy.in_keys[0])
-        super().__init__(env, Compose(*(transform.clone() for transform in transforms), *noise))
+        if key is not None:
+            transforms.append(NoiseTransform(policy.noise_shape, block=policy.max_steps, noise_key=key))
+        super().__init__(env, transforms)
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seeds the environment and the noise; as in :class:`torchrl.envs.EnvBase`."""
