@@ -76,6 +76,13 @@ def test_the_raw_block_must_not_read_further_frames():
     assert make_infer(look_ahead=8).reader.look_ahead == (8,)
 
 
+def test_frames_with_a_clamped_look_ahead_count_if_asked_for():
+    assert [make_infer(clamped=clamped).reader.valid_frames(20) for clamped in (False, True)] == [
+        range(8, 12),
+        range(8, 18),
+    ]
+
+
 def test_steps_of_the_state_are_at_the_declared_positions():
     infer = make_infer()
     windows = torch.randn(50, 17, 2).cumsum(1)

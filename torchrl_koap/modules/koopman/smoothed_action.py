@@ -106,7 +106,8 @@ class LatentActionSmoothed(LatentActionModule):
             )
         raw = LatentActionFourier(lifting.state_dim, num_features, trainable=False, **raw_frames)
         super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **frames, **kwargs)
-        self.reader = WindowReader(dim, relative=False, **frames)  # reads the lifted frames that are smoothed together
+        # reads the lifted frames that are smoothed together
+        self.reader = WindowReader(dim, relative=False, clamped=self.reader.clamped, **frames)
         self.keeps_state = lifting.keeps_state
         self.lifted, self.raw = lifted, raw
         self._lifting = (lifting,)  # the tuple prevents registration: the Koopman model owns its weights
