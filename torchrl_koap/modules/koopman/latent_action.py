@@ -271,7 +271,10 @@ class LatentActionFourier(LatentActionModule):
         amplitude, motion_scale, position_scale = self.kernel
         where = torch.cat([motion / motion_scale, present / position_scale], -1)
         curved = amplitude * torch.cos(where @ self.frequency + self.phase)
-        return torch.cat([motion, curved, *((self.position_weight * present,) if self.position_weight else ())], -1)
+        parts = [motion, curved]
+        if self.position_weight:
+            parts.append(self.position_weight * present)
+        return torch.cat(parts, -1)
 
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Returns the entries that hold the steps along state columns (:meth:`LatentActionModule.axis_features`)."""
