@@ -125,6 +125,8 @@ def test_wrong_input():
         Normalizer.fit(torch.zeros(4))
     with pytest.raises(ValueError, match="wanted 2 columns, got shape"):
         Normalizer.fit(torch.rand(4, 2))(torch.zeros(5, 3))
+    with pytest.raises(ValueError, match=r"floating-point numbers, got torch.int64; cast them"):
+        Normalizer.fit(torch.rand(4, 2))(torch.ones(5, 2, dtype=torch.int64))
     for offset, scale in ((torch.zeros(2), torch.ones(1)), (torch.zeros(1), torch.zeros(1))):
         with pytest.raises(ValueError, match="offset"):
             Normalizer(1, offset=offset, scale=scale)

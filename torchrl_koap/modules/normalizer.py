@@ -52,7 +52,8 @@ class Normalizer(nn.Module):
         every method maps ``[*B, d]`` to ``[*B, d]`` in the dtype of its argument.
 
     Raises:
-        ValueError: if offset and scale are not ``[d]``, not finite, or a scale is not positive.
+        ValueError: if offset and scale are not ``[d]``, not finite, or a scale is not positive; at a call for another
+            number of columns, or whole numbers.
 
     Examples:
         >>> import torch
@@ -140,4 +141,6 @@ class Normalizer(nn.Module):
     def _statistics(self, values: Tensor) -> tuple[Tensor, Tensor]:
         if values.shape[-1:] != self.offset.shape:
             raise ValueError(f"wanted {len(self.offset)} columns, got shape {list(values.shape)}")
+        if not values.is_floating_point():  # their dtype would round offset and scale
+            raise ValueError(f"wanted floating-point numbers, got {values.dtype}; cast them, as with .float()")
         return self.offset.to(values.dtype), self.scale.to(values.dtype)
