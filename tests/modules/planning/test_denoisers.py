@@ -66,12 +66,12 @@ def test_output_depends_on_every_input_and_reaches_every_parameter(denoiser):
 
 
 def test_embeddings_in_closed_form():
-    embedding = StepEmbedding(8)
+    embedding = StepEmbedding()
     embedding.network = torch.nn.Identity()
     values = embedding(torch.tensor([0.0, 3.0]))
-    torch.testing.assert_close(values[0], torch.tensor([0.0] * 4 + [1.0] * 4))
+    torch.testing.assert_close(values[0], torch.tensor([0.0] * 16 + [1.0] * 16))
     torch.testing.assert_close(values[1, 0], torch.tensor(3.0).sin())
-    torch.testing.assert_close(values.square().sum(-1), torch.full((2,), 4.0))
+    torch.testing.assert_close(values.square().sum(-1), torch.full((2,), 16.0))
     encoder = ConditionEncoder(1, frequencies=2, width=4)
     encoder.network = torch.nn.Identity()
     torch.testing.assert_close(encoder(torch.tensor([[0.5]])), torch.tensor([[0.5, 1.0, 0.0, 0.0, -1.0]]))

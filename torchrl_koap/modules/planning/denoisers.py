@@ -14,21 +14,18 @@ NEAR = (0.05, 0.015)  # length scales in m of the magnified copies of positions
 
 
 class StepEmbedding(nn.Module):
-    """Embeds times by sines and cosines of geometrically spaced frequencies and a two-layer network.
+    """Embeds times by sines and cosines of geometrically spaced frequencies and a two-layer network."""
 
-    The width ``embedding_dim`` is even and at least 4.
-    """
-
-    def __init__(self, embedding_dim: int):
+    def __init__(self):
         super().__init__()
-        half = embedding_dim // 2
+        half = EMBEDDING_DIM // 2
         self.register_buffer("frequencies", torch.exp(torch.arange(half) * (-math.log(10000.0) / (half - 1))))
         self.network = nn.Sequential(
-            nn.Linear(embedding_dim, 4 * embedding_dim), nn.SiLU(), nn.Linear(4 * embedding_dim, embedding_dim)
+            nn.Linear(EMBEDDING_DIM, 4 * EMBEDDING_DIM), nn.SiLU(), nn.Linear(4 * EMBEDDING_DIM, EMBEDDING_DIM)
         )
 
     def forward(self, time: Tensor) -> Tensor:
-        """Maps times ``[B]`` to embeddings ``[B, embedding_dim]``."""
+        """Maps times ``[B]`` to embeddings ``[B, 32]``."""
         angles = time[:, None] * self.frequencies
         return self.network(torch.cat([angles.sin(), angles.cos()], -1))
 
@@ -68,7 +65,7 @@ class Denoiser(nn.Module):
     def __init__(self, state_dim: int, condition_dim: int, *, horizon: int | None = None):
         super().__init__()
         self.state_dim, self.condition_dim, self.horizon = state_dim, condition_dim, horizon
-        self.step_embedding = StepEmbedding(EMBEDDING_DIM)
+        self.step_embedding = StepEmbedding()
 
     def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
         """Predicts ``[N, H, d]`` from sequences ``[N, H, d]``, embedded steps ``[N, 32]`` and conditions ``[N, c]``."""
