@@ -10,6 +10,7 @@ from torchrl_koap.modules import (
     Execution,
     ResponseModel,
     blend_plan,
+    make_koopman_inverse_dynamics,
     make_policy,
 )
 from torchrl_koap.modules.execution.followers import InverseDynamicsFollower, command_rest, remaining_plan
@@ -52,6 +53,15 @@ def test_the_final_rule_for_actions_reads_the_whole_window():
     plan = CountingPlanner().sample(states + 5.0)  # of a robot that is elsewhere by now
     assert follower(states, states, plan)[0, 0, :2].tolist() == [7.5, 8.5]
     assert seen[0][0, :, 0].tolist() == [3, 4] + [9 + 1000.0 * k for k in range(1, 7)]  # plans as they were made
+
+
+def test_actions_are_followed_whichever_entries_the_controller_was_asked_to_write():
+    controller, states, plan = make_koopman_inverse_dynamics(2, 2), torch.randn(3, 5, 2), torch.randn(3, 14, 2)
+    expected = InverseDynamicsFollower(controller)(states, states, plan)
+    selected = InverseDynamicsFollower(controller.select_out_keys("action", "latent_action"))
+    assert torch.equal(selected(states, states, plan), expected)
+    with pytest.raises(KeyError, match='"action" not found'):
+        InverseDynamicsFollower(controller.select_out_keys("latent_action"))(states, states, plan)
 
 
 def test_the_last_state_stays_when_a_plan_is_over():

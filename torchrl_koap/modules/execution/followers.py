@@ -78,7 +78,8 @@ class InverseDynamicsFollower(Follower):
         window = torch.cat([states, blend_plan(states, plan, self.blend)], -2)
         window = window if self.reads is None else self.reads(window)
         out = self.controller(TensorDict({self.controller.in_keys[0]: window}, batch_size=window.shape[:-2]))
-        actions = out.get(self.controller.out_keys[-1])
+        own = isinstance(self.controller, InverseDynamics)  # its out_keys may be selected
+        actions = out[self.controller.out_key if own else self.controller.out_keys[-1]]
         if self.action_rule is not None:
             actions = self.action_rule(torch.cat([states, plan], -2), actions)
         now = states.shape[-2] - 1
