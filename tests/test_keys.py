@@ -57,8 +57,9 @@ def test_everything_is_reported_at_once():
     data = flat().exclude("action", ("next", "done"))
     data["episode"] = data["episode"].float()
     data["has_action"] = data["has_action"].squeeze(-1)
+    data["label_command"] = torch.zeros(len(data))
     found = problems(data)
-    assert len(found) == 4
+    assert len(found) == 5 and "'label_command' must be a float tensor [N, d], got torch.float32 [8]" in found
     assert any("int64" in problem for problem in found) and any("[N, 1]" in problem for problem in found)
 
 
