@@ -241,7 +241,7 @@ def _value_problems(data: TensorDictBase, present: set, command: slice | None) -
         yield f"('next', 'done') must be 'terminated or truncated', first fault at step {_first(done != stopped)}"
 
 
-def _not_finite(values: torch.Tensor, allowed: slice | None) -> torch.Tensor:
+def _not_finite(values: Tensor, allowed: slice | None) -> Tensor:
     """Returns which rows hold NaN or infinite values; in a row, the ``allowed`` columns may all be NaN."""
     bad_entries = ~values.isfinite()
     if allowed is not None:
@@ -249,5 +249,5 @@ def _not_finite(values: torch.Tensor, allowed: slice | None) -> torch.Tensor:
     return bad_entries.any(-1)
 
 
-def _first(mask: torch.Tensor) -> int:
+def _first(mask: Tensor) -> int:
     return int(mask.nonzero()[0])

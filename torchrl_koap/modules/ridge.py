@@ -132,7 +132,7 @@ def ridge(
     target = y - mean_y
     left, singular, right = thin_svd(x, mean_x)
     unit = singular.square().sum() / len(x)
-    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # for constant inputs any positive unit works
+    unit = torch.where(unit > 0, unit, 1.0)  # for constant inputs any positive unit works
 
     smallest = input_noise * len(x)
     tried = sorted({max(float(penalty), smallest) for penalty in penalties})

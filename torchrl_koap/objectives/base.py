@@ -85,7 +85,7 @@ class NetworkLoss(LossModule):
     def _recorded(self, tensordict: TensorDictBase, state: Tensor) -> Tensor:
         """Returns which transitions are between two recorded (not padded) frames, bool ``[*B, T - 1]``."""
         if tensordict.get(self.tensor_keys.padded, None) is None:
-            return torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
+            return torch.ones_like(state[..., 1:, 0], dtype=torch.bool)
         padded = self._read_mask(tensordict, "padded", state)
         return ~(padded[..., 1:] | padded[..., :-1])
 

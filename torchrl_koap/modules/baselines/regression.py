@@ -58,7 +58,7 @@ class LinearInverseDynamics(InverseDynamics):
         inputs, action, groups = self.labelled_frames(self._read, windows, mask)
         spread = inputs.std(0, correction=0)
         self.inputs.offset.copy_(inputs.mean(0))
-        self.inputs.scale.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
+        self.inputs.scale.copy_(torch.where(spread > 1e-9, spread, 1.0))
         fit = ridge(self.inputs(inputs), action, groups=groups, input_noise=INPUT_NOISE, alike=alike)
         self.decoder.assign(fit)
         return fit.summary()

@@ -94,7 +94,7 @@ class NoiseAdjustedComponents(nn.Module):
         sign = torch.where(analysis.sum(-1) < 0, -1.0, 1.0)  # the sign of an eigenvector is arbitrary
         kept = ratio > MIN_RATIO
         kept[0] = True
-        size = torch.where(ratio > 1e-9, ratio.clamp_min(1e-9).sqrt(), torch.ones_like(ratio))
+        size = torch.where(ratio > 1e-9, ratio.sqrt(), 1.0)
         self.analysis.copy_(analysis * (sign * kept / size)[:, None])
         self.synthesis.copy_(synthesis * (sign * kept * size))
         self.weights.copy_(torch.where(kept, ratio, 0.0) * count / ratio[kept].sum().clamp_min(1e-9))

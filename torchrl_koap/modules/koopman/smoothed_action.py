@@ -156,7 +156,7 @@ class LatentActionSmoothed(LatentActionModule):
         self.spread.fill_(1.0)
         lifted = torch.cat([self._lift(part) for part in windows.split(BATCH)])
         spread = lifted.flatten(0, 1).std(0)
-        self.spread.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
+        self.spread.copy_(torch.where(spread > 1e-9, spread, 1.0))
         lifted = lifted / self.spread
         read = self.reader.gather(lifted, now).squeeze(-3)
         self.smoother.fit(read, lifted)
