@@ -11,6 +11,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training import loop
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import train_phase
@@ -56,6 +57,8 @@ def test_the_latest_good_averaged_weights_are_kept_and_training_ends(tmp_path):
     assert (best.best.item(), best.step.item()) == (0.5, 30)
     scores = [float(row["held_out_score"]) for row in run.read_metrics() if row["held_out_score"]]
     assert scores == [0.9, 0.5, 0.52, *[0.53] * 5], "1.5 times 30 updates and four more scores"
+    assert run.last_metrics("planner")["updates"] == 85, "a resumed run reads from here how many there were"
+    assert load_tensors(tmp_path / "checkpoints" / "planner.safetensors")[1]["step"] == 85
     kept = best.network.state_dict()
     assert all(torch.equal(value, kept[name]) for name, value in curve.seen[2].items())
     average = loss.target_network_params.flatten_keys(".")

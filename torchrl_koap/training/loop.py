@@ -99,6 +99,9 @@ def train_phase(
     values: dict[str, float] = run.last_metrics(phase) if start else {}
     device_rate = torch.tensor(learning_rate, device=device)  # a CUDA graph reads tensors only
 
+    def ends(step: int) -> bool:
+        return step == num_steps or (best is not None and best.finished(step))
+
     def update(batch: TensorDictBase) -> TensorDictBase:
         losses = loss_module(batch)
         terms = losses.select(*(key for key in losses.keys() if key.startswith("loss_")))
@@ -114,22 +117,22 @@ def train_phase(
             update = CudaGraphModule(update)
     done = start
     began, mark, marked = time.perf_counter(), time.perf_counter(), start
-    for step in range(start, num_steps):
-        if best is not None and best.finished(step):
-            break
-        rate = learning_rate * warmup_cosine(step, num_steps, WARMUP)
+    ended = ends(done)
+    while not ended:
+        rate = learning_rate * warmup_cosine(done, num_steps, WARMUP)
         for group in optimizer.param_groups:
             group["lr"] = device_rate.fill_(rate) if replay else rate
         with _interrupts_let_through():
             terms = update(sample())
 
-        done = step + 1
+        done += 1
         scored = best is not None and (done % best.every == 0 or done == num_steps)
         with _interrupts_let_through():
             if target_update is not None and (done % AVERAGE_EVERY == 0 or done == num_steps):
                 target_update.step()
             scores = {} if best is None else best.check(done) if scored else best.kept()
-        if scored or done % log_every == 0 or done == num_steps:
+        ended = ends(done)
+        if scored or done % log_every == 0 or ended:
             values = {key: value.item() for key, value in terms.items()}
             bad = [key for key, value in values.items() if not math.isfinite(value)]
             if bad:
@@ -145,7 +148,7 @@ def train_phase(
                     logger.log_scalar(f"{phase}/{key}", number, step=done)
         if progress is not None:
             progress(done, values)
-        if checkpoint is not None and (done % CHECKPOINT_EVERY == 0 or done == num_steps):
+        if checkpoint is not None and (done % CHECKPOINT_EVERY == 0 or ended):
             if not all(parameter.isfinite().all() for parameter in loss_module.parameters()):
                 raise DivergedError(f"{phase}: parameters are not finite at step {done}; lower the learning rate")
             save_training_state(checkpoint, state, optimizer, {"phase": phase, "step": done})
