@@ -140,6 +140,25 @@ def test_a_trajectory_left_out_is_judged_by_the_others_alone():
     assert all(torch.allclose(value, after[name], equal_nan=True) for name, value in before.items())
 
 
+def label_last(data, episode, steps):
+    """Hides all labels of a trajectory but those of its last steps."""
+    rows = (data["episode"] == episode).nonzero().squeeze(-1)[:-steps]
+    data["has_action"][rows], data["action"][rows] = False, torch.nan
+
+
+def test_labels_near_the_end_that_no_fit_can_use_are_told():
+    data, task = counting((30, 40)), get_task("avoiding")
+    controller, every = controller_of("koap", data), data.clone()
+    label_last(data, 1, 8)  # enough for the controller, not for the ridge, which looks 8 steps ahead
+    assert errors_left_out(controller, data, task, (0, 1)) == {
+        "note": "no labelled step has enough recorded future to decode its action"
+    }
+    label_last(data, 0, 8)
+    hidden = data.clone().set("has_action", data["has_action"] & (data["episode"] == 1).unsqueeze(-1))
+    note = {"note": "the ridge on raw frames cannot be fitted: no label is followed by 8 recorded steps"}
+    assert errors_outside_budget(controller, every, hidden, task) == (note, {})
+
+
 def test_an_action_that_never_changes_is_commanded_right_whatever_is_decoded():
     data = counting()
     data["action"][:, 1] = 7.0

@@ -42,6 +42,12 @@ def test_a_policy_that_goes_to_the_goal(trained):
     assert found["distance_to_demonstrations"] < 0.5 and json.dumps(found)
 
 
+def test_labels_of_first_steps_alone_show_no_change(trained):
+    model, data = trained
+    first = data.clone().set("has_action", data["has_action"] & (data["step_count"].reshape(-1, 1) == 0))
+    assert check_loop(model, first, first) == {"note": "no command changes in the labels", "faults": []}
+
+
 def test_commands_are_counted_in_those_of_the_budget_and_noise_is_that_of_the_seed(trained, monkeypatch):
     monkeypatch.setattr(loop_on_labels, "STEPS", 30)
     model, data = trained

@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.tasks.columns import unit_groups
-from torchrl_koap.training.closed_form import action_facts, fit_closed_form
+from torchrl_koap.training.closed_form import LateLabelsError, action_facts, fit_closed_form
 from torchrl_koap.training.controller import FEW_VALUES
 
 SAMPLES = 16  # plans per situation
@@ -149,7 +150,10 @@ def errors_outside_budget(
     predicted, true, episode = first_actions(controller, data, outside)
     if not len(true):
         return {"note": "no trajectory outside the budget has labels"}, {}
-    models = _with_baselines(predicted, true, labelled, data, outside, task)
+    try:
+        models = _with_baselines(predicted, true, labelled, data, outside, task)
+    except LateLabelsError as error:
+        return {"note": f"the ridge on raw frames cannot be fitted: {error}"}, {}
     return summarise_errors(models, true, episode, task), {"predicted": models["controller"], "true": true}
 
 
@@ -190,10 +194,11 @@ def errors_left_out(
         fold[HAS_ACTION] = labelled[HAS_ACTION] & ~hidden.unsqueeze(-1)
         fold[ACTION] = torch.where(fold[HAS_ACTION], labelled[ACTION], math.nan)
         again = copy.deepcopy(controller)
-        fit_closed_form(again, fold, **action_facts(task, columns))
-        predicted, true, episode = first_actions(again, labelled, [int(number)])
-        if len(true):  # otherwise its labels lie too near its end
-            folds.append((_with_baselines(predicted, true, fold, labelled, [int(number)], task), true, episode))
+        with suppress(LateLabelsError):  # of the other trajectories
+            fit_closed_form(again, fold, **action_facts(task, columns))
+            predicted, true, episode = first_actions(again, labelled, [int(number)])
+            if len(true):  # otherwise its labels lie too near its end
+                folds.append((_with_baselines(predicted, true, fold, labelled, [int(number)], task), true, episode))
     if not folds:
         return {"note": "no labelled step has enough recorded future to decode its action"}
     models, truths, numbers = zip(*folds, strict=True)

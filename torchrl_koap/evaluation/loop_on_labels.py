@@ -62,7 +62,7 @@ def check_loop(
     """
     task = trained.task
     ranges = command_ranges(task, labelled)
-    if not any(ranges):
+    if not any(ranges) or not (data[HAS_ACTION] & ~begins(data).unsqueeze(-1)).any():
         return {"note": "no command changes in the labels", "faults": []}
     response, explained = _fit(data)
     if explained < _EXPLAINED:

@@ -20,7 +20,7 @@ from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.tasks.action_rules import shift_actions
-from torchrl_koap.training.closed_form import action_facts, fit_closed_form
+from torchrl_koap.training.closed_form import LateLabelsError, action_facts, fit_closed_form
 from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
@@ -67,18 +67,26 @@ def learn_controller(
 def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None:
     """Raises a ValueError before training if a trajectory of flat data ``[N]`` is shorter than a window.
 
-    Also if a controller fails or its actions lack the task's width. Warns of late switches that no fit sees.
+    Also if a controller fails, its actions lack the task's width, or no label is early enough for it. Warns of late
+    switches that no fit sees.
     """
-    method, window, past, ahead = get_method(config.method), WINDOW, 1, 0
-    if method.plans and method.fit is None:
-        with torch.random.fork_rng(devices=[]):
-            controller = build_controller(task, method, config.controller).eval()
-            window, past = max(WINDOW, controller.num_window_frames), controller.num_past
-            _check_actions(task, config, controller, window)
-            ahead = window - controller.valid_frames(window).stop
+    method = get_method(config.method)
+    if not method.plans or method.fit is not None:
+        WindowTable.build(data, WINDOW, pad_before=1)
+        return
+    with torch.random.fork_rng(devices=[]):
+        controller = build_controller(task, method, config.controller).eval()
+        shortest, past = controller.num_window_frames, controller.num_past
+        window = max(WINDOW, shortest)
+        _check_actions(task, config, controller, window)
     WindowTable.build(data, window, pad_before=past)
-    if ahead:
-        _warn_of_late_switches(task, data, ahead)
+    counted = range(past, past + 1) if method.closed_form else controller.valid_frames(shortest)
+    if not WindowTable.build(data, shortest, counted=counted, pad_before=past).labelled.any():
+        raise LateLabelsError(
+            f"no label is followed by the {shortest - counted.stop} recorded steps that method {config.method!r} needs:"
+            " label earlier steps"
+        )
+    _warn_of_late_switches(task, data, window - controller.valid_frames(window).stop)
 
 
 def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, window: int) -> None:
