@@ -15,6 +15,7 @@ from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 from torchrl_koap.training import loop
+from torchrl_koap.training.checkpoints import load_training_state, save_training_state
 from torchrl_koap.training.loop import (
     WARMUP,
     DivergedError,
@@ -203,6 +204,17 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path):
     save_tensors(tmp_path / "checkpoints" / "controller.safetensors", weights, {"task": "avoiding"})
     with pytest.raises(CheckpointError, match="is not a training state"):
         run_training(Controller, tmp_path, resume=True)
+
+
+def test_a_training_on_the_cpu_leaves_gpus_alone(tmp_path, monkeypatch):
+    """Reading their random states would reserve memory on each, and another number of GPUs could not restore them."""
+    module, path = nn.Linear(2, 2), tmp_path / "state.safetensors"
+    optimizer = torch.optim.AdamW(module.parameters())
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    for name in ("get_rng_state", "get_rng_state_all", "set_rng_state_all"):
+        monkeypatch.setattr(f"torch.cuda.{name}", lambda *_: pytest.fail("a GPU was asked"))
+    save_training_state(path, module, optimizer, {"step": 3})
+    assert load_training_state(path, module, optimizer) == {"step": 3}
 
 
 @pytest.mark.parametrize(

@@ -24,8 +24,6 @@ def save_training_state(
     tensors = _state(module)
     for index, held in moments.items():
         tensors |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in held.items()}
-    if torch.cuda.is_available():
-        tensors |= {f"rng.cuda.{i}": value for i, value in enumerate(torch.cuda.get_rng_state_all())}
     save_tensors(path, tensors, {**about, "moments": [str(index) for index in moments]})
 
 
@@ -48,25 +46,25 @@ def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.op
     }
     wanted = _state(module)
     wanted |= {f"optimizer.{index}.{name}": like for index, held in moments.items() for name, like in held.items()}
-    saved = {name: value for name, value in tensors.items() if not name.startswith("rng.cuda.")}
-    if wanted.keys() != saved.keys() or any(
-        (like.shape, like.dtype) != (saved[name].shape, saved[name].dtype) for name, like in wanted.items()
+    if wanted.keys() != tensors.keys() or any(
+        (like.shape, like.dtype) != (tensors[name].shape, tensors[name].dtype) for name, like in wanted.items()
     ):
         raise CheckpointError(f"{path} holds the state of another model")
     with torch.no_grad():
         for name, value in _state(module).items():
-            value.copy_(saved[name])
-    state = {index: {name: saved[f"optimizer.{index}.{name}"] for name in held} for index, held in moments.items()}
+            value.copy_(tensors[name])
+    state = {index: {name: tensors[f"optimizer.{index}.{name}"] for name in held} for index, held in moments.items()}
     # hyperparameters come from the run's options; the loop sets the learning rate at every update
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    torch.set_rng_state(saved["rng.cpu"])
-    cuda = [tensors[name] for name in sorted(tensors) if name.startswith("rng.cuda.")]
-    if cuda and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all(cuda)
+    torch.set_rng_state(tensors["rng.cpu"])
+    if "rng.cuda" in tensors:
+        torch.cuda.set_rng_state(tensors["rng.cuda"], next(module.parameters()).device)
     return about
 
 
 def _state(module: nn.Module) -> dict[str, Tensor]:
-    """Returns the tensors of a module, and the random state."""
+    """Returns the tensors of a module, and the random states of the CPU and of the module's GPU, if it is on one."""
     own = {name: value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
-    return own | {"rng.cpu": torch.get_rng_state()}
+    device = next(module.parameters()).device
+    cuda = {"rng.cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
+    return own | {"rng.cpu": torch.get_rng_state()} | cuda
