@@ -99,6 +99,7 @@ def test_nothing_is_written_beside_them(policies, tmp_path, capfd, monkeypatch):
 
 def test_another_run_is_not_overwritten(trained_run, tmp_path):
     copy_run(trained_run, tmp_path / "mine")
+    assert copy_run(tmp_path / "mine", tmp_path / "mine") == tmp_path / "mine", "`--out` may name the run itself"
     assert (tmp_path / "mine" / "demonstrations.safetensors").is_file()  # the report draws them
     config = json.loads((trained_run / "config.json").read_text())
     (tmp_path / "mine" / "config.json").write_text(json.dumps(config | {"run": config["run"] | {"seed": 9}}))

@@ -211,6 +211,8 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
     if (target / "config.json").exists() and RunDirectory(target).read_json("config.json") != config:
         raise RunDirectoryError(f"{target} holds another run than {source}; choose another --out")
     target.mkdir(parents=True, exist_ok=True)
+    if target.samefile(source):
+        return target
     for name in FILES:
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
