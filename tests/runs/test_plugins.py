@@ -143,8 +143,9 @@ def test_what_is_no_method_is_refused():
         Method("other", "", build, sees="labeled")
     with pytest.raises(ValueError, match="the name of a method must be letters, digits"):
         Method("a/b", "", build)
-    with pytest.raises(ValueError, match="phases of method 'other' must have different names"):
-        Method("other", "", build, (Phase("x", loss), Phase("x", loss)))
+    for names in (("x", "x"), ("planner",)):
+        with pytest.raises(ValueError, match="phases of method 'other' must have different names, not 'planner', got"):
+            Method("other", "", build, tuple(Phase(name, loss) for name in names))
     with pytest.raises(ValueError, match="unknown kind of windows 'labeled'; did you mean 'labelled'"):
         Phase("x", loss, "labeled")
     with pytest.raises(ValueError, match="the teacher of method 'other' must be a controller, 'dp' is a policy"):

@@ -100,7 +100,8 @@ class Method:
         phases_by_preset (mapping): phases of presets that are trained differently.
 
     Raises:
-        ValueError: for a name that cannot be a folder name, two phases of one name, or an unknown default.
+        ValueError: for a name that cannot be a folder name, two phases of one name, a phase ``"planner"``, or an
+            unknown default.
 
     Examples:
         >>> from torchrl_koap.modules import LinearInverseDynamics
@@ -131,8 +132,8 @@ class Method:
         if not re.fullmatch(r"[A-Za-z0-9_.]+", self.name):
             raise ValueError(f"the name of a method must be letters, digits, '_' and '.', got {self.name!r}")
         names = [phase.name for phase in self.phases]
-        if len(set(names)) < len(names):
-            raise ValueError(f"phases of method {self.name!r} must have different names, got {names}")
+        if len({"planner", *names}) <= len(names):  # logs and checkpoints have these names
+            raise ValueError(f"phases of method {self.name!r} must have different names, not 'planner', got {names}")
         if not self.plans and len(names) != 1:
             raise ValueError(f"method {self.name!r} does not plan: it must have one phase, got {len(names)}")
         if self.fit is not None and (names or self.closed_form):
