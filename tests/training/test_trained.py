@@ -148,10 +148,12 @@ def test_files_that_cannot_be_used_are_named(own, trained_run, tmp_path):
 def test_what_cannot_be_saved_or_executed(own, tmp_path):
     with pytest.raises(IsADirectoryError, match="is a folder; a policy is one file, such as"):
         own.save(tmp_path)
-    assert not list(tmp_path.iterdir())
     for part in ("planner", "controller"):
-        with pytest.raises(ValueError, match=f"a policy needs planner and controller: no {part} was trained here"):
-            replace(own, **{part: None}).policy()
+        half = replace(own, **{part: None})
+        for make in (half.policy, lambda half=half: half.save(tmp_path / "half.safetensors")):
+            with pytest.raises(ValueError, match=f"a policy needs planner and controller: no {part} was trained here"):
+                make()
+    assert not list(tmp_path.iterdir()), "a file that could not be loaded"
 
 
 def test_a_training_is_shown_in_one_line(own, trained_run):

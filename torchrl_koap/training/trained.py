@@ -146,7 +146,9 @@ class Trained:
 
         Raises:
             IsADirectoryError: if the path is a folder.
+            ValueError: if only a planner or a controller was trained.
         """
+        self._check_parts()
         path = Path(path)
         if path.is_dir():
             raise IsADirectoryError(f"{path} is a folder; a policy is one file, such as {path / 'policy.safetensors'}")
@@ -207,9 +209,7 @@ class Trained:
         """
         if not isinstance(execution, Execution):
             execution = given_options(execution, ExecutionConfig).on(self.execution)
-        missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
-        if self.method.plans and missing:
-            raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
+        self._check_parts()
         reads = state_reader(self.task, self.config.controller)
         facts = policy_facts(self.task, reads=reads, ranges=self.results.get("command_ranges"))
         facts["observe"] = Observer(self.task, self.cameras) if self.cameras else None
@@ -219,6 +219,11 @@ class Trained:
         if follower is not None:
             raise ValueError(f"follower: method {self.method.name!r} samples actions and makes no plans to follow")
         return make_policy(self.controller, **facts, execution=execution)
+
+    def _check_parts(self) -> None:
+        missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
+        if self.method.plans and missing:
+            raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
 
     def data(self, dataset: str | None = None) -> TensorDictBase:
         """Reads the demonstrations of the training with all labels; ``dataset`` is their folder if it has moved.
