@@ -181,8 +181,8 @@ def distance_to_demonstrations(task: Task, episodes: Sequence[TensorDict], data:
     Every second demonstration is held out, so that neither is compared with itself. Returns 95 % quantiles
     in standard deviations (root mean square over columns); an empty dict for a single demonstration.
     """
-    every = data[EPISODE] % 2 == 0
-    known, held_out = data[STATE][every], data[STATE][~every]
+    even = data[EPISODE] % 2 == 0
+    known, held_out = data[STATE][even], data[STATE][~even]
     if not len(held_out):
         return {}
     scale = known.std(0).clamp_min(1e-6) * task.state_dim**0.5

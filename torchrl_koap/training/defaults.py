@@ -65,8 +65,8 @@ def resolve(config: TrainConfig, task: Task) -> TrainConfig:
 
 def _planner(asked: PlannerConfig, method: Method, task: Task) -> PlannerConfig:
     if not method.plans:
-        for name in ("source", "held_out", "frames"):
-            if getattr(asked, name) not in (None, {"held_out": 0.0, "frames": HISTORY}.get(name)):
+        for name, only in {"source": None, "held_out": 0.0, "frames": HISTORY}.items():
+            if getattr(asked, name) not in (None, only):
                 raise ValueError(f"planner.{name}: method {method.name!r} samples actions and has no planner")
     if asked.source is not None:
         return _taken_over(asked)

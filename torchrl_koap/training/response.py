@@ -6,7 +6,6 @@ A ridge regression of single steps comes first, then nonlinear least squares of 
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -106,15 +105,13 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
             out = folds == fold
             _fit(response, data, take(steps, ~out), changes, coupled=coupled)
             errors.append(prediction_errors(response, _stretches(response, data, take(steps, out), changes)).flatten())
-        errors = torch.cat(errors)
-        found[coupled] = errors.pow(2).mean().sqrt().item() if len(errors) else math.inf
+        found[coupled] = torch.cat(errors).pow(2).mean().sqrt().item()
     coupled = min(found, key=found.__getitem__, default=False)
-    error = found.get(coupled, math.inf)
     _fit(response, data, steps, changes, coupled=coupled)
     return {
         "coupled": coupled,
         "labels_used": len(steps.row),
-        "held_out_error": float(f"{error:.4g}") if error < math.inf else None,
+        "held_out_error": float(f"{found[coupled]:.4g}") if found else None,
     }
 
 
