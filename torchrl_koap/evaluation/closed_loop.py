@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import statistics
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from torchrl_koap.evaluation.config import EvalConfig, environment_arguments
 from torchrl_koap.evaluation.latency import measure_latency
-from torchrl_koap.evaluation.loop_on_labels import limited_commands, standing_faults, start_faults
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
+from torchrl_koap.evaluation.rollout_faults import limited_commands, standing_faults, start_faults
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import outcome_of, score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval
@@ -103,17 +104,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     result |= {"execution": to_json(policy.execution), "episode": rows}
     result |= where.facts
     if where.record is not None:
-        result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors}
-        # an episode that an error cut short has no return
-        for episode, row in zip(episodes, rows, strict=True):
-            row["return"] = None if row["outcome"] == "error" else float(episode["next", "reward"].sum())
-        returns = [row["return"] for row in rows if row["return"] is not None]
-        result["mean_return"] = statistics.fmean(returns) if returns else None
-        if len(returns) > 1:
-            result["mean_return_interval"] = bootstrap_interval(returns, statistics.fmean)
-        ends = [bool(episode[-1]["next", "terminated"]) for episode in episodes]
-        result["ended_early"] = sum(end and row["outcome"] != "success" for end, row in zip(ends, rows, strict=True))
-        result["left_out_of_return"] = len(episodes) - len(returns)
+        result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors} | _returns(episodes, rows)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
         if data is not None:
             sound = [episode for episode in episodes if outcome_of(episode) != "error"]
@@ -137,6 +128,19 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         save_tensors(directory.path / "actions.safetensors", actions)
     directory.write_json("eval.json", result)
     return result
+
+
+def _returns(episodes: Sequence[TensorDict], rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Adds its return to the row of each episode, None if an error cut it short; returns the mean and early ends."""
+    for episode, row in zip(episodes, rows, strict=True):
+        row["return"] = None if row["outcome"] == "error" else float(episode["next", "reward"].sum())
+    returns = [row["return"] for row in rows if row["return"] is not None]
+    found: dict[str, Any] = {"mean_return": statistics.fmean(returns) if returns else None}
+    if len(returns) > 1:
+        found["mean_return_interval"] = bootstrap_interval(returns, statistics.fmean)
+    ends = [bool(episode[-1]["next", "terminated"]) for episode in episodes]
+    found["ended_early"] = sum(end and row["outcome"] != "success" for end, row in zip(ends, rows, strict=True))
+    return found | {"left_out_of_return": len(episodes) - len(returns)}
 
 
 def _judge_offline(run: str | Path, trained: Trained, config: EvalConfig) -> dict[str, Any]:

@@ -24,8 +24,8 @@ from torchrl_koap.evaluation.diagnosis import (
 )
 from torchrl_koap.evaluation.findings import GOOD, NEAR, describe_inspection
 from torchrl_koap.evaluation.latent_space import analyse_latent
-from torchrl_koap.evaluation.loop_on_labels import start_faults
 from torchrl_koap.evaluation.policies import trained_policy
+from torchrl_koap.evaluation.rollout_faults import start_faults
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate

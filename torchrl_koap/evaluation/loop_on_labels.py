@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import statistics
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,24 +14,20 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.data.trajectories import begins, labelled_episodes, trajectory_lengths
+from torchrl_koap.data.trajectories import begins, labelled_episodes
 from torchrl_koap.data.windows import spread_evenly
-from torchrl_koap.evaluation.findings import LEAVES, STAYS, UNSTABLE, loop_faults
-from torchrl_koap.files import some
+from torchrl_koap.evaluation.findings import UNSTABLE, loop_faults
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
 from torchrl_koap.modules.execution.agent import FarStateWarning
 from torchrl_koap.modules.execution.command_limits import ends_of
 from torchrl_koap.modules.ridge import ridge
-from torchrl_koap.tasks import Task
 from torchrl_koap.training.policy_facts import command_ranges
 from torchrl_koap.training.trained import Trained
 
 STEPS, ROBOTS = 300, 16
 DIVERGED = 1e12  # a rollout ends if a column exceeds this, far below values whose squares overflow in a network
-_MIN_ROLLOUTS, _START_MARGIN = 5, 0.02  # to compare starts; tolerance, as a share of the range of the column
 _EXPLAINED = 0.5  # smallest share of the variance of changes that a usable linear model explains
-_SMOOTH = 8  # frames that are averaged before distances from the start are measured
 _DRIFT = 1.0  # standard deviations; replayed actions must end nearer to their recording
 _ROWS = 4000  # largest number of recorded states that distances are measured to
 _PREFERRED = 100.0  # weight of actions in the ridge: in smooth motions the state alone predicts the next one
@@ -108,50 +104,6 @@ def _growth(commands: Tensor, ends: Tensor, steps: int) -> tuple[Tensor, float]:
     growth = ((commands - ends.mean(-1)) / (ends.diff(dim=-1).squeeze(-1) / 2)).nan_to_num(math.inf).abs()
     growth = growth[..., ends[:, 0].isfinite()].amax(-1)
     return growth, float(growth[2 * len(growth) // 3 :].max()) if len(growth) == steps else math.inf
-
-
-def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
-    """Counts the commands of a policy that left the demonstrated range; ``faults`` has a sentence if any did."""
-    limited, commands = policy.limited.tolist()
-    if not limited:
-        return {"limited_commands": 0}
-    margin = policy.execution.limits
-    fault = (
-        f"{limited} of {commands} commands left the demonstrated range by more than {margin:g} of its width and were"
-        " limited there; --limits inf sends them as they are"
-    )
-    return {"limited_commands": limited, "faults": [fault]}
-
-
-def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> list[str]:
-    """Reports failed rollouts ``[T]`` that, in most columns, hardly leave their start compared to demonstrations."""
-
-    def reach(rows: Tensor) -> Tensor:
-        smooth = rows.double().unfold(0, min(_SMOOTH, len(rows)), 1).mean(-1)  # sensor noise is not motion
-        return (smooth - smooth[:1]).abs().amax(0)
-
-    recorded = data[OBSERVATION].split(trajectory_lengths(data).tolist())
-    usual = torch.stack([reach(rows) for rows in recorded]).median(0).values
-    ways = [reach(episode[OBSERVATION]) / usual for episode in failed if len(episode) >= _SMOOTH]
-    stay = sum(bool(each[usual > 0].median() < STAYS) for each in ways)
-    said = f"{stay} of {len(failed)} failed rollouts get less than {STAYS:g} times as far from their start as"
-    return [f"{said} demonstrations; {LEAVES}"] if stay else []
-
-
-def start_faults(rollouts: Sequence[TensorDictBase], data: TensorDictBase, task: Task) -> list[str]:
-    """Names columns in which 90 % of at least five rollouts ``[T]`` start outside the range of recorded starts."""
-    if len(rollouts) < _MIN_ROLLOUTS:
-        return []
-    observed = data[OBSERVATION].double()
-    (low, high), (least, most) = (torch.aminmax(rows, dim=0) for rows in (observed[begins(data)], observed))
-    seen = torch.stack([episode[OBSERVATION][0].double() for episode in rollouts])
-    margin = _START_MARGIN * (most - least)
-    out = ((seen > high + margin) | (seen < low - margin)).double().mean(0) >= 0.9
-    origin = torch.tensor((task.origins or (0.0,))[0], dtype=torch.float64)
-    table = torch.stack([*torch.aminmax(seen, dim=0), low, high], -1) + origin.unsqueeze(-1)
-    rows = [(task.observation_names[column], *table[column].tolist()) for column in out.nonzero().flatten().tolist()]
-    said = some([f"{name} at {a:.4g} to {b:.4g} (recordings: {c:.4g} to {d:.4g})" for name, a, b, c, d in rows])
-    return [f"rollouts start where no recording does: {said}: another zero, unit or order of columns?"] if rows else []
 
 
 def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, float]:

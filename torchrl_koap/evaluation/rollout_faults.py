@@ -1,0 +1,65 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Says what is odd in rollouts: commands that were limited, policies that stand still, starts that no recording has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.data.trajectories import begins, trajectory_lengths
+from torchrl_koap.evaluation.findings import LEAVES, STAYS
+from torchrl_koap.files import some
+from torchrl_koap.keys import OBSERVATION
+from torchrl_koap.modules import PlanningPolicy
+from torchrl_koap.tasks import Task
+
+_MIN_ROLLOUTS, _START_MARGIN = 5, 0.02  # to compare starts; tolerance, as a share of the range of the column
+_SMOOTH = 8  # frames that are averaged before distances from the start are measured
+
+
+def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
+    """Counts the commands of a policy that left the demonstrated range; ``faults`` has a sentence if any did."""
+    limited, commands = policy.limited.tolist()
+    if not limited:
+        return {"limited_commands": 0}
+    margin = policy.execution.limits
+    fault = (
+        f"{limited} of {commands} commands left the demonstrated range by more than {margin:g} of its width and were"
+        " limited there; --limits inf sends them as they are"
+    )
+    return {"limited_commands": limited, "faults": [fault]}
+
+
+def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> list[str]:
+    """Reports failed rollouts ``[T]`` that, in most columns, hardly leave their start compared to demonstrations."""
+
+    def reach(rows: Tensor) -> Tensor:
+        smooth = rows.double().unfold(0, min(_SMOOTH, len(rows)), 1).mean(-1)  # sensor noise is not motion
+        return (smooth - smooth[:1]).abs().amax(0)
+
+    recorded = data[OBSERVATION].split(trajectory_lengths(data).tolist())
+    usual = torch.stack([reach(rows) for rows in recorded]).median(0).values
+    ways = [reach(episode[OBSERVATION]) / usual for episode in failed if len(episode) >= _SMOOTH]
+    stay = sum(bool(each[usual > 0].median() < STAYS) for each in ways)
+    said = f"{stay} of {len(failed)} failed rollouts get less than {STAYS:g} times as far from their start as"
+    return [f"{said} demonstrations; {LEAVES}"] if stay else []
+
+
+def start_faults(rollouts: Sequence[TensorDictBase], data: TensorDictBase, task: Task) -> list[str]:
+    """Names columns in which 90 % of at least five rollouts ``[T]`` start outside the range of recorded starts."""
+    if len(rollouts) < _MIN_ROLLOUTS:
+        return []
+    observed = data[OBSERVATION].double()
+    (low, high), (least, most) = (torch.aminmax(rows, dim=0) for rows in (observed[begins(data)], observed))
+    seen = torch.stack([episode[OBSERVATION][0].double() for episode in rollouts])
+    margin = _START_MARGIN * (most - least)
+    out = ((seen > high + margin) | (seen < low - margin)).double().mean(0) >= 0.9
+    origin = torch.tensor((task.origins or (0.0,))[0], dtype=torch.float64)
+    table = torch.stack([*torch.aminmax(seen, dim=0), low, high], -1) + origin.unsqueeze(-1)
+    rows = [(task.observation_names[column], *table[column].tolist()) for column in out.nonzero().flatten().tolist()]
+    said = some([f"{name} at {a:.4g} to {b:.4g} (recordings: {c:.4g} to {d:.4g})" for name, a, b, c, d in rows])
+    return [f"rollouts start where no recording does: {said}: another zero, unit or order of columns?"] if rows else []
