@@ -156,6 +156,14 @@ def test_what_cannot_be_saved_or_executed(own, tmp_path):
     assert not list(tmp_path.iterdir()), "a file that could not be loaded"
 
 
+def test_a_file_does_not_say_which_labels_were_seen(trained_run, demonstrations, tmp_path):
+    trained = Trained.load(trained_run)
+    loaded = Trained.load(trained.save(tmp_path / "policy.safetensors"))
+    for half, name in ((loaded, "policy.safetensors"), (replace(loaded, folder=None), "a training in memory")):
+        with pytest.raises(RunDirectoryError, match=f"{name} does not record which labels were seen: wanted a run of"):
+            half.hide_labels(loaded.data(str(demonstrations)))
+
+
 def test_a_training_is_shown_in_one_line(own, trained_run):
     assert repr(own) == "Trained(task='my_arm', method='linear', folder=None)"
     assert repr(Trained.load(trained_run)) == f"Trained(task='avoiding', method='koap', folder='{trained_run}')"

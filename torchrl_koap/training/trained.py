@@ -253,7 +253,9 @@ class Trained:
         """
         hidden, report = within_budget(self.task, self.config, data)
         if "labels" not in self.results:
-            raise RunDirectoryError(f"{self.folder}: summary.json has no entry 'labels'")
+            where = self.folder or "a training in memory"
+            wanted = "wanted a run of `koap train`, whose summary.json has the entry 'labels'"
+            raise RunDirectoryError(f"{where} does not record which labels were seen: {wanted}")
         recorded = self.results["labels"]
         used = fingerprint(subsample_trajectories(hidden, self.config.labels.trajectories))
         trained_on = self.folder and RunDirectory(self.folder).read_json("config.json").get("data")
