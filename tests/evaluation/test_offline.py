@@ -16,11 +16,14 @@ from torchrl_koap.commands.cli import main
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
 from torchrl_koap.evaluation.data_errors import summarise_errors
 from torchrl_koap.evaluation.findings import offline_faults
+from torchrl_koap.evaluation.offline import evaluate_actions
+from torchrl_koap.files import DataError
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.config import LabelConfig
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Action, Task
+from torchrl_koap.training.trained import Trained
 
 FEW = EvalConfig(threads=1)
 
@@ -140,6 +143,20 @@ def test_a_single_trajectory(tmp_path):
     assert result["action_errors"]["left_out"]["note"] == "only one trajectory has labels: none can be left out"
     assert result["relative_plan_error"] is result["relative_action_error"] is None and result["faults"] == []
     write_report(run)
+
+
+def test_rollouts_do_not_need_the_data_of_the_training(copied_run, tmp_path):
+    """Nothing is left in its folder, or other recordings are there now; ``dataset`` must name the right ones."""
+    content = json.loads((copied_run / "config.json").read_text())
+    other = save_arm(tmp_path / "other")
+    (tmp_path / "empty").mkdir()
+    for folder, says, error in ((tmp_path / "empty", "no data set", FileNotFoundError), (other, "it holds", DataError)):
+        (copied_run / "config.json").write_text(json.dumps(content | {"dataset": str(folder)}))
+        trained = Trained.load(copied_run)
+        found, actions, data = evaluate_actions(trained)
+        assert says in found["action_errors"]["outside_budget"]["note"] and not actions and data is None
+        with pytest.raises(error, match=says):
+            evaluate_actions(trained, str(folder))
 
 
 def test_a_data_set_that_has_moved_or_changed(tmp_path):

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_koap.evaluation.data_errors import errors_left_out, errors_of_chunks, errors_outside_budget, plan_errors
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.loop_on_labels import check_loop
+from torchrl_koap.files import DataError
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.training.datasets import split_held_out
@@ -64,14 +65,14 @@ def evaluate_actions(
 ) -> tuple[dict[str, Any], dict[str, Tensor], TensorDictBase | None]:
     """Compares decoded actions with labels outside the budget, for evaluation only, in addition to rollouts.
 
-    Nothing is read if the data set is missing and ``dataset`` is not given. A ``dataset`` other than that of the
-    training raises an error. Returns ``action_errors`` with their summary and the actions, as
-    :func:`evaluate_offline`, and the data that were read.
+    If ``dataset`` is not given, and that of the training is missing, changed or damaged, a ``note`` says so: rollouts
+    do not need it. A ``dataset`` other than that of the training raises an error. Returns ``action_errors`` with their
+    summary and the actions, as :func:`evaluate_offline`, and the data that were read.
     """
     try:
         data: TensorDictBase | None = trained.data(dataset)
         outside, tensors = _outside_budget(trained, data, trained.hide_labels(data)[0])
-    except RunDirectoryError as error:
+    except (RunDirectoryError, DataError, FileNotFoundError) as error:
         if dataset is not None:
             raise
         data, outside, tensors = None, {"note": str(error)}, {}
