@@ -6,6 +6,7 @@ import torch
 from inverse_dynamics_test_base import KEYS, T, normalizers, partly_labelled, recorded
 from loss_test_base import LossTestBase
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from torchrl_koap.modules import (
     KoopmanInverseDynamics,
@@ -239,6 +240,25 @@ def test_keys_of_the_network_are_taken_over_and_renaming_reaches_it():
     assert network.in_keys == ["state"] and network.in_key == "state"
     network.set_keys(state="window")
     assert loss.in_keys[0] == "state" and network.in_key == "window"
+
+
+def test_frames_that_a_slice_sampler_of_torchrl_appends_count_as_padded():
+    sampler = SliceSampler(slice_len=T, traj_key="episode", strict_length=False, pad_output=True)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(4 * T), sampler=sampler, batch_size=32 * T)
+    steps = make_batch(4, share=0.9).set("episode", torch.arange(4)[:, None].expand(4, T)).auto_batch_size_(2)
+    steps["next", "done"] = torch.zeros(4, T, 1, dtype=torch.bool)
+    buffer.extend(torch.cat([row[: T - number] for number, row in enumerate(steps)]))
+    torch.manual_seed(0)
+    batch = buffer.sample().reshape(32, T)
+    recorded = batch["collector", "mask"]
+    assert 0.5 < recorded.float().mean() < 0.95
+    loss, bare = KOAPLoss(make_network()), batch.exclude("collector")
+    found, without = loss(batch), loss(bare)
+    expected = loss(bare.set("padded", ~recorded))
+    assert all(torch.equal(found[key], expected[key]) for key in loss.out_keys)
+    assert (found["loss_koopman"] - without["loss_koopman"]).abs() > 1e-3
+    loss.loss_mask_key = None
+    assert torch.equal(loss(batch)["loss_koopman"], without["loss_koopman"])
 
 
 @pytest.mark.parametrize("entry", ["has_action", "padded"])

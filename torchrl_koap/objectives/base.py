@@ -84,10 +84,13 @@ class NetworkLoss(LossModule):
 
     def _recorded(self, tensordict: TensorDictBase, state: Tensor) -> Tensor:
         """Returns which transitions are between two recorded (not padded) frames, bool ``[*B, T - 1]``."""
-        if tensordict.get(self.tensor_keys.padded, None) is None:
-            return torch.ones_like(state[..., 1:, 0], dtype=torch.bool)
-        padded = self._read_mask(tensordict, "padded", state)
-        return ~(padded[..., 1:] | padded[..., :-1])
+        recorded = torch.ones_like(state[..., 0], dtype=torch.bool)
+        if tensordict.get(self.tensor_keys.padded, None) is not None:
+            recorded = ~self._read_mask(tensordict, "padded", state)
+        for key in self._loss_mask_keys():
+            mask = tensordict.get(key, None)
+            recorded = recorded if mask is None else recorded & frame_mask(mask, repr(key), state)
+        return recorded[..., 1:] & recorded[..., :-1]
 
     def _reduce(self, error: Tensor, mask: Tensor | None = None) -> Tensor:
         """Reduces errors. Those outside a mask (of the same shape, or with a trailing 1) become 0 and do not count."""
@@ -115,7 +118,8 @@ class WindowLoss(NetworkLoss):
             action (NestedKey): raw actions ``[*B, T, act]``, NaN where unlabelled.
             has_action (NestedKey): labelled frames, bool ``[*B, T, 1]``.
             padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T]``. Transitions
-                to or from padded frames count in no loss, labelled or not.
+                to or from padded frames count in no loss, labelled or not. Frames that TorchRL's ``loss_mask_key``
+                leaves out are padded too, such as those of ``SliceSampler(pad_output=True)``.
 
         Both masks may have a trailing 1. Reshape a flat batch ``[B * T]``, such as that of TorchRL's ``SliceSampler``,
         to ``[B, T]``: it would be read as one window. It raises a ValueError if ``episode`` or ``done`` shows several.
