@@ -2,6 +2,7 @@
 """Tests that the registered Gymnasium environments behave like the batched environments they wrap."""
 
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -12,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from torchrl_koap.envs import AvoidingEnv, ManipulationGymEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.registry import make_env
+from torchrl_koap.tasks import get_task
 
 NAMES = ("Avoiding", "Aligning", "Sorting2", "Sorting4", "Sorting6", "Stacking")
 
@@ -37,6 +39,12 @@ def test_layout_of_the_batched_environment(name):
     assert env.metadata["render_fps"] == (33 if name == "Stacking" else 29)
     assert set(info) == {"success", "mode", "mode_index"} | ({"collision"} if name == "Avoiding" else {"context"})
     assert info["mode_index"] == -1 and not info["success"]
+
+
+@pytest.mark.parametrize("task", [get_task("po_sorting"), replace(get_task("avoiding"), name="short", max_steps=7)])
+def test_an_episode_ends_after_the_steps_of_the_task(task):
+    assert make_env(task).max_steps == task.max_steps
+    assert make_env(task, max_steps=3).max_steps == 3
 
 
 def test_seeds_make_contexts_repeatable():

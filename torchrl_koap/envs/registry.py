@@ -40,8 +40,8 @@ def make_env(task: Task | str, num_envs: int = 1, *, noisy: bool = False, **opti
         task (Task or str): the task, or its name.
         num_envs (int): number of parallel episodes.
         noisy (bool): adds ``Task.noise`` to the measured end effector, as in rollouts of policies.
-        **options: further arguments of the environment, such as ``num_threads``, ``max_steps`` and ``dtype``. They
-            override ``Task.env_options``.
+        **options: further arguments of the environment, such as ``num_threads`` and ``dtype``. They override
+            ``Task.env_options`` and ``Task.max_steps``.
 
     Returns:
         EnvBase: the batched environment.
@@ -60,7 +60,8 @@ def make_env(task: Task | str, num_envs: int = 1, *, noisy: bool = False, **opti
             f"task {task.name!r} has no environment (Task.env is None): it can be trained on data, but not rolled out,"
             " recorded or drawn by a simulator. `koap eval --env ID` takes an environment of Gymnasium"
         )
-    env = resolve(task.env, f"env of task {task.name!r}")(num_envs, **{**task.env_options, **options})
+    options = {"max_steps": task.max_steps, **task.env_options, **options}
+    env = resolve(task.env, f"env of task {task.name!r}")(num_envs, **options)
     return TransformedEnv(env, EndEffectorNoise(task, task.noise)) if noisy and task.noise else env
 
 
@@ -109,7 +110,7 @@ class ManipulationGymEnv(gymnasium.Env):
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(facts.control_hz)}
         self.task = facts
-        self.batched = make_env(facts, 1, max_steps=facts.max_steps, dtype=torch.float64)
+        self.batched = make_env(facts, dtype=torch.float64)
         self._size = {"width": width, "height": height}
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
         low, high = (

@@ -177,7 +177,7 @@ def _play_batches(
     if not left:
         return
     size, shown = min(batch_size, len(left)), 0
-    env = make_env(task, size, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
+    env = make_env(task, size, num_threads=num_threads, dtype=torch.float64)
 
     def show(found: int, over: int) -> None:  # the bar waits while discarded attempts are repeated
         nonlocal shown
