@@ -323,9 +323,10 @@ class ManipulationEnv(EnvBase):
             ValueError: for an unknown camera or a size below 1.
         """
         if self._renderer is None or self._renderer.size != (width, height):
+            renderer = Renderer(self.sims.model, width, height)  # an error leaves the old one as it is
             if self._renderer is not None:
                 self._renderer.close()
-            self._renderer = Renderer(self.sims.model, width, height)
+            self._renderer = renderer
         return self._renderer.render(self.sims.data[index], camera or self.CAMERA)
 
     def close(self, **kwargs) -> None:

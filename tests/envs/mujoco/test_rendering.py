@@ -4,6 +4,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import mujoco
@@ -53,8 +54,10 @@ def test_environments_look_different(env):
     ],
 )
 def test_what_cannot_be_drawn_is_named(env, asked, message):
+    before = env.render()
     with pytest.raises(ValueError, match=message):
         env.render(**asked)
+    np.testing.assert_array_equal(env.render(), before)
 
 
 def test_backends(monkeypatch):
@@ -107,8 +110,10 @@ def test_a_context_without_a_window_is_no_back_end(monkeypatch):
         def make_current(self): ...
 
     monkeypatch.setitem(sys.modules, "mujoco.glfw", SimpleNamespace(GLContext=Blank))
+    with ThreadPoolExecutor(1) as thread:  # a window that another test left open is of the main thread
+        opening = thread.submit(rendering.open_context, ["glfw"], mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
     with pytest.raises(RuntimeError, match="could be used to draw .glfw: FatalError: "):
-        rendering.open_context(["glfw"], mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
+        opening.result()
 
 
 @pytest.mark.parametrize(
