@@ -99,6 +99,15 @@ def test_holding_still_is_no_success_and_the_spoon_stays_above_the_table():
     assert not data["success"].item() and not data["mode"].item()
 
 
+def test_a_step_after_the_success_of_all_changes_nothing(graphics):
+    env = ScoopingEnv(num_envs=2, embed=False, pixels=True)
+    start = env.reset()
+    env.sims.rim[:], env.sims.held[:] = True, 99
+    first = env.step(start.clone().set("action", torch.zeros(2, 7)))["next"]
+    second = env.step(first.clone().set("action", torch.ones(2, 7)))["next"]
+    assert (first == second).all() and first["success"].all() and first["reward"].tolist() == [[1.0], [1.0]]
+
+
 def test_targets_that_are_far_away_are_approached_at_a_limited_speed():
     env = ScoopingEnv(num_envs=1, embed=False)
     data = env.reset(contexts=NEAR[None])

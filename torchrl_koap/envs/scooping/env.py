@@ -114,7 +114,7 @@ class ScoopingEnv(ManipulationEnv):
 
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         embedding = np.zeros((len(rows), EMBEDDING_DIM))
-        if self._camera is not None:
+        if self._camera is not None and len(rows):
             self._pixels[rows] = [self._camera.render(self.sims.data[row], CAMERA) for row in rows]
             if self._encoder is not None:
                 embedding = self._encoder.embed(torch.from_numpy(self._pixels[rows])).double().numpy()
@@ -128,15 +128,15 @@ class ScoopingEnv(ManipulationEnv):
         self._mode[rows, 0] = self.sims.rim[rows]
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        rows = self._rows(tensordict, "_step")
-        rows = rows[~self._success[rows]]  # finished episodes do not change and need no frame
+        stepped = self._rows(tensordict, "_step")
+        rows = stepped[~self._success[stepped]]  # finished episodes do not change and need no frame
         self._command(rows, self._checked_action(tensordict, rows))
         self._advance(rows)
         self._steps[rows] += 1
         self._update_mode(rows)
         self._success[rows] = self._check(rows)[0]
         self._observation[rows] = self._observe(rows)
-        return self._stepped(rows)
+        return self._stepped(stepped)
 
     def _leaves(self) -> TensorDictBase:
         leaves = super()._leaves()
