@@ -126,6 +126,7 @@ def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, value, rea
         ({"seed": -1}, "seed must be an integer of at least 0"),
         ({"num_threads": 0}, "num_threads must be an integer of at least 1"),
         ({"batch_size": 0}, "batch_size must be an integer of at least 1, got 0"),
+        ({"task": "scooping"}, "demonstrations of task 'scooping' are videos: use record_videos"),
     ],
 )
 def test_bad_arguments(arguments, message):

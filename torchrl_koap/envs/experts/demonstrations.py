@@ -143,7 +143,8 @@ def iterate_takes(
     task = get_task(task)
     disturbance = _share(task, disturbance)
     task = get_task(task.source)
-    expert_of(task)
+    if expert_of(task).embodiments:
+        raise ValueError(f"demonstrations of task {task.name!r} are videos: use record_videos, or --embodiment")
     numbers = {"episodes": episodes, "seed": seed, "num_threads": num_threads, "batch_size": batch_size}
     for option, value in numbers.items():
         least = 0 if option == "seed" else 1
