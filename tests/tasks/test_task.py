@@ -12,7 +12,7 @@ import pytest
 import torch
 from toy_task import TOY
 
-from torchrl_koap.tasks import TASKS, Action, Task, avoiding, get_task, sorting
+from torchrl_koap.tasks import TASKS, Action, Body, Scene, Task, avoiding, get_task, sorting
 from torchrl_koap.tasks.modes import note_arrivals
 
 
@@ -57,6 +57,14 @@ def test_units_decide_nothing_but_which_errors_are_averaged():
     actions = {"a": Action("rad"), "grip": Action("N"), "b": Action("rad", "absolute")}
     task = Task(**(TOY | {"actions": actions}))
     assert task.delta_actions == (0, 1) and task.tool_columns is None and task.gripper is None
+
+
+def test_columns_of_a_body_are_not_those_of_another_whose_name_begins_alike():
+    parts = {"arm": 2, "cup_xy": 2, "cup_2_xy": 2, "cup_2_spin": 2, "cup_spin": 2}
+    bodies = tuple(Body(name, f"{name}_xy") for name in ("cup", "cup_2"))
+    given = TOY | {"observation_parts": parts, "position": "arm", "command": None, "state": {}, "hidden": ()}
+    task = Task(**given | {"scene": Scene(bodies=bodies), "interchangeable": (("cup", "cup_2"),)})
+    assert task.interchangeable_columns() == [[[2, 3, 8, 9], [4, 5, 6, 7]]]
 
 
 @pytest.mark.parametrize("name", list(TASKS))

@@ -49,7 +49,7 @@ class Body:
     """A body that a context places: its pose in the observation, its start regions, and its top view.
 
     Args:
-        name (str): its name in contexts and messages.
+        name (str): its name in contexts and messages; parts of the observation that begin with ``name_`` are its own.
         position (str): part of the observation that begins with its x, y (m).
         yaw (str): part of the observation with its yaw: a quaternion (w, x, y, z) or ``tan(yaw)``. Empty: the yaw is
             0.

@@ -265,8 +265,9 @@ class Task(Columns):
         return [column for part in parts for column in range(part.start, part.stop)]
 
     def body_parts(self, name: str) -> list[str]:
-        """Returns the parts of the state that belong to a body: their names begin with its name."""
-        return [part for part in self.state_slices if part.startswith(f"{name}_")]
+        """Returns the parts of the state of a body: their names begin with its name, and with no longer body's name."""
+        longer = tuple(f"{other}_" for other in self.objects if other.startswith(f"{name}_"))
+        return [part for part in self.state_slices if part.startswith(f"{name}_") and not part.startswith(longer)]
 
     def planar_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Returns the state columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` of ``planar_parts``."""
