@@ -100,6 +100,8 @@ def test_what_counts_as_success(name, key, wanted):
     over = rollout["done"][0].flatten().tolist()
     ends = name in ("ToyReachWon-v0", "ToyReachLost-v0", "ToyReachFell-v0")
     assert over == ([False, False, True, True, True, True] if ends else [False] * 5 + [True])
+    assert torch.equal(rollout["terminated" if ends else "truncated"], rollout["done"])
+    assert not rollout["truncated" if ends else "terminated"].any()
 
 
 def test_finished_environments_wait_for_their_reset():
@@ -112,6 +114,22 @@ def test_finished_environments_wait_for_their_reset():
     assert again["done"].flatten().tolist() == [False, True]
     assert torch.equal(again["observation"][1], rollout["observation"][1, 5])
     assert not torch.equal(again["observation"][0], rollout["observation"][0, 5])
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_environments_that_the_mask_leaves_out_wait(processes):
+    record = EpisodeRecord()
+    env = GymnasiumBatch("ToyReach-v0", TASK, 2, processes=processes, record=record)
+    env.seed_episodes([4, 9])
+    start, action = env.reset(), torch.full((2, 2), PUSH)
+    masked = TensorDict({"action": action, "_step": torch.tensor([[True], [False]])}, [2])
+    after, later = (env.step(each)["next"] for each in (masked, TensorDict({"action": action}, [2])))
+    env.close()
+    assert record.actions == 3 and not after["done"].any()
+    assert torch.equal(after["observation"][1], start["observation"][1])
+    steps = run(GymnasiumBatch("ToyReach-v0", TASK, 2), 2, [4, 9])["observation"]
+    assert torch.equal(after["observation"][0], steps[0, 0])
+    assert torch.equal(later["observation"], torch.stack([steps[0, 1], steps[1, 0]]))
 
 
 def observer(*cameras):
@@ -285,7 +303,7 @@ def test_rounding_of_float32_is_no_clipping():
 def test_an_error_in_a_step_ends_the_episode():
     told = [step[-1] for step in played(GymnasiumEpisode(Breaks(at=2), 0, max_steps=9), 3)]
     assert [each["error"] for each in told] == ["", "ZeroDivisionError: division by zero", ""]
-    assert [each["over"] for each in told] == [False, True, True] and not told[-1]["success"]
+    assert [each["played"] for each in told] == [True, True, False] and not told[-1]["success"]
     assert told[1]["truncated"] and not told[1]["terminated"]
 
 

@@ -81,9 +81,9 @@ class NamedColumns(gymnasium.ObservationWrapper):
 class GymnasiumBatch(EnvBase):
     """Runs environments of one Gymnasium id in parallel; one whose episode is over waits for the others.
 
-    ``success`` stays True once it is reported (:class:`GymnasiumEpisode`). Actions are clipped to
-    the environment's box. An environment that raises an error, or gives a wrong observation, ends its episode as failed
-    (``failed``).
+    So does one that TorchRL's mask ``_step`` leaves out. ``success`` stays True once it is reported
+    (:class:`GymnasiumEpisode`). Actions are clipped to the environment's box. An environment that raises an error, or
+    gives a wrong observation, ends its episode as failed (``failed``).
 
     Observations and actions are those of the data: the task's ``origins`` are subtracted from an environment's
     observations and added to its actions. Of a dictionary, the task's columns are taken by name.
@@ -172,8 +172,7 @@ class GymnasiumBatch(EnvBase):
         self._seeds = [None if seed is None else seed + index for index in range(self.batch_size[0])]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        chosen = None if tensordict is None else tensordict.get("_reset", None)
-        begin = np.ones(self.batch_size[0], bool) if chosen is None else chosen.flatten(1).any(1).cpu().numpy()
+        begin = self._chosen(tensordict, "_reset")
         seen, _ = self._env.reset(seed=self._seeds, options={"begin": begin})
         for index in np.flatnonzero(begin):
             self._begun_with[index], self._seeds[index], self._steps[index] = self._seeds[index], None, 0
@@ -181,7 +180,15 @@ class GymnasiumBatch(EnvBase):
             self._state[name] = self._state[name] & ~torch.from_numpy(begin).unsqueeze(-1)
         return self._leaves(seen)
 
+    def _chosen(self, tensordict: TensorDictBase | None, mask: str) -> np.ndarray:
+        """Returns which environments a mask of TorchRL chooses, bool ``[n]``: all without a mask."""
+        chosen = None if tensordict is None else tensordict.get(mask, None)
+        return np.ones(self.batch_size[0], bool) if chosen is None else chosen.flatten(1).any(1).cpu().numpy()
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        waits = ~self._chosen(tensordict, "_step") & ~self._state["done"].squeeze(-1).numpy()
+        if waits.any():  # those that are over wait anyway
+            self._env.set_attr("waits", waits.tolist())
         seen, reward, _, _, info = self._env.step(tensordict.get(ACTION).detach().cpu().numpy() + self._added)
         self._steps += info["played"]
         self.record.actions += int(info["played"].sum())
@@ -193,8 +200,11 @@ class GymnasiumBatch(EnvBase):
             {"seed": self._begun_with[index], "step": int(self._steps[index]), "error": info["error"][index]}
             for index in np.flatnonzero(failed)
         ]
-        ends = {"done": info["over"], FAILED: failed} | {name: info[name] for name in (*_ENDS[1:], SUCCESS)}
-        self._state |= {name: torch.from_numpy(flags.astype(bool)).unsqueeze(-1) for name, flags in ends.items()}
+        told = {name: info[name] for name in ("terminated", "truncated", SUCCESS)}
+        told |= {"done": info["terminated"] | info["truncated"], FAILED: failed}
+        for name, flags in told.items():  # an environment that waited keeps its own
+            kept = self._state[name].squeeze(-1).numpy()
+            self._state[name] = torch.from_numpy(np.where(info["played"], flags, kept)).unsqueeze(-1)
         return self._leaves(seen).set("reward", torch.from_numpy(reward).float().unsqueeze(-1))
 
     def _leaves(self, seen: Any) -> TensorDictBase:

@@ -23,10 +23,11 @@ class ObservationError(ValueError):
 class GymnasiumEpisode(gymnasium.Wrapper):
     """Plays one episode of an environment after each reset, then repeats its last observation.
 
-    A vector environment therefore never resets it; ``index`` is its place there. ``info`` holds ``terminated``,
-    ``truncated`` and ``over``; whether the step was ``played`` and which columns of its action were ``clipped`` to the
-    box; ``success``; and ``error``, the environment's error in this step or at the reset, which truncates the episode.
-    A wrong observation (:class:`ObservationError`) is such an error, which names the column by ``names``.
+    A vector environment therefore never resets it; ``index`` is its place there. If ``waits`` is set, the next step
+    leaves the episode as it is. ``info`` holds whether the step was ``played``, whether it ``terminated`` or
+    ``truncated`` the episode, and which columns of its action were ``clipped`` to the box; ``success``; and ``error``,
+    the environment's error in this step or at the reset, which truncates the episode. A wrong observation
+    (:class:`ObservationError`) is such an error, which names the column by ``names``.
 
     Success is the entry ``success_key`` of the environment's ``info``; by default ``is_success`` or ``success``. If
     the default finds none, an episode succeeds if its last step terminates it with a positive reward above twice any
@@ -44,6 +45,7 @@ class GymnasiumEpisode(gymnasium.Wrapper):
     ):
         super().__init__(env)
         self.index, self.max_steps, self.success_key, self.names = index, max_steps, success_key, names
+        self.waits = False
         self._last = create_zero_array(env.observation_space)
         self._error, self._steps, self._over, self._success, self._most = "", 0, True, False, 0.0
 
@@ -58,13 +60,14 @@ class GymnasiumEpisode(gymnasium.Wrapper):
         return self._last, {}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Plays a step if the episode is not over; only ``info`` reports its end."""
-        report = {"played": not self._over, "terminated": False, "truncated": self._over, "error": ""}
+        """Plays a step if the episode is not over and does not wait; only ``info`` reports its end."""
+        plays, self.waits = not (self._over or self.waits), False
+        report = {"played": plays, "terminated": False, "truncated": False, "error": ""}
         report["clipped"], reward = np.zeros(self.env.action_space.shape, bool), 0.0
-        if not self._over:
+        if plays:
             reward, ends = self._play(action)
             report |= ends
-        return self._last, reward, False, False, report | {"over": self._over, "success": self._success}
+        return self._last, reward, False, False, report | {"success": self._success}
 
     def _play(self, action: np.ndarray) -> tuple[float, dict[str, Any]]:
         space: Any = self.env.action_space
