@@ -40,6 +40,8 @@ def test_actions_say_what_they_move():
     silent = Task(**(TOY | {"robot": (3, 4, 0)}))
     assert silent.moved_columns() == () and silent.moves == {0: 3, 1: 4}
     assert Task(**(TOY | {"robot": (3,)})).moves == {}
+    for grip in (Action("", "raw"), Action("m", "gripper", column=4)):  # says nothing about the others
+        assert Task(**(TOY | {"actions": moving | {"grip": grip}, "robot": (3, 4)})).moves == {0: 1, 1: 0}
     reached = Task(**(TOY | {"actions": {name: Action("m", "absolute", column=2) for name in "xy"}, "robot": (3, 4)}))
     assert reached.targets == reached.moves == {0: 2, 1: 2}
     assert reached.moved_columns() == () and reached.delta_actions == ()

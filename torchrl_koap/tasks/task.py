@@ -167,14 +167,15 @@ class Task(Columns):
     def moves(self) -> dict[int, int]:
         """Action column of each command and the state column that it moves; empty if unknown.
 
-        These are the ``targets``, or else the changes of a command. Changes move the columns that the actions name, or
-        the first columns of the robot if some actions name none.
+        These are the ``targets``, or else the changes of a command. Changes move the columns that they name, or the
+        first columns of the robot if one of them names none.
         """
         if self.targets:
             return self.targets
-        moved = self.moved_columns() or self.robot[: len(self.delta_actions)]
-        known = len(moved) == len(self.delta_actions)
-        return dict(zip(self.delta_actions, moved, strict=True)) if known else {}
+        changes, actions = self.delta_actions, list(self.actions.values())
+        named = [column for index in changes if (column := actions[index].column) is not None]
+        moved = named if len(named) == len(changes) else self.robot[: len(changes)]
+        return dict(zip(changes, moved, strict=True)) if len(moved) == len(changes) else {}
 
     @cached_property
     def distances(self) -> tuple[tuple[int, int], ...]:
