@@ -55,6 +55,19 @@ def test_actions_say_what_they_move():
     assert get_task("stacking").moved_columns() == ()  # its axes do not share a filter
 
 
+def test_an_absolute_action_has_the_origin_of_its_target_behind_parts_of_another_width():
+    given = {"pose": ("w", "i", "j", "k"), "arm": ("near", "far")}
+    task = Task(
+        name="far_away",
+        observation_parts=given,
+        observation_origin=(0.0, 0.0, 0.0, 0.0, 5.0, 1e6),
+        position="arm",
+        state={"pose": "quaternion", "arm": "plain"},  # two columns, then two
+        actions={"turn": Action("rad"), "place": Action("m", "absolute", column=3)},
+    )
+    assert task.origins == (task.observation_origin, (0.0, 1e6))
+
+
 def test_units_decide_nothing_but_which_errors_are_averaged():
     actions = {"a": Action("rad"), "grip": Action("N"), "b": Action("rad", "absolute")}
     task = Task(**(TOY | {"actions": actions}))

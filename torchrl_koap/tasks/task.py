@@ -190,7 +190,8 @@ class Task(Columns):
         """Offsets subtracted from every observation column and every action; None if there are none."""
         if not self.observation_origin:
             return None
-        places = {index: self.observation_origin[self.state_columns[c]] for index, c in self.targets.items()}
+        origin = dict(zip(self.observation_names, self.observation_origin, strict=True))
+        places = {index: origin.get(self.state_names[column], 0.0) for index, column in self.targets.items()}
         return self.observation_origin, tuple(places.get(index, 0.0) for index in range(self.action_dim))
 
     @cached_property
