@@ -31,6 +31,10 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
         ({"defaults": Defaults(joint_recovery=0.1)}, "defaults.joint_recovery: wanted tool_kinematics"),
         ({"robot": (0, 9)}, "robot: the state has 5 columns, got 9"),
         ({"interchangeable": (("box",),)}, "interchangeable: no body 'box'"),
+        (
+            {"scene": Scene(bodies=(BOX, LID)), "interchangeable": (("box", "lid"),)},
+            r"wanted bodies with equally many state columns \(parts NAME_...\), got box 3, lid 0",
+        ),
         ({"relative_positions": (("tool", "command"),)}, "'command' is no part of the state"),
         ({"observation_parts": {**TOY["observation_parts"], "more": ("tool_0",)}}, "columns named twice: tool_0"),
         (

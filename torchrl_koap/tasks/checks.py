@@ -96,6 +96,11 @@ def _column_faults(task: Task) -> Iterator[str]:
     for name in (*(name for group in task.relative_positions for name in group), *task.planar_parts):
         if name not in task.state_parts:
             yield f"relative_positions or planar_parts: {name!r} is no part of the state"
+    for group in task.interchangeable:
+        widths = {name: len(task.body_columns(name)) for name in group if name in task.objects}
+        if 0 in widths.values() or len(set(widths.values())) > 1:
+            got = ", ".join(f"{name} {width}" for name, width in widths.items())
+            yield f"interchangeable: wanted bodies with equally many state columns (parts NAME_...), got {got}"
 
 
 def _body_faults(task: Task) -> Iterator[str]:
