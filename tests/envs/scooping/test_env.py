@@ -2,6 +2,7 @@
 """Tests Scooping: physics, outcome, absolute targets, the expert, and a bowl at random positions."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -167,6 +168,12 @@ def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path
     one, other = (read_recordings(tmp_path / name) for name in ("again", "whole"))
     np.testing.assert_array_equal(one.actions[0], other.actions[0])
     np.testing.assert_array_equal(*(list(each.cameras["third_person"][0].read()) for each in (one, other)))
+
+
+def test_a_recording_ends_after_the_steps_of_the_task(tmp_path, graphics):
+    short = replace(get_task("scooping"), max_steps=3)
+    with pytest.raises(RuntimeError, match="the hand never succeeded in 10 attempts"):
+        record_videos(tmp_path / "set", "hand", 1, task=short)
 
 
 def test_a_context_has_the_spoon_at_one_of_its_starts_and_the_bowl_anywhere_in_its_region():

@@ -45,17 +45,18 @@ def _context_at(task: Task, start: int, generator: np.random.Generator) -> np.nd
 
 
 def _play(
-    sims: ScoopingSimulations, expert: ScoopingExpert, renderer: Renderer, columns: int
+    task: Task, sims: ScoopingSimulations, expert: ScoopingExpert, renderer: Renderer
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Returns frames uint8 ``[T + 1, H, W, 3]``, states ``[T + 1, d]``, targets ``[T, nu]``; None without success."""
     frames, states, targets, after = [], [], [], 0
+    width = task.observation_dim - EMBEDDING_DIM  # without the bowl's place if it never moves
 
     def look() -> None:
         frames.append(renderer.render(sims.data[0], CAMERA))
-        states.append(np.append(sims.spoon_position[0], sims.bowl_positions[0])[:columns])
+        states.append(np.append(sims.spoon_position[0], sims.bowl_positions[0])[:width])
 
     look()
-    for _ in range(get_task("scooping").max_steps):
+    for _ in range(task.max_steps):
         target = expert.target()
         if expert.finished:
             break
@@ -88,11 +89,10 @@ def record_videos(
         if value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}")
     sims = ScoopingSimulations(embodiment, 1)
-    columns = ("spoon_x", "spoon_y", "spoon_z", *task.observation_names[EMBEDDING_DIM + 3 :])
     writer = LeRobotWriter(
         folder,
         fps=FRAME_HZ,
-        state_names=columns,
+        state_names=("spoon_x", "spoon_y", "spoon_z", *task.observation_names[EMBEDDING_DIM + 3 :]),
         action_names=task.action_names if embodiment == "robot" else (),
         camera=f"observation.images.{CAMERA}",
         embodiment=embodiment,
@@ -107,7 +107,7 @@ def record_videos(
                 context = _context_at(task, number % len(STARTS), np.random.default_rng((*own, 1)))
                 start_episodes(sims, np.array([0]), context[None], arm)
                 expert = ScoopingExpert(sims, 0, start_of(context), own)
-                episode = _play(sims, expert, renderer, len(columns))
+                episode = _play(task, sims, expert, renderer)
                 attempts += 1
                 if episode is not None:
                     break
