@@ -246,8 +246,7 @@ def _frames_by_camera(frames: Mapping[str, Any], observe: Observer) -> dict[str,
 
 
 def _check_entries(env_id: str, space: gymnasium.Space, observe: Observer) -> None:
-    spaces = dict(entries_of(space.spaces if isinstance(space, gymnasium.spaces.Dict) else space))
-    frames, numbers = _split_pictures(spaces)
+    frames, numbers = _split_pictures(dict(entries_of(space)))
     missing = [name for name in observe.cameras if name not in _frames_by_camera(frames, observe)]
     width = sum(int(np.prod(each.shape)) for each in numbers.values())
     if missing or width not in (observe.state_dim, 0):

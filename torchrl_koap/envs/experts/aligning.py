@@ -102,7 +102,6 @@ class _Player:
         self.time = self.since_success = self.waited = 0
         self.contact: np.ndarray | None = None
         self.plan = np.empty(PLAN_SIZE)
-        self.choices = 0
         self.action, self.last_tcp, self.last_pose = np.zeros(3), np.zeros(3), np.zeros(3)
         self._begin_push()
         self.doing = self._travel
@@ -157,7 +156,6 @@ class _Player:
             if cost + _SWITCH_COST < least:
                 self.contact, self.aim = contacts[first], between
                 search(pose, between, self.contact, self.plan)
-        self.choices += 1
 
     def _in_world(self, point: np.ndarray) -> np.ndarray:
         return self.pose[:2] + _turned(point, self.pose[2])

@@ -143,17 +143,12 @@ class SimulationBatch(Simulations):
         return np.stack(self._object_views).reshape(len(self), -1, 7)
 
     def reset(
-        self,
-        rows: np.ndarray,
-        start_joints: np.ndarray,
-        object_poses: np.ndarray | None = None,
-        *,
-        width: float = controller.FINGER_RESET,
+        self, rows: np.ndarray, start_joints: np.ndarray, object_poses: np.ndarray | None, *, width: float
     ) -> None:
         """Puts simulations into their start state (docs/appendix/d3il.md, Reset), one substep included.
 
-        The arm gets ``start_joints`` [7] (rad), the free bodies ``object_poses`` [len(rows), objects, 7], the fingers
-        the target ``width`` (m) during that substep.
+        The arm gets ``start_joints`` [7] (rad), the free bodies, if there are any, ``object_poses`` [len(rows),
+        objects, 7], the fingers the target ``width`` (m) during that substep.
         """
         commands = np.zeros((len(self), 7))
         for index, row in enumerate(rows):

@@ -65,13 +65,12 @@ class SpoonKinematics:
         self._jacobian = np.zeros((6, 7))
 
     def solve(
-        self, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray | None = None, iterations: int = 40
+        self, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray = REST, *, iterations: int
     ) -> np.ndarray:
         """Finds joints ``[7]`` (rad) for a position ``[3]`` (m) and a rotation ``[3, 3]`` of the spoon.
 
-        Starts at ``joints``, by default the rest pose, and takes at most ``iterations`` steps.
+        Starts at ``joints`` and takes at most ``iterations`` steps.
         """
-        joints = (REST if joints is None else joints).copy()
         for _ in range(iterations):
             self._data.qpos[:] = joints
             mujoco.mj_kinematics(self._model, self._data)

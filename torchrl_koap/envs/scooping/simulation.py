@@ -35,7 +35,7 @@ _WHITE, _DARK = "0.93 0.93 0.93 1", "0.25 0.25 0.27 1"
 _SKIN, _SLEEVE, _STEEL = "0.85 0.6 0.48 1", "0.2 0.35 0.6 1", "0.2 0.55 0.85 1"
 
 
-def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.MjModel:
+def scooping_model(embodiment: str, *, pieces: bool = True) -> mujoco.MjModel:
     """Compiles the scene of a ``"robot"``, a Panda of seven actuated joints, or a ``"hand"``, which moves freely.
 
     The pieces' free joints come first, then those of robot or hand; the bowl is the only mocap body.
