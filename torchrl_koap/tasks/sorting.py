@@ -78,7 +78,7 @@ _WALLS = tuple(
 
 
 def _sorting(num_boxes: int) -> Task:
-    boxes = [f"{colour}_{index + 1}" for colour in COLOURS for index in range(num_boxes // 2)]
+    boxes = {f"{colour}_{index + 1}": colour for colour in COLOURS for index in range(num_boxes // 2)}
     columns = {part: size for box in boxes for part, size in ((f"{box}_xy", 2), (f"{box}_tan_yaw", 1))}
     orders = tuple(", ".join(COLOURS[colour] for colour in order) for order in arrival_orders(num_boxes))
     return Task(
@@ -91,7 +91,7 @@ def _sorting(num_boxes: int) -> Task:
         robot=(0, 1),
         state={"measured_xy": "plain"} | {name: "tan_yaw" if size == 1 else "plain" for name, size in columns.items()},
         relative_positions=tuple(("measured_xy", f"{box}_xy") for box in boxes),
-        interchangeable=(tuple(boxes[: num_boxes // 2]), tuple(boxes[num_boxes // 2 :])),
+        interchangeable=tuple(tuple(box for box in boxes if boxes[box] == colour) for colour in COLOURS),
         goal="torchrl_koap.tasks.sorting:goal_reached",
         modes=Modes(
             (("order of arrival", orders),),
@@ -107,8 +107,7 @@ def _sorting(num_boxes: int) -> Task:
                 Body(
                     box, f"{box}_xy", f"{box}_tan_yaw", label=f"{colour} boxes", color=colour, half=(BOX_HALF, BOX_HALF)
                 )
-                for box in boxes
-                for colour in (box.partition("_")[0],)
+                for box, colour in boxes.items()
             ),
             shared_starts=REGIONS,
             x=(0.17, 0.83),
