@@ -10,7 +10,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
-from torchrl_koap.envs import AvoidingEnv, ManipulationGymEnv
+from torchrl_koap.envs import AvoidingEnv, ManipulationGymEnv, SortingEnv, StackingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.tasks import get_task
@@ -45,6 +45,15 @@ def test_layout_of_the_batched_environment(name):
 def test_an_episode_ends_after_the_steps_of_the_task(task):
     assert make_env(task).max_steps == task.max_steps
     assert make_env(task, max_steps=3).max_steps == 3
+
+
+@pytest.mark.parametrize(
+    ("make", "name"), [(SortingEnv, "po_sorting"), (StackingEnv, "stacking_1"), (AvoidingEnv, "avoiding")]
+)
+def test_an_environment_takes_a_variant_of_its_task(make, name):
+    task = replace(get_task(name), max_steps=2)
+    env = make(task=task)
+    assert env.task is task and env.rollout(9)["next", "truncated"].flatten().tolist() == [False, True]
 
 
 def test_seeds_make_contexts_repeatable():

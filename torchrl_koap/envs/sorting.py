@@ -10,6 +10,7 @@ import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
+from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.modes import note_arrivals
 from torchrl_koap.tasks.sorting import (
@@ -70,9 +71,9 @@ class SortingEnv(ManipulationEnv):
     MODE_ENTRIES, MODE_VALUES = None, 2
     START_HEIGHT = 0.05  # m; inside the platform, as in the original; the first steps push the boxes up
 
-    def __init__(self, *args: Any, num_boxes: int = 4, **options: Any):
-        task = sorting_task(num_boxes)
-        self._colours = np.array(box_colours(num_boxes))
+    def __init__(self, *args: Any, num_boxes: int = 4, task: Task | None = None, **options: Any):
+        task = sorting_task(num_boxes) if task is None else task
+        self._colours = np.array(box_colours(len(task.objects)))
         super().__init__(*args, task=task, **options)
         self._noted = self._episode["noted"]
 

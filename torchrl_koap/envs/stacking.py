@@ -11,7 +11,7 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import add_free_box, panda, scene
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.tasks.action_rules import OPEN, OPEN_ABOVE
 from torchrl_koap.tasks.columns import tan_yaw
 from torchrl_koap.tasks.modes import note_arrivals
@@ -68,10 +68,11 @@ class StackingEnv(ManipulationEnv):
     MODE_ENTRIES, MODE_VALUES = None, 3
     COMMAND_DIM, RESET_WIDTH = 8, controller.FINGER_OPEN
 
-    def __init__(self, *args: Any, num_boxes: int = 3, **options: Any):
+    def __init__(self, *args: Any, num_boxes: int = 3, task: Task | None = None, **options: Any):
         if num_boxes not in (1, 2, 3):
             raise ValueError(f"num_boxes must be 1, 2 or 3 (boxes needed for success), got {num_boxes!r}")
-        super().__init__(*args, task=get_task("stacking_1" if num_boxes == 1 else "stacking"), **options)
+        task = get_task("stacking_1" if num_boxes == 1 else "stacking") if task is None else task
+        super().__init__(*args, task=task, **options)
         self.num_boxes = num_boxes
 
     def _begin(self, rows: np.ndarray) -> None:
