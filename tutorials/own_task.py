@@ -96,6 +96,7 @@ class PushEnv(EnvBase):
             np.zeros(shape) for shape in ((num_envs, 2), (num_envs, 2), (num_envs, 1, 3))
         )
         self.mode, self.steps = np.full(num_envs, -1), np.zeros(num_envs, dtype=int)
+        self.success = np.zeros(num_envs, dtype=bool)
         shape, flag = self.batch_size, {"n": 1, "shape": (num_envs, 1), "dtype": torch.bool}
         self.observation_spec = Composite(
             observation=Unbounded((*shape, 4), dtype=dtype),
@@ -117,7 +118,7 @@ class PushEnv(EnvBase):
         drawn = draw_contexts(task, len(self.puck), self.generator) if contexts is None else contexts
         self.contexts = check_contexts(task, drawn)
         self.robot[:], self.puck[:] = (0.5, 0.0), self.contexts[:, 0, :2]
-        self.mode[:], self.steps[:] = -1, 0
+        self.mode[:], self.steps[:], self.success[:] = -1, 0, False
         return self.leaves()
 
     def _step(self, tensordict):
@@ -127,13 +128,14 @@ class PushEnv(EnvBase):
         self.puck += np.maximum(PUCK_RADIUS + ROBOT_RADIUS - distance, 0) * away / np.maximum(distance, 1e-9)
         passed = (self.puck[:, 1] >= POST[1]) & (self.mode < 0)
         self.mode[passed] = self.puck[passed, 0] >= POST[0]
+        self.success |= np.linalg.norm(self.puck - GOAL, axis=1) < GOAL_RADIUS  # stays until the reset
         self.steps += 1
         leaves = self.leaves()
         return leaves.set("reward", leaves["success"].to(self._dtype))
 
     def leaves(self):
-        success, late = np.linalg.norm(self.puck - GOAL, axis=1) < GOAL_RADIUS, self.steps >= self.max_steps
-        flags = {"success": success, "terminated": success, "truncated": late, "done": success | late}
+        late = self.steps >= self.max_steps
+        flags = {"success": self.success, "terminated": self.success, "truncated": late, "done": self.success | late}
         leaves = {name: torch.tensor(value[:, None]) for name, value in flags.items()}
         leaves["observation"] = torch.tensor(np.concatenate([self.robot, self.puck], 1), dtype=self._dtype)
         leaves["mode"] = torch.tensor(self.mode[:, None].copy())
