@@ -9,7 +9,7 @@ from html_pages import Page
 from PIL import Image
 from tiny_runs import read_csv
 
-from torchrl_koap.studies import plots
+from torchrl_koap.studies import plots, report
 from torchrl_koap.studies.plots import method_styles
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.table import summarise
@@ -196,6 +196,15 @@ def test_every_line_across_errors_has_its_number_and_there_are_two(errors, monke
     named = [tick for tick in axes.yaxis.get_major_ticks() if low <= tick.get_loc() <= high]
     assert len(named) >= 2 and all(tick.label1.get_text() for tick in named)
     assert not any(tick.gridline.get_visible() for tick in axes.yaxis.get_minor_ticks())
+
+
+def test_the_unit_of_the_errors_does_not_depend_on_the_first_cell(monkeypatch, tmp_path):
+    rows, units = make_cells(seeds=1, action_error_unit="mm"), {}
+    spoil(rows[0], "failed")
+    rows[0]["action_error_unit"] = None
+    monkeypatch.setattr(report, "plot_measure", lambda _, path, kind, **more: units.update({kind: more.get("unit")}))
+    write_study_report(tmp_path, rows, title="t")
+    assert units["action_error"] == "mm"
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,16 @@ from torchrl_koap.reports.pictures import FOLDER
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, REFERENCE, Outcome, compare_cells
 from torchrl_koap.studies.paper import paper_points, write_paper_layout
 from torchrl_koap.studies.plots import plot_measure
-from torchrl_koap.studies.table import Summary, markdown_table, not_done, percent, summarise, table_rows, write_csv
+from torchrl_koap.studies.table import (
+    Summary,
+    error_units,
+    markdown_table,
+    not_done,
+    percent,
+    summarise,
+    table_rows,
+    write_csv,
+)
 from torchrl_koap.training.methods import METHODS
 
 _CAPTIONS = {
@@ -129,7 +138,7 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
         wanted: dict[str, dict[str, Any]] = {
             "success": {"by": ("labels", "labelled_transitions"), "paper": points},
             "mode_entropy": {},
-            error: {"unit": ", ".join(main[0].action_error_units) if error == "action_error" else ""},
+            error: {"unit": error_units(main) if error == "action_error" else ""},
         }
         known = [kind for kind in wanted if any(kind in item.measures for item in main)]
         if error in known and min(item.measures[error].low for item in main if error in item.measures) <= 0:

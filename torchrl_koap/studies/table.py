@@ -152,12 +152,11 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     """Returns the table as text, a row per method and share of labels, without columns that have no value."""
     units = {item.label_unit for item in summaries}
     labels = f"labels ({plural_of(*units)})" if len(units) == 1 else "labels"
-    error = ", ".join(sorted({unit for item in summaries for unit in item.action_error_units}))
     numbers = {  # heading to measure and form
         "mode entropy": ("mode_entropy", ".2f"),
         "action error (of the mean action's)": ("relative_action_error", ".3g"),
         "plan error (of standing still's)": ("relative_plan_error", ".3g"),
-        f"action error ({error or 'unit of the first column'})": ("action_error", ".3g"),
+        f"action error ({error_units(summaries) or 'unit of the first column'})": ("action_error", ".3g"),
         "labelled transitions": ("labelled_transitions", ",.0f"),
         "in trajectories": ("trajectories_touched", ".4g"),
         "training (s)": ("train_seconds", ",.0f"),
@@ -187,6 +186,11 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
         if len(values) == 1 and (usual is None or values == {usual}):
             empty.add(name)
     return [{name: text for name, text in row.items() if name not in empty} for row in rows]
+
+
+def error_units(summaries: Sequence[Summary]) -> str:
+    """Returns the units of the action errors, separated by commas."""
+    return ", ".join(sorted({unit for item in summaries for unit in item.action_error_units}))
 
 
 def _success(item: Summary) -> dict[str, str]:
