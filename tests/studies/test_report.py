@@ -163,6 +163,15 @@ def test_shares_of_demonstrations_and_tasks_have_their_own_pictures(tmp_path):
     assert len(read_comparisons(tmp_path)) == 2 * 2 * 3
 
 
+def test_success_and_errors_of_one_study_are_told_apart(tmp_path):
+    outcomes, recorded = {}, {"kind": "offline", "episodes": None, "successes": None, "relative_action_error": 0.3}
+    rows = make_cells(outcomes, seeds=1) + [row | recorded for row in make_cells(outcomes, task="arm", seeds=1)]
+    text = Page(write_study_report(tmp_path, rows, outcomes, title="t")).text
+    assert "success above 0: koap succeeds more often. Difference of errors below 0: koap errs less." in text
+    assert "evaluated on recorded data or rolled out on fixed evaluation contexts." in text
+    assert "avoiding 1 % ridge +30.0 +0.0 to +60.0" in text and "arm 1 % ridge – +0.000 to +0.600" in text
+
+
 def test_methods_differ_without_colour():
     styles = list(method_styles([f"method {number}" for number in range(27)]).values())
     assert len({str(style) for style in styles}) == 27 and len({style["marker"] for style in styles[:12]}) == 12

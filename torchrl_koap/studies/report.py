@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,7 @@ def write_study_report(
         aside.write_text(markdown_table(rows), encoding="utf-8")
     write_csv(folder / "comparisons.csv", COMPARISON_COLUMNS, compared)
     windows = [row for row in rows if row["label_unit"] == "window"]
-    offline = any(item.offline for item in summaries)
+    offline = {item.task for item in summaries if item.offline}
     return write_page(
         "curve.html",
         folder / "index.html",
@@ -98,9 +98,10 @@ def write_study_report(
         options=options or {},
         table=table_rows(summaries),
         layout=write_paper_layout(folder, windows) if windows else None,
-        offline=offline,
+        offline=bool(offline),
+        rolled_out=not offline or offline != {item.task for item in summaries},
         figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows))),
-        compared=_comparison_rows(compared, offline=offline),
+        compared=_comparison_rows(compared, offline),
         reference=REFERENCE,
         not_done=not_done(rows),
     )
@@ -165,18 +166,23 @@ def _figure(
     return {"title": f"{head}, {items[0].task}", "caption": caption + more, "source": source, "beside": not wide}
 
 
-def _comparison_rows(compared: Sequence[Mapping[str, Any]], *, offline: bool) -> list[dict[str, str]]:
+def _comparison_rows(compared: Sequence[Mapping[str, Any]], offline: Collection[str]) -> list[dict[str, str]]:
+    """Returns the comparisons as text: of errors for ``offline`` tasks, else of success, in points."""
+    several = [name for name in ("task", "demonstrations") if len({row[name] for row in compared}) > 1]
+    return [_comparison_row(row, several, errors=row["task"] in offline) for row in compared]
+
+
+def _comparison_row(row: Mapping[str, Any], several: Sequence[str], *, errors: bool) -> dict[str, str]:
     factor, digits, head, unit = 100, 1, "difference (points)", "contexts"
-    if offline:
+    if errors:
         factor, digits, head, unit = 1, 3, "difference of the relative action error", "trajectories"
 
     def text(difference: float) -> str:
         return f"{round(factor * difference, digits) + 0.0:+.{digits}f}"  # the sum turns -0.0 into 0.0
 
-    several = {name: len({row[name] for row in compared}) > 1 for name in ("task", "demonstrations")}
-    return [
-        ({"task": row["task"]} if several["task"] else {})
-        | ({"demonstrations used": percent(row["demonstrations"])} if several["demonstrations"] else {})
+    return (
+        ({"task": row["task"]} if "task" in several else {})
+        | ({"demonstrations used": percent(row["demonstrations"])} if "demonstrations" in several else {})
         | {
             "labels": percent(row["labels"]),
             f"{REFERENCE} against": row["method"],
@@ -188,8 +194,7 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], *, offline: bool) ->
             "seeds": str(row["seeds"] or 0),
             "n (pairs)": str(row["n"]),
         }
-        for row in compared
-    ]
+    )
 
 
 def _p_text(p: float | None) -> str:
