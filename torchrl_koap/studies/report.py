@@ -27,6 +27,7 @@ from torchrl_koap.studies.table import (
 )
 from torchrl_koap.training.methods import METHODS
 
+_JUDGED_ON = " Each share of labels is judged on other recordings: compare methods at one share, not shares of labels."
 _CAPTIONS = {
     "success": (
         "Success against the labels",
@@ -45,14 +46,14 @@ _CAPTIONS = {
         "Action error against the labels",
         "Mean over seeds, with the best and the worst seed, of the error on recorded actions without labels. They"
         " were read for this picture only; nothing was trained or selected with them. A smaller error need not mean"
-        " more success: the planner has its own failures.",
+        " more success: the planner has its own failures." + _JUDGED_ON,
     ),
     "relative_action_error": (
         "Action error against the labels",
         "Mean over seeds, with the best and the worst seed. There is no environment, so actions decoded from recorded"
         " states are compared with recorded ones: on hidden labels if the data have some (read for this only), else on"
         " seen labels, leaving out one labelled trajectory at a time. 1 (dashed): no better than always giving the"
-        " mean action. Columns of every unit count alike.",
+        " mean action. Columns of every unit count alike." + _JUDGED_ON,
     ),
     "demonstrations": (
         "Success against the demonstrations used",
@@ -60,10 +61,6 @@ _CAPTIONS = {
         " demonstrations used.",
     ),
 }
-_MIXED = (
-    ' Points of one line are of different recordings: see "action errors on" in the table. Compare methods at one'
-    " share of labels, not shares of labels."
-)
 
 
 def write_study_report(
@@ -146,11 +143,10 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
             known.remove(error)
         used = f" All with {percent(shares[-1])} of the demonstrations." if shares[-1] != 1 else ""
         hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
-        mixed = _MIXED if len({compared for item in main for compared in item.action_errors_on}) > 1 else ""
-        more = {"success": used + hollow, "relative_action_error": mixed}
         for kind in known:
             options = {"methods": methods, "label_unit": plural_of(label_unit), **wanted[kind]}
-            figures.append(_figure(folder, name, kind, main, more.get(kind, ""), **options))
+            more = used + hollow if kind == "success" else ""
+            figures.append(_figure(folder, name, kind, main, more, **options))
         if len(shares) > 1 and "success" in known:
             figures.append(_figure(folder, name, "demonstrations", items, by=("demonstrations",), methods=methods))
     return figures
