@@ -111,7 +111,7 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     unit = list(dict.fromkeys(plural_of(row["label_unit"]) for row in rows))
     text = ", ".join(
         (
-            f"{', '.join(map(str, names['task']))}: methods {', '.join(map(str, names['method']))}",
+            f"{', '.join(names['task'])}: methods {', '.join(names['method'])}",
             f"labels on {', '.join(percent(share) for share in sorted({row['labels'] for row in rows}))} of the"
             f" {' / '.join(unit)}",
             f"training seeds {', '.join(map(str, sorted(names['seed'])))}",
@@ -123,15 +123,13 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) -> list[dict[str, Any]]:
-    """Draws the pictures of every task and label unit; returns what the page needs to show them."""
-    groups = list(dict.fromkeys((item.task, item.label_unit) for item in summaries))
+    """Draws the pictures of every task; returns what the page needs to show them."""
     figures = []
-    for task, label_unit in groups:
-        items = [item for item in summaries if (item.task, item.label_unit) == (task, label_unit)]
+    for task in dict.fromkeys(item.task for item in summaries):
+        items = [item for item in summaries if item.task == task]
         shares = sorted({item.demonstrations for item in items})
         main = [item for item in items if item.demonstrations == shares[-1]]
-        name = task if sum(task == other for other, _ in groups) == 1 else f"{task}_{label_unit}"
-        points = paper_points(task) if label_unit == "window" else {}
+        points = paper_points(task) if items[0].label_unit == "window" else {}
         error = "relative_action_error" if any(item.mean("relative_action_error") for item in main) else "action_error"
         wanted: dict[str, dict[str, Any]] = {
             "success": {"by": ("labels", "labelled_transitions"), "paper": points},
@@ -144,19 +142,17 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
         used = f" All with {percent(shares[-1])} of the demonstrations." if shares[-1] != 1 else ""
         hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
         for kind in known:
-            options = {"methods": methods, "label_unit": plural_of(label_unit), **wanted[kind]}
+            options = {"methods": methods, "label_unit": plural_of(items[0].label_unit), **wanted[kind]}
             more = used + hollow if kind == "success" else ""
-            figures.append(_figure(folder, name, kind, main, more, **options))
+            figures.append(_figure(folder, kind, main, more, **options))
         if len(shares) > 1 and "success" in known:
-            figures.append(_figure(folder, name, "demonstrations", items, by=("demonstrations",), methods=methods))
+            figures.append(_figure(folder, "demonstrations", items, by=("demonstrations",), methods=methods))
     return figures
 
 
-def _figure(
-    folder: Path, name: str, kind: str, items: Sequence[Summary], more: str = "", **options: Any
-) -> dict[str, Any]:
-    """Draws a picture; returns what the page needs to show it."""
-    source, (head, caption) = f"{FOLDER}/{name}_{kind}.png", _CAPTIONS[kind]
+def _figure(folder: Path, kind: str, items: Sequence[Summary], more: str = "", **options: Any) -> dict[str, Any]:
+    """Draws a picture of a task; returns what the page needs to show it."""
+    source, (head, caption) = f"{FOLDER}/{items[0].task}_{kind}.png", _CAPTIONS[kind]
     plot_measure(items, folder / source, "success" if kind == "demonstrations" else kind, **options)
     wide = kind == "success"  # two panels need the width of the page
     return {"title": f"{head}, {items[0].task}", "caption": caption + more, "source": source, "beside": not wide}

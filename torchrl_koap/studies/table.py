@@ -149,9 +149,12 @@ def _summary(task: str, unit: str, demonstrations: float, labels: float, method:
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
-    """Returns the table as text, a row per method and share of labels, without columns that have no value."""
-    units = {item.label_unit for item in summaries}
-    labels = f"labels ({plural_of(*units)})" if len(units) == 1 else "labels"
+    """Returns the table as text, a row per method and share of labels, without columns that have no value.
+
+    Labels are of one unit, as in a study.
+    """
+    if not summaries:
+        return []
     numbers = {  # heading to measure and form
         "mode entropy": ("mode_entropy", ".2f"),
         "action error (of the mean action's)": ("relative_action_error", ".3g"),
@@ -165,7 +168,7 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     rows = [
         {
             "task": item.task,
-            labels: percent(item.labels) + (f" of {plural_of(item.label_unit)}" if len(units) > 1 else ""),
+            f"labels ({plural_of(item.label_unit)})": percent(item.labels),
             "demonstrations used": percent(item.demonstrations),
             "method": item.method,
             **_success(item),
@@ -180,11 +183,11 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
         | {head: "–" if (v := item.mean(name)) is None else format(v, form) for head, (name, form) in numbers.items()}
         for item in summaries
     ]
-    empty = {name for name in (rows[0] if rows else ()) if all(row[name] in ("", "–") for row in rows)}
-    for name, usual in (("task", None), ("demonstrations used", "100 %")):
-        values = {row[name] for row in rows}
-        if len(values) == 1 and (usual is None or values == {usual}):
-            empty.add(name)
+    empty = {name for name in rows[0] if all(row[name] in ("", "–") for row in rows)}
+    if len({item.task for item in summaries}) == 1:
+        empty.add("task")
+    if all(item.demonstrations == 1 for item in summaries):
+        empty.add("demonstrations used")
     return [{name: text for name, text in row.items() if name not in empty} for row in rows]
 
 
