@@ -175,7 +175,7 @@ def draw_average(entries: Sequence[Entry], path: str | Path) -> None:
             cells = [entry.paper for entry in entries if (entry.method, entry.level) == (method, level)]
             if all(cells):
                 paper.setdefault(method, []).append((level, sum(cell.success for cell in cells) / len(cells)))
-    plot_average(averages, paper, list(dict.fromkeys(entry.task for entry in entries)), path)
+    plot_average(averages, paper, len({entry.task for entry in entries}), path)
 
 
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -115,10 +115,10 @@ def plot_measure(
 def plot_average(
     averages: Mapping[str, Sequence[tuple[int, float, float, float]]],
     paper: Mapping[str, Sequence[tuple[int, float]]],
-    tasks: Sequence[str],
+    number: int,
     path: str | Path,
 ) -> None:
-    """Draws success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
+    """Draws success averaged over a ``number`` of tasks against the label level; the paper's hollow and dashed.
 
     By method, ``averages`` has level, mean and the ends of its interval, ``paper`` level and mean; successes in 0..1.
     """
@@ -134,7 +134,7 @@ def plot_average(
     axes.set(xlim=(levels[0] - 0.25, levels[-1] + 0.25), xticks=levels)
     axes.set(xlabel="label level (1: fewest labels)", ylabel="success (%)")
     _scale_shares(axes, 100)
-    title = f"success, 95 % interval: {tasks[0]}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks, 95 % interval"
+    title = f"mean over {number} tasks, 95 % interval"
     tidy(axes, title + (_HOLLOW if any(line.paper for line in lines) else ""), grid=True)
     _name_lines(figure, lines)
     save_figure(figure, path)
