@@ -25,8 +25,7 @@ class Regime:
     """An observation model of the robot.
 
     Args:
-        name (str): name in studies.
-        title (str): name in tables and pictures.
+        name (str): name in the tables of results.
         embed (callable, optional): from standardised states ``[N, d]`` to observations without noise ``[N, c]``.
             Default: the identity.
         fit (callable, optional): from recorded standardised states to an ``embed`` that depends on them.
@@ -37,7 +36,6 @@ class Regime:
     """
 
     name: str
-    title: str
     embed: Callable[[Tensor], Tensor] | None = None
     fit: Callable[[Tensor], Callable[[Tensor], Tensor]] | None = None
     noise: float = 0.0
@@ -182,14 +180,11 @@ def disc_pictures(
 REGIMES = {
     regime.name: regime
     for regime in (
-        Regime("plain", "positions as recorded"),
-        Regime("noise_1", "noise of one step", noise=1.0),
-        Regime("noise", "noise of three steps", noise=3.0),
-        Regime("wide_64", "64 nonlinear columns", random_network(64, 2.0), noise=2.0),
-        Regime("wide_64_gain_1", "64 columns, weaker", random_network(64, 1.0), noise=2.0),
-        Regime("wide_64_gain_4", "64 columns, stronger", random_network(64, 4.0), noise=2.0),
-        Regime("wide_512", "512 nonlinear columns", random_network(512, 2.0), noise=2.0),
-        Regime("pictures", "32 x 32 pictures", fit=disc_pictures, noise=1.0),
-        Regime("distractors", "64 columns, 2 distractors", random_network(64, 1.0), noise=1.0, distractors=2),
+        Regime("plain"),
+        Regime("noise", noise=3.0),
+        Regime("wide_64", random_network(64, 2.0), noise=2.0),
+        Regime("wide_512", random_network(512, 2.0), noise=2.0),
+        Regime("pictures", fit=disc_pictures, noise=1.0),
+        Regime("distractors", random_network(64, 1.0), noise=1.0, distractors=2),
     )
 }

@@ -61,7 +61,7 @@ METHODS = {
     "linear_steps": ("linear_steps", None, 0, False),
     "dd_lookahead": ("dd_lookahead", None, 500, True),
 }
-OBSERVED = REGIMES | {"joints_hidden": Regime("joints_hidden", "Stacking, joints hidden", hidden=tuple(range(7)))}
+OBSERVED = REGIMES | {"joints_hidden": Regime("joints_hidden", hidden=tuple(range(7)))}
 JUDGED = 24  # test trajectories for the error of controllers: the last ones in the order of a seed
 HORIZON = 14
 NOISE_SEED = 2000  # added to the seed, so that the noise of rollouts differs from that of demonstrations
@@ -101,8 +101,8 @@ def with_labels(data: TensorDictBase, episodes: torch.Tensor) -> TensorDictBase:
 def refit(controller: InverseDynamics, data: TensorDictBase, task: Task) -> tuple[InverseDynamics, dict]:
     """Repeats the closed-form fit of a copied controller on other labels; returns it and the fit's report."""
     controller = copy.deepcopy(controller)
-    mode = Normalizer.fit(data["action"], mode="rms", mask=data["has_action"])
-    controller.action_normalizer.load_state_dict(mode.state_dict())
+    normalizer = Normalizer.fit(data["action"], mode="rms", mask=data["has_action"])
+    controller.action_normalizer.load_state_dict(normalizer.state_dict())
     return controller, fit_closed_form(controller, data, **action_facts(task, task.controller_columns("robot")))
 
 
@@ -274,8 +274,8 @@ def main(
         trajectories: maximum number of demonstrations.
         folder: folder of the tables.
     """
-    for name, known in ((name, METHODS) for name in methods):
-        lookup(known, name, "method")
+    for name in methods:
+        lookup(METHODS, name, "method")
     regimes = [lookup(OBSERVED, name, "observation setting") for name in observed]
     source = find_task_of(dataset)
     if rollouts and source.name != "avoiding":

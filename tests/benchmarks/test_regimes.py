@@ -36,10 +36,10 @@ def test_a_seed_fixes_a_regime_and_actions_stay(name):
 
 def test_hidden_columns_are_not_observed():
     data = make_data(columns=4)
-    seen = apply_regime(data, Regime("dark", "", hidden=(0, 2)))["state"]
+    seen = apply_regime(data, Regime("dark", hidden=(0, 2)))["state"]
     assert torch.equal(seen, data["state"][:, [1, 3]])
     with pytest.raises(ValueError, match="hides column 4, the state has 4"):
-        apply_regime(data, Regime("dark", "", hidden=(4,)))
+        apply_regime(data, Regime("dark", hidden=(4,)))
     with pytest.raises(ValueError, match="unknown regime 'wide_65'; did you mean 'wide_64'"):
         apply_regime(data, "wide_65")
 
