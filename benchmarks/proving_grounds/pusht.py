@@ -1,13 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Push-T: a disc pushes a T-shaped block to a target; 206 human demonstrations of Chi et al. 2023 (MIT licence).
 
-There are grounds with states, with the agent's position and eight corners of the block, and with the agent's position
-and frames of 96 x 96 pixels. The simulator gives corners and frames of recorded states. Frames need extra ``vision``.
+One ground has states, the other the agent's position and frames of 96 x 96 pixels. The simulator renders the frames of
+recorded states; they need the extra ``vision``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from torchrl_koap.data import read_recordings, save_demonstrations
 from torchrl_koap.vision.embedding import embed_recordings, read_sources
 
 DATA = SHARED / "pusht_human_206.npz"
-ENV, CORNERS, PIXELS = (f"torchrl_koap/PushT{kind}-v0" for kind in ("", "Corners", "Pixels"))
+ENV, PIXELS = "torchrl_koap/PushT-v0", "torchrl_koap/PushTPixels-v0"
 STEPS = 300
 AGENT, TARGET = ("agent_x", "agent_y"), ("target_x", "target_y")
 ABSOLUTE: dict[str, Any] = {"action_kind": "absolute", "targets": AGENT, "action_units": "px", "max_steps": STEPS}
@@ -41,33 +40,17 @@ def read_episodes() -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def write_data_set(folder: Path, *, demonstrations: int | None = None) -> None:
     """Writes all or the first ``demonstrations``, with their actions, as a data set of ``koap train``."""
-    save(folder, six_columns, STATE, demonstrations)
-
-
-def write_corners(folder: Path) -> None:
-    """Writes the demonstrations with the block's eight corners (px) in place of its position and angle."""
-    env = make_corners().unwrapped
-    env.reset(seed=0)
-    names = [*AGENT, *(f"corner_{number}_{axis}" for number in range(8) for axis in "xy")]
-
-    def corners(states: np.ndarray) -> np.ndarray:
-        rows = []
-        for state in states:
-            place(env, state)
-            rows.append(join(env.get_obs()))
-        return np.stack(rows)
-
-    save(folder, corners, dict.fromkeys(names, "px"))
-
-
-def save(
-    folder: Path, columns: Callable[[np.ndarray], np.ndarray], units: dict[str, str], most: int | None = None
-) -> None:
-    """Writes the demonstrations; ``columns`` converts their states ``[T, 5]``."""
-    states, actions = (each[:most] for each in read_episodes())
-    options = {"state_names": list(units), "state_units": list(units.values()), "action_names": TARGET}
+    states, actions = (each[:demonstrations] for each in read_episodes())
     save_demonstrations(
-        folder, list(map(columns, states)), actions, control_hz=10, robot=list(AGENT), **options, **ABSOLUTE
+        folder,
+        list(map(six_columns, states)),
+        actions,
+        control_hz=10,
+        state_names=list(STATE),
+        state_units=list(STATE.values()),
+        action_names=TARGET,
+        robot=list(AGENT),
+        **ABSOLUTE,
     )
 
 
@@ -108,11 +91,6 @@ def place(env: Any, state: np.ndarray) -> None:
         env.space.reindex_shapes_for_body(body)
 
 
-def join(observation: dict[str, np.ndarray]) -> np.ndarray:
-    """Returns the agent's position and the corners of an observation, float32 ``[18]``."""
-    return np.concatenate([observation["agent_pos"], observation["environment_state"]]).astype(np.float32)
-
-
 class SixColumns(gymnasium.ObservationWrapper):
     """Converts observations by :func:`six_columns`."""
 
@@ -132,15 +110,6 @@ def make_env(**options: object) -> gymnasium.Env:
     return SixColumns(gymnasium.make("gym_pusht/PushT-v0", obs_type="state", disable_env_checker=True, **options))
 
 
-def make_corners(**options: object) -> gymnasium.Env:
-    """Makes the simulator with observations of the block's corners and the agent's position."""
-    import gym_pusht  # noqa: F401  # registers it
-
-    options |= {"obs_type": "environment_state_agent_pos", "disable_env_checker": True}
-    box = gymnasium.spaces.Box(-np.inf, np.inf, (18,), np.float32)
-    return gymnasium.wrappers.TransformObservation(gymnasium.make("gym_pusht/PushT-v0", **options), join, box)
-
-
 def make_pixels(**options: object) -> gymnasium.Env:
     """Makes the simulator with observations of pictures and the agent's position."""
     import gym_pusht  # noqa: F401  # registers it
@@ -150,11 +119,9 @@ def make_pixels(**options: object) -> gymnasium.Env:
 
 
 gymnasium.register(ENV, make_env, max_episode_steps=STEPS, disable_env_checker=True)
-gymnasium.register(CORNERS, make_corners, max_episode_steps=STEPS, disable_env_checker=True)
 gymnasium.register(PIXELS, make_pixels, max_episode_steps=STEPS, disable_env_checker=True)
 INSTALL = 'pip install gym-pusht==0.1.8 "pymunk<7"'
 GROUNDS = {
     "pusht": Ground(write_data_set, "reward", (10,), 150, ENV, STEPS, DATA, "gym_pusht", INSTALL),
-    "pusht_corners": Ground(write_corners, "reward", (10,), 150, CORNERS, STEPS, DATA, "gym_pusht", INSTALL),
     "pusht_pixels": Ground(write_pixels, "reward", (10,), 150, PIXELS, STEPS, DATA, "gym_pusht", INSTALL),
 }
