@@ -15,9 +15,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.lookup import lookup
-
-PICTURE = 32  # pixels along an edge
+PICTURE, RADIUS = 32, 2.5  # edge of a picture and radius of the disc's soft edge, in pixels
+COMPONENTS = 64  # observed principal components of pictures
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class RegimeSensor:
 
     Args:
         data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``, which determine the scales.
-        regime (str or Regime): a name in :data:`REGIMES`, or a regime.
+        regime (Regime): the observation model.
 
     Keyword Args:
         seed (int): seed of noise and distractors.
@@ -59,12 +58,12 @@ class RegimeSensor:
         step (Tensor): typical step of every column ``[c]``, the unit of the noise.
 
     Raises:
-        ValueError: for an unknown regime, or a state without the columns to hide.
+        ValueError: for a state without the columns to hide.
     """
 
-    def __init__(self, data: TensorDictBase, regime: str | Regime, *, seed: int = 0):
-        self.regime = lookup(REGIMES, regime, "regime") if isinstance(regime, str) else regime
-        state, episode, hidden = data["state"], data["episode"], self.regime.hidden
+    def __init__(self, data: TensorDictBase, regime: Regime, *, seed: int = 0):
+        self.regime = regime
+        state, episode, hidden = data["state"], data["episode"], regime.hidden
         if hidden and max(hidden) >= state.shape[-1]:
             raise ValueError(f"regime {self.regime.name!r} hides column {max(hidden)}, the state has {state.shape[-1]}")
         self._generator = torch.Generator().manual_seed(1000 + seed)
@@ -130,50 +129,42 @@ def _oscillations(episode: Tensor, count: int, generator: torch.Generator) -> Te
     return out
 
 
-def random_network(columns: int, gain: float, seed: int = 0) -> Callable[[Tensor], Tensor]:
+def random_network(columns: int, gain: float) -> Callable[[Tensor], Tensor]:
     r"""Returns a fixed random layer, :math:`\tanh(\gamma (W x / \sqrt{d} + b))` with standard normal ``W`` and ``b``.
 
     Args:
         columns (int): number of output columns.
         gain (float): nonlinearity :math:`\gamma`: at 1 a state two standard deviations out saturates some columns.
-        seed (int): seed of the weights.
     """
 
     def embed(state: Tensor) -> Tensor:
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(0)
         weight = torch.randn(state.shape[-1], columns, generator=generator).to(state) / math.sqrt(state.shape[-1])
         return torch.tanh(gain * (state @ weight + torch.randn(columns, generator=generator).to(state)))
 
     return embed
 
 
-def disc_pictures(
-    recorded: Tensor, *, pixels: int = PICTURE, radius: float = 2.5, kept: int = 64
-) -> Callable[[Tensor], Tensor]:
+def disc_pictures(recorded: Tensor) -> Callable[[Tensor], Tensor]:
     """Draws small pictures of a disc at the first two coordinates; returns a map to their principal components.
 
     Args:
         recorded (Tensor): standardised states ``[N, d]``.
 
-    Keyword Args:
-        pixels (int): pixels along an edge. Defaults to ``32``.
-        radius (float): radius of the disc's soft edge, in pixels.
-        kept (int): number of principal components.
-
     Returns:
-        callable: from standardised states ``[N, d]`` to the components of their pictures ``[N, kept]``.
+        callable: from standardised states ``[N, d]`` to the components of their pictures ``[N, COMPONENTS]``.
     """
 
     def draw(state: Tensor) -> Tensor:
-        place = (pixels - 1) * (0.5 + state[:, :2] / 5)  # the picture spans 2.5 standard deviations to either side
-        axis = torch.arange(pixels, device=state.device, dtype=state.dtype)
-        profile = torch.exp(-0.5 * ((axis - place[..., None]) / radius) ** 2)  # [N, 2, pixels]
+        place = (PICTURE - 1) * (0.5 + state[:, :2] / 5)  # the picture spans 2.5 standard deviations to either side
+        axis = torch.arange(PICTURE, device=state.device, dtype=state.dtype)
+        profile = torch.exp(-0.5 * ((axis - place[..., None]) / RADIUS) ** 2)  # [N, 2, PICTURE]
         return (profile[:, 1, :, None] * profile[:, 0, None, :]).flatten(1)
 
     pictures = draw(recorded)
     mean = pictures.mean(0)
     centred = pictures - mean
-    components = torch.linalg.eigh(centred.mT @ centred)[1][:, -kept:].flip(-1)
+    components = torch.linalg.eigh(centred.mT @ centred)[1][:, -COMPONENTS:].flip(-1)
     return lambda state: (draw(state) - mean) @ components
 
 

@@ -26,12 +26,12 @@ def make_data(length=600, columns=2):
 @pytest.mark.parametrize("name", REGIMES)
 def test_a_seed_fixes_a_regime_and_actions_stay(name):
     data = make_data()
-    seen = apply_regime(data, name, seed=3)
-    assert torch.equal(seen["state"], apply_regime(data, name, seed=3)["state"])
+    seen = apply_regime(data, REGIMES[name], seed=3)
+    assert torch.equal(seen["state"], apply_regime(data, REGIMES[name], seed=3)["state"])
     assert torch.equal(seen["action"], data["action"]) and seen["state"].dtype == torch.float32
     assert seen["state"].isfinite().all()
     random = REGIMES[name].noise or REGIMES[name].distractors
-    assert torch.equal(seen["state"], apply_regime(data, name, seed=4)["state"]) == (not random)
+    assert torch.equal(seen["state"], apply_regime(data, REGIMES[name], seed=4)["state"]) == (not random)
 
 
 def test_hidden_columns_are_not_observed():
@@ -40,29 +40,27 @@ def test_hidden_columns_are_not_observed():
     assert torch.equal(seen, data["state"][:, [1, 3]])
     with pytest.raises(ValueError, match="hides column 4, the state has 4"):
         apply_regime(data, Regime("dark", hidden=(4,)))
-    with pytest.raises(ValueError, match="unknown regime 'wide_65'; did you mean 'wide_64'"):
-        apply_regime(data, "wide_65")
 
 
 class TestRegimeSensor:
     def test_other_states_are_observed_like_recorded_ones(self):
         data = make_data()
-        sensor = RegimeSensor(data, "wide_64")
+        sensor = RegimeSensor(data, REGIMES["wide_64"])
         torch.testing.assert_close(sensor.show(data["state"][40:50]), sensor.recorded[40:50])
         middle = (data["state"][3] + data["state"][4]) / 2
         assert (sensor.show(middle[None]) - sensor.recorded[3]).abs().max() > 0
 
     def test_noise_is_drawn_anew_and_scaled_by_the_steps_of_the_data(self):
         data = make_data(6000)
-        sensor = RegimeSensor(data, "noise", seed=2)
+        sensor = RegimeSensor(data, REGIMES["noise"], seed=2)
         recorded, later = (sensor.noisy(sensor.recorded) - sensor.recorded for _ in range(2))
-        torch.testing.assert_close(recorded, apply_regime(data, "noise", seed=2)["state"] - data["state"])
+        torch.testing.assert_close(recorded, apply_regime(data, REGIMES["noise"], seed=2)["state"] - data["state"])
         assert not torch.equal(recorded, later)
         torch.testing.assert_close(later.std(0), 3 * sensor.step, rtol=0.05, atol=0)
 
     def test_distractors_are_shown_beside_the_state(self):
         data = make_data()
-        sensor = RegimeSensor(data, "distractors")
+        sensor = RegimeSensor(data, REGIMES["distractors"])
         shown = sensor.show(data["state"][:5], sensor.distractors[:5])
         torch.testing.assert_close(shown, sensor.recorded[:5])
         assert not torch.allclose(sensor.show(data["state"][:5], sensor.distractors[5:10]), shown)

@@ -40,7 +40,7 @@ class Next(nn.Module):
 
 def shown(script, demonstrations, regime):
     data, _ = script.load_positions(str(demonstrations), 100)
-    sensor = script.RegimeSensor(data, regime)
+    sensor = script.RegimeSensor(data, script.REGIMES[regime])
     seen = data.copy().set("state", sensor.noisy(sensor.recorded)).set("observation", data["state"])
     return sensor, seen.set("episode", torch.unique(data["episode"], return_inverse=True)[1])
 
