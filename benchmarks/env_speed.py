@@ -103,7 +103,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=40, help="control steps per measurement")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--sleep", action="store_true", help="enable MuJoCo's sleeping of bodies (not as recorded)")
     options = parser.parse_args()
     torch.set_num_threads(1)
 
@@ -115,8 +114,6 @@ def main() -> None:
     for num_envs in (1, options.num_envs):
         for threads in options.threads if num_envs > 1 else [1]:
             env = make_env(options.task, num_envs, num_threads=threads, max_steps=10**6)
-            if options.sleep:
-                env.sims.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
             speeds = rollout_speed(env, options.steps, options.repeats, file)
             median = statistics.median(speeds)
             base = median if threads == 1 else base
