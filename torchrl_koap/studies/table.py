@@ -62,7 +62,6 @@ class Summary:
     done: tuple[int, ...]
     failed: tuple[int, ...]
     missing: tuple[int, ...]
-    successes: int
     episodes: int
     measures: Mapping[str, Measure]
     action_errors_on: tuple[str, ...] = ()  # the labels on which action errors were measured without an environment
@@ -140,7 +139,6 @@ def _summary(task: str, unit: str, demonstrations: float, labels: float, method:
         demonstrations,
         unit,
         **seeds,
-        successes=successes,
         episodes=episodes,
         measures=measures,
         action_errors_on=compared,
