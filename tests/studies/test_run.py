@@ -110,6 +110,7 @@ def test_methods_labels_and_seeds_may_be_added(curve, demonstrations, monkeypatc
     assert {name: after[name] for name in before} == before
     added = {f"cells/avoiding/dd-0.5-1-seed{seed}" for seed in (0, 1)}
     assert set(rows_of(curve)) == {DP, LINEAR} | added
+    assert list(dict.fromkeys(row["method"] for row in rows_of(curve).values())) == ["linear", "dp", "dd"]
     assert sorted(read) == sorted([DP, LINEAR, *added, *added])  # each once at first, and again when it has ended
     kept = json.loads((curve / "study.json").read_text())
     assert (kept["methods"], kept["labels"], kept["seeds"]) == (["linear", "dp", "dd"], [0.25, 0.5], 2)

@@ -92,10 +92,9 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         for name, content in facts.items():
             if not (_begun(study, name).path / "config.json").exists():
                 _begun(study, name).write_json("config.json", content)
-        asked = set(cells)
-        folders = {cell: study.out / cell.folder for cell in whole.cells() if cell not in asked}
-        earlier = [cell for cell, folder in folders.items() if (folder / "log.txt").exists() or folder.is_file()]
-        results = {cell: cell_row(study.out, cell, label_unit=study.label_unit) for cell in [*cells, *earlier]}
+        asked = set(cells)  # the order of all cells gives a method its place and colour in every call
+        shown = [cell for cell in whole.cells() if cell in asked or _was_begun(study.out / cell.folder)]
+        results = {cell: cell_row(study.out, cell, label_unit=study.label_unit) for cell in shown}
         _work(study, cells, results, machines or Machines())
         rows, tasks = _write_rows(study, results), whole.tasks
         outcomes = {row["run"]: found for row, found in results.values() if found}
@@ -148,6 +147,10 @@ def _check_folder(study: Study) -> None:
         different.append(f"planners ({', '.join(earlier.planners)})")
     if different:
         raise RunDirectoryError(f"{path} holds a study with another {', '.join(different)}; choose another --out")
+
+
+def _was_begun(folder: Path) -> bool:
+    return (folder / "log.txt").exists() or folder.is_file()  # a file in place of the folder made the cell fail
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
