@@ -101,8 +101,11 @@ def cases(data: Path, run: Path) -> list[Case]:
     ]
 
 
-def call(words: Sequence[object], kill: tuple[str, float] | None = None) -> int:
-    """Runs a command in a fork of this process; returns its exit status, or minus the signal that ended it."""
+def call(words: Sequence[object], kill: tuple[str, float] | None = None) -> int | None:
+    """Runs a command in a fork of this process, which a signal may ``kill`` after some seconds.
+
+    Returns its exit status, or minus the signal that ended it; None if it ended before the signal was sent.
+    """
     child = os.fork()
     if child == 0:
         os.setsid()  # separates a curve's workers from this process
@@ -120,7 +123,7 @@ def call(words: Sequence[object], kill: tuple[str, float] | None = None) -> int:
         ends = time.monotonic() + seconds
         while time.monotonic() < ends:
             if os.waitpid(child, os.WNOHANG)[0]:
-                return 0
+                return None
             time.sleep(0.002)
         os.kill(child, getattr(signal, name))
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -150,17 +153,18 @@ def _timeless(value):
 def disturb(
     case: Case, out: Path, undisturbed: dict[str, object], seconds: float, generator: random.Random
 ) -> dict[str, object]:
-    """Runs a command, ended one to three times; returns its row."""
+    """Runs a command, to which up to three signals are sent; returns its row, whose signals may be empty."""
     if case.prepare is not None:
         case.prepare(out)
     signals, times, calls = [], [], 0
     words = case.begin(out)
     for _ in range(generator.choice((1, 1, 2, 3))):
-        signals.append(generator.choice(SIGNALS))
-        times.append(generator.uniform(0, 1.1 * seconds))
+        name, wait = generator.choice(SIGNALS), generator.uniform(0, 1.1 * seconds)
         calls += 1
-        if call(words, (signals[-1], times[-1])) == 0:
+        if call(words, (name, wait)) is None:
             break
+        signals.append(name)
+        times.append(wait)
         words = case.again(out)
     calls += 1
     status = call(case.again(out))
@@ -208,10 +212,11 @@ def main() -> int:
                 undisturbed[case.name] = content(reference, case.files)
                 assert undisturbed[case.name], case.name
             out = root / f"killed-{number}"
-            rows.append(disturb(case, out, undisturbed[case.name], took[case.name], generator))
-            print(" ".join(f"{rows[-1][name]}" for name in COLUMNS), flush=True)
+            row = disturb(case, out, undisturbed[case.name], took[case.name], generator)
+            print(" ".join(f"{row[name]}" for name in COLUMNS), flush=True)
+            rows += [row] if row["signals"] else []
             shutil.rmtree(out, ignore_errors=True)
-            if options.table is not None:
+            if options.table is not None and rows:
                 write_table(options.table, rows)
     equal = sum(row["equal"] == "yes" for row in rows)
     kills = sum(len(row["signals"].split()) for row in rows)
