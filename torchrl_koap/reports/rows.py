@@ -174,15 +174,12 @@ def _environment(run: RunFacts) -> Row | None:
         return None
     success = f"success: info[{made['success_key']!r}]" if made.get("success_key") else made.get("success")
     limit = f"at most {made['step_limit']}" if made.get("step_limit") else None
-    total = run.evaluation.get("mean_return")
-    left = run.evaluation.get("left_out_of_return")
-    notes = [f"{left:g} rollouts that an error ended are left out"] if left else []
-    low, high = made.get("mean_return_interval") or (None, None)
-    notes = notes if low is None else [f"95 % interval {low:.4g} to {high:.4g}", *notes]
+    early, left, total = (made.get(name) for name in ("ended_early", "left_out_of_return", "mean_return"))
+    ended = f"{early:g} rollouts ended before that without success" if early else None
+    notes = ["95 % interval {:.4g} to {:.4g}".format(*ends)] if (ends := made.get("mean_return_interval")) else []
+    notes += [f"{left:g} rollouts that an error ended are left out"] if left else []
     about = f" ({'; '.join(notes)})" if notes else ""
     gained = None if total is None else f"mean return {total:.4g}{about}"
-    early = run.evaluation.get("ended_early")
-    ended = f"{early:g} rollouts ended before that without success" if early else None
     return Row("environment", str(made["env"]), "; ".join(filter(None, (limit, ended, success, gained))))
 
 
