@@ -9,7 +9,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
-from tables import fact, percent, read_rows, table
+from tables import METHOD_NAMES, fact, percent, read_rows, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, GREEN, INK, MUTED, ORANGE, PALE_BLUE, tidy
@@ -25,14 +25,14 @@ TITLES = {
     "meta_world_pick-place": "Meta-World pick-place",
     "unitree_g1": "Unitree G1",
 }
-COMPARED = {
-    "koap": ("KOAP", BLUE),
-    "koap_untrained": ("random features", PALE_BLUE),
-    "linear_steps": ("ridge regression", ORANGE),
-    "dd_lookahead": ("supervised, look-ahead", GREEN),
-    "dd": ("Decision Diffuser", "#9fd3ad"),
-    "vpt": ("VPT", "#b39ddb"),
-    "dp": ("Diffusion Policy", MUTED),
+COMPARED = {  # methods with the colours of their bars
+    "koap": BLUE,
+    "koap_untrained": PALE_BLUE,
+    "linear_steps": ORANGE,
+    "dd_lookahead": GREEN,
+    "dd": "#9fd3ad",
+    "vpt": "#b39ddb",
+    "dp": MUTED,
 }
 ONE_SEED = "\N{DAGGER}"  # marks a score with fewer training seeds than its row states
 STEP = 0.9 / len(COMPARED)  # distance of neighbouring bars
@@ -126,7 +126,7 @@ def grounds_table() -> str:
         row = [title, str(usual_labels(ground)), f"{first.seeds} x {first.n // first.seeds}"]
         row += [_beside(score, first.seeds) for score in scores]
         body.append([*row, fact(key) if key in published else "none"])
-    heads = [name for name, _ in COMPARED.values()]
+    heads = [METHOD_NAMES[method] for method in COMPARED]
     return table(["benchmark", "labelled", "training seeds x n", *heads, "published, all labels"], body)
 
 
@@ -161,16 +161,16 @@ def draw_grounds(path: Path) -> Path:
     left, right = figure.subplots(1, 2, width_ratios=[max(2, len(rolled)), 2 * max(1, len(judged))])
     left.set(ylim=(0, 1.12), ylabel="largest reward, or success")
     right.set(ylim=(0, 1.6), ylabel="error on recordings")
-    for number, (method, (name, color)) in enumerate(COMPARED.items()):
+    for number, (method, color) in enumerate(COMPARED.items()):
         for place, ground in enumerate(rolled):
             score = ground_score(ground, method)
             if score is not None:
-                _bar(left, place + STEP * number, *score.interval, color, name)
+                _bar(left, place + STEP * number, *score.interval, color, METHOD_NAMES[method])
         for place, ground in enumerate(judged):
             score = ground_score(ground, method)
             for step, share in enumerate(() if score is None else (score.action, score.plan)):
                 if share is not None:
-                    _bar(right, 2 * place + step + STEP * number, share, share, share, color, name)
+                    _bar(right, 2 * place + step + STEP * number, share, share, share, color, METHOD_NAMES[method])
     texts = [f"{TITLES[ground].replace(' ', chr(10), 1)}\n{usual_labels(ground)} labelled" for ground in rolled]
     left.set_xticks([place + 0.4 for place in range(len(rolled))], texts, fontsize=8)
     kinds = ("actions,\nridge = 1", "plans,\nstanding still = 1")

@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from paper_rows import count_by_observations, count_successes, finished_cells, label_shares, paper_cells_beside
-from tables import SOURCE, fact, percent, read_rows, table
+from tables import METHOD_NAMES, SOURCE, fact, percent, read_rows, table
 from unlabelled_rows import REGIMES, followed
 
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -82,13 +82,12 @@ def _beside_the_paper(entry: Entry) -> str:
 
 def controllers_table() -> str:
     """Formats the success of KOAP, its controls and `mpc` with the same planner."""
-    body = []
+    methods, body = ("koap", "koap_untrained", "linear_steps", "mpc"), []
     for task, text in CONTROLLERS.items():
-        names = ("koap", "koap_untrained", "linear_steps", "mpc")
-        cells = [count_successes("controllers", task, name, 0.01) for name in names]
+        cells = [count_successes("controllers", task, method, 0.01) for method in methods]
         rates = [f"{percent(counts, 0)} of {counts['n']}" if counts["n"] else "not run" for counts in cells]
         body.append([f"`{task}`", text, *rates])
-    return table(["task", "labelled", "KOAP", "random features", "ridge regression", "`mpc`"], body)
+    return table(["task", "labelled", *(METHOD_NAMES.get(method, f"`{method}`") for method in methods)], body)
 
 
 FOLLOWED = {

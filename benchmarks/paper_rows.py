@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tables import percent, read_rows, share, table
+from tables import METHOD_NAMES, percent, read_rows, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.modules import Execution
@@ -138,8 +138,8 @@ def few_labels_table(name: str, all_labels: str, human: str) -> str:
         body.append([called.capitalize(), share(fewest), *text, _pooled(all_labels, task, "dp", 1.0)])
     text = [_pooled(human, "avoiding", method) for method in methods]
     body.append(["Avoiding, human recordings", "1 recording", *text, "not run"])
-    head = ["task", "labelled", "KOAP", "random features", "ridge regression", "Decision Diffuser", "Diffusion Policy"]
-    return table([*head, "Diffusion Policy, all labels"], body)
+    names = [METHOD_NAMES[method] for method in methods]
+    return table(["task", "labelled", *names, "Diffusion Policy, all labels"], body)
 
 
 def bench_rollouts(name: str) -> str:
@@ -233,15 +233,7 @@ def tuning_table() -> str:
     return table(["method", "used", "best other execution"], body)
 
 
-RIVALS = {
-    "koap_untrained": "random features",
-    "linear_steps": "ridge regression",
-    "nonlinear": "nonlinear maps",
-    "dd_lookahead": "supervised, look-ahead",
-    "dd": "Decision Diffuser",
-    "lapo": "LAPO",
-    "dp": "Diffusion Policy",
-}
+RIVALS = ("koap_untrained", "linear_steps", "nonlinear", "dd_lookahead", "dd", "lapo", "dp")
 
 
 def comparison_table() -> str:
@@ -253,7 +245,7 @@ def comparison_table() -> str:
         found = {row["method"]: row for row in rows if float(row["labels"]) == fewest and row["difference"]}
         if found:
             body.append([f"`{task}`", *(_points(found[name]) if name in found else "not run" for name in RIVALS)])
-    return table(["KOAP minus", *RIVALS.values()], body)
+    return table(["KOAP minus", *(METHOD_NAMES[method] for method in RIVALS)], body)
 
 
 def _points(row: Mapping[str, str]) -> str:

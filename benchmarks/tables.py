@@ -12,6 +12,17 @@ from torchrl_koap.evaluation.statistics import wilson_interval
 
 SOURCE = Path(__file__).resolve().parent / "results"
 Row = Mapping[str, str]
+METHOD_NAMES = {  # in tables and pictures
+    "koap": "KOAP",
+    "koap_untrained": "random features",
+    "linear_steps": "ridge regression",
+    "nonlinear": "nonlinear maps",
+    "dd_lookahead": "supervised, look-ahead",
+    "dd": "Decision Diffuser",
+    "lapo": "LAPO",
+    "vpt": "VPT",
+    "dp": "Diffusion Policy",
+}
 
 
 def read_rows(name: str, **wanted: Any) -> list[dict[str, str]]:
