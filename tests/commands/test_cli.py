@@ -208,14 +208,15 @@ def test_two_trainings_that_begin_together(demonstrations, tmp_path, capsys, mon
 
 def test_labels_of_the_call_take_the_place_of_those_in_a_file(tmp_path):
     file = tmp_path / "config.json"
-    file.write_text('{"labels": {"count": 3, "unit": "window"}, "method": "linear"}')
-    for words, fraction, count in (
-        (["--labels.fraction", "0.1"], 0.1, None),
-        (["--labels=0.1"], 0.1, None),
-        (["--labels", "5"], None, 5),
-        ([], None, 3),
+    file.write_text('{"labels": {"count": 3, "unit": "window", "trajectories": 0.5}, "method": "linear"}')
+    for words, fraction, count, unit in (
+        (["--labels.fraction", "0.1"], 0.1, None, "window"),
+        (["--labels=0.1"], 0.1, None, "trajectory"),
+        (["--labels", "5"], None, 5, "trajectory"),
+        ([], None, 3, "window"),
     ):
         config = parse(Subcommand, ["train", "--out", "x", "--config", str(file), *words]).config
         assert (config.labels.fraction, config.labels.count, config.method) == (fraction, count, "linear")
+        assert (config.labels.unit, config.labels.trajectories) == (unit, 0.5)
     with pytest.raises(ValueError, match="there is no such file"):
         parse(Subcommand, ["train", "--out", "x", "--config", str(tmp_path / "none.json")])

@@ -133,10 +133,9 @@ def _words_of(path: Path, amounts: Sequence[str]) -> list[str]:
     if not path.is_file():
         raise ValueError(f"--config {path}: there is no such file")
     options = {name: value for name, value in read_json(path).items() if name not in FACTS}
-    if "--labels" in amounts:
-        options.pop("labels", None)
-    elif amounts and isinstance(labels := options.get("labels"), Mapping):
-        options["labels"] = {name: value for name, value in labels.items() if f"--labels.{name}" not in AMOUNTS}
+    if amounts and isinstance(labels := options.get("labels"), Mapping):
+        replaced = [*AMOUNTS, "--labels.unit"] if "--labels" in amounts else AMOUNTS  # --labels 5: 5 trajectories
+        options["labels"] = {name: value for name, value in labels.items() if f"--labels.{name}" not in replaced}
     from_json(TrainConfig, {"out": ""} | options, path)
     return list(_flat(options))
 
