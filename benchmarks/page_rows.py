@@ -41,9 +41,9 @@ NAMES = {
 }
 
 
-def bench_rate(name: str, task: str, method: str, level: int = 0) -> str:
-    """Formats a method's success over all seeds in whole percent; level 0 has the fewest labels."""
-    return percent(count_successes(name, task, method, label_shares(name, task)[level]), 0)
+def bench_rate(name: str, task: str, method: str) -> str:
+    """Formats a method's success with the fewest labels over all seeds in whole percent."""
+    return percent(count_successes(name, task, method, label_shares(name, task)[0]), 0)
 
 
 def hours(name: str) -> str:

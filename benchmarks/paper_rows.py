@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from torchrl_koap.studies.paper import (
     above_the_paper,
     draw_average,
     layout_rows,
-    paper_cell,
     paper_cells,
     paper_entries,
 )
@@ -103,12 +102,9 @@ def paper_size() -> str:
     return str(sum(cell.task != "stacking_1" for number in (1, 2) for cell in paper_cells(number)))
 
 
-def bench_sentence(name: str, method: str = "") -> str:
-    """Counts the cells in which KOAP is above the paper's KOAP; with ``method``, in which that method is."""
-    entries = paper_cells_beside(name)
-    if method:
-        entries = [replace(entry, paper=paper_cell(entry.task, "koap", entry.level)) for entry in entries]
-    above, both = above_the_paper(entries, method or "koap")
+def bench_sentence(name: str) -> str:
+    """Counts the cells in which KOAP is above the paper's KOAP."""
+    above, both = above_the_paper(paper_cells_beside(name))
     return f"{above} of {both}"
 
 

@@ -120,9 +120,9 @@ def kills(rows: Sequence[Row]) -> list[dict[str, str]]:
     return total(counts, command="all")
 
 
-def every(rows: Sequence[Row], count: int = 4) -> list[Row]:
-    """Returns the first row, the last, and evenly spaced rows between them."""
-    return [*rows[: -1 : max(1, len(rows) // count)], rows[-1]]
+def every(rows: Sequence[Row]) -> list[Row]:
+    """Returns the first row, the last, and about three evenly spaced rows between them."""
+    return [*rows[: -1 : max(1, len(rows) // 4)], rows[-1]]
 
 
 def commands(rows: Sequence[Row]) -> str:

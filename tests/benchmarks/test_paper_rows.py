@@ -7,13 +7,12 @@ def cell(method, fraction, successes):
     return done | {"method": method, "labels": fraction, "episodes": 60, "successes": successes}
 
 
-def test_another_method_is_counted_against_the_papers_koap(benchmark_script, monkeypatch):
+def test_cells_above_the_paper_are_counted(benchmark_script, monkeypatch):
     """Other rows are compared with the committed pages by test_make_results.py."""
     rows = benchmark_script("paper_rows")
-    cells = [cell("koap", 0.02, 60), cell("pca", 0.02, 60), cell("pca", 0.05, 40), cell("koap", 0.05, 60)]
+    cells = [cell("koap", 0.02, 60), cell("pca", 0.02, 60), cell("koap", 0.05, 40)]  # the paper: 78.0 and 98.05 %
     monkeypatch.setattr(rows, "read_cells", {"made": cells}.__getitem__)
-    assert rows.bench_sentence("made") == "2 of 2"
-    assert rows.bench_sentence("made", "pca") == "1 of 2"  # the paper's KOAP has 78.0 and 98.05 %
+    assert rows.bench_sentence("made") == "1 of 2"
 
 
 def test_methods_declare_what_the_tuning_found(benchmark_script):

@@ -139,9 +139,9 @@ def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
     return list(lines.values())
 
 
-def above_the_paper(entries: Sequence[Entry], method: str = "koap") -> tuple[int, int]:
-    """Counts the cells in which a method succeeds more often than the paper's, and the cells that both have."""
-    both = [entry for entry in entries if entry.method == method and entry.paper and entry.success is not None]
+def above_the_paper(entries: Sequence[Entry]) -> tuple[int, int]:
+    """Counts the cells in which KOAP succeeds more often than the paper's, and the cells that both have."""
+    both = [entry for entry in entries if entry.method == "koap" and entry.paper and entry.success is not None]
     return sum(entry.success > entry.paper.success for entry in both), len(both)
 
 
