@@ -120,6 +120,13 @@ def test_a_picture_that_no_evaluation_could_leave_says_why(tmp_path):
     assert "Predicted against recorded actions: not drawn" not in write_report(tmp_path).read_text()
 
 
+def test_a_training_without_updates_has_no_losses_to_draw(tmp_path):
+    (write_run(tmp_path) / "metrics.csv").unlink()  # as with a given planner and a controller in closed form
+    page = Page(write_report(tmp_path, draw=False))
+    assert "Losses: not drawn, the training logged no loss." in page.text
+    assert "Losses. Made by koap train" not in page.text
+
+
 @pytest.mark.parametrize("name", ["config.json", "summary.json", "eval.json"])
 @pytest.mark.parametrize("content", ['{"task": ', "[1, 2]", ""])
 def test_damaged_json_is_named_and_the_rest_is_shown(name, content, tmp_path):

@@ -73,7 +73,10 @@ def _subtitle(run: RunFacts) -> str:
 
 def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
     """Returns the figures to show, and for each command the titles of the pictures whose source it would write."""
-    no_actions = entry_at(run.action_errors, "outside_budget", "note")
+    nothing = {  # reasons why no command would write a source
+        "actions.safetensors": entry_at(run.action_errors, "outside_budget", "note"),
+        "metrics.csv": "the training logged no loss" if run.summary else None,
+    }
     figures: list[dict[str, Any]] = []
     missing: dict[str, list[str]] = {}
     for name, item in all_pictures().items():
@@ -85,8 +88,8 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
             figures.append(figure | {"source": f"{FOLDER}/{name}", "beside": name.endswith(".gif")})
         elif (item.source in _SIMULATED) if run.offline else item.offline:
             continue  # no command makes it for this task
-        elif item.source == "actions.safetensors" and not source and no_actions:
-            figures.append(figure | {"empty": no_actions})  # no command would make it
+        elif not source and nothing.get(item.source):
+            figures.append(figure | {"empty": nothing[item.source]})
         elif not source:
             missing.setdefault(_filled(item.made_by, run), []).append(item.title)
         elif item.empty:
