@@ -12,12 +12,11 @@ per demonstration. The interval is that of the mean paired difference to random 
 from __future__ import annotations
 
 import argparse
-import math
 import statistics
 import time
 
 import torch
-from scipy.stats import t as student
+from tables import t_interval
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -105,9 +104,7 @@ def row(criterion: str, budget: int, labels: list[int], errors: list[float], ran
     if criterion == "random" or budget == 1:
         return text
     differences = [error - other for error, other in zip(errors, random, strict=True)]
-    reach = student.ppf(0.975, len(differences) - 1) * statistics.stdev(differences) / math.sqrt(len(differences))
-    mean = statistics.fmean(differences)
-    return f"{text}  {mean:+.3f} ({mean - reach:+.3f} to {mean + reach:+.3f})"
+    return text + "  {:+.3f} ({:+.3f} to {:+.3f})".format(*t_interval(differences))
 
 
 def main() -> None:

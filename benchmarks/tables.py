@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import csv
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from scipy.stats import t as student
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 
@@ -49,6 +52,13 @@ def percent(row: Mapping[str, Any], digits: int = 1) -> str:
     successes, trials = int(row["successes"]), int(row["n"])
     low, high = (100 * end for end in wilson_interval(successes, trials))
     return f"{100 * successes / trials:.{digits}f} % ({low:.{digits}f}-{high:.{digits}f})"
+
+
+def t_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Returns the mean of two or more values and the ends of its 95 % t-interval."""
+    mean = statistics.fmean(values)
+    half = student.ppf(0.975, len(values) - 1) * statistics.stdev(values) / len(values) ** 0.5
+    return mean, mean - half, mean + half
 
 
 def share(fraction: str | float) -> str:

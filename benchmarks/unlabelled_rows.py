@@ -9,8 +9,7 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import t as student
-from tables import percent, read_rows, table
+from tables import percent, read_rows, t_interval, table
 
 REGIMES = {
     "plain": "positions as recorded",
@@ -108,9 +107,7 @@ def paired_gain(gains: Sequence[float], unit: str = "%") -> str:
     """
     if len(gains) < 3:
         return f"{statistics.fmean(gains):+.0f} {unit} ({len(gains)} seeds)" if gains else "not run"
-    half = student.ppf(0.975, len(gains) - 1) * statistics.stdev(gains) / len(gains) ** 0.5
-    mean = statistics.fmean(gains)
-    return f"{mean:+.0f} {unit} ({mean - half:+.0f} to {mean + half:+.0f})"
+    return "{:+.0f} {unit} ({:+.0f} to {:+.0f})".format(*t_interval(gains), unit=unit)
 
 
 def draw_unlabelled(path: Path) -> Path:
