@@ -17,10 +17,9 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from paper_rows import count_by_observations, count_successes, finished_cells, label_shares, paper_cells_beside
-from tables import METHOD_NAMES, SOURCE, fact, percent, read_rows, table
+from tables import METHOD_NAMES, SOURCE, fact, percent, read_rows, success_interval, table
 from unlabelled_rows import REGIMES, followed
 
-from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, set_title, tidy
 from torchrl_koap.studies.paper import Entry
 from torchrl_koap.tasks.scooping import CAMERA, FRAME_HZ
@@ -268,9 +267,9 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
             if cell is None:
                 continue
             x = group + (place - 1.5) * 0.21
-            low, high = (100 * end for end in wilson_interval(cell["successes"], cell["n"]))
+            rate, low, high = success_interval(cell["successes"], cell["n"])
             label = NAMES[method] if not group else None
-            axes.bar(x, 100 * cell["successes"] / cell["n"], width=0.19, color=COLORS[method], label=label)
+            axes.bar(x, rate, width=0.19, color=COLORS[method], label=label)
             axes.vlines(x, low, high, color=INK, linewidth=1)
     axes.set(xticks=range(len(LABELS)), ylim=(0, 102), ylabel="success (%)")
     axes.set_xticklabels([f"{labels} labels" for labels in LABELS], fontsize=9)

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tables import METHOD_NAMES, percent, read_rows, share, table
+from tables import METHOD_NAMES, percent, read_rows, share, success_interval, table
 
-from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.modules import Execution
 from torchrl_koap.studies.paper import (
     Entry,
@@ -162,8 +161,7 @@ def _pooled(name: str, task: str, method: str, labels: float | None = None) -> s
     counts = count_successes(name, task, method, labels or label_shares(name, task)[0])
     if not counts["n"]:
         return "not run"
-    low, high = (100 * end for end in wilson_interval(counts["successes"], counts["n"]))
-    return f"{100 * counts['successes'] / counts['n']:.0f} ({low:.0f}-{high:.0f})"
+    return "{:.0f} ({:.0f}-{:.0f})".format(*success_interval(counts["successes"], counts["n"]))
 
 
 def bench_size(name: str) -> str:

@@ -13,10 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from page_rows import CONTROLLERS
 from paper_rows import count_by_observations, count_successes, draw_bench_average, label_shares
-from tables import fact, read_rows
+from tables import fact, read_rows, success_interval
 from unlabelled_rows import draw_unlabelled
 
-from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, tidy
 from torchrl_koap.studies.study import PAPER_TASKS
 
@@ -119,19 +118,13 @@ def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], col
     axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=color, linewidth=1.1))
 
 
-def _interval(successes: int, trials: int) -> tuple[float, float, float]:
-    """Returns mean, low and high in percent."""
-    low, high = wilson_interval(successes, trials)
-    return 100 * successes / trials, 100 * low, 100 * high
-
-
 def _controllers() -> list[Bar]:
     """Returns the success of KOAP and of `mpc` with the same planner."""
     bars = []
     for task in CONTROLLERS:
         for method in ("koap", "mpc"):
             counts = count_successes("controllers", task, method, 0.01)
-            bars.append((f"{task}: {method}", *_interval(counts["successes"], counts["n"])))
+            bars.append((f"{task}: {method}", *success_interval(counts["successes"], counts["n"])))
     return bars
 
 
@@ -140,7 +133,8 @@ def _planner_data() -> dict[str, list[Point]]:
     found = count_by_observations("study_observations_and_planner")
     return {
         name: [
-            (100 * part, *_interval(own[method]["successes"], own[method]["n"])) for part, own in sorted(found.items())
+            (100 * part, *success_interval(own[method]["successes"], own[method]["n"]))
+            for part, own in sorted(found.items())
         ]
         for method, name in SHOWN.items()
         if method in found[1.0]
@@ -171,7 +165,7 @@ def draw_few_labels(path: Path) -> Path:
             counts = [
                 (100 * part, count_successes("table_1", task, method, part)) for part in label_shares("table_1", task)
             ]
-            points = [(part, *_interval(own["successes"], own["n"])) for part, own in counts if own]
+            points = [(part, *success_interval(own["successes"], own["n"])) for part, own in counts if own]
             if points:
                 _line(axes, points, SHOWN[method], number)
         axes.set_title(task.replace("_unobserved_joints", ", joints hidden").replace("_", " "), fontsize=9)

@@ -49,9 +49,14 @@ def _same(text: str, value: Any) -> bool:
 
 def percent(row: Mapping[str, Any], digits: int = 1) -> str:
     """Formats the success of a row in percent with its Wilson interval."""
-    successes, trials = int(row["successes"]), int(row["n"])
-    low, high = (100 * end for end in wilson_interval(successes, trials))
-    return f"{100 * successes / trials:.{digits}f} % ({low:.{digits}f}-{high:.{digits}f})"
+    rate, low, high = success_interval(int(row["successes"]), int(row["n"]))
+    return f"{rate:.{digits}f} % ({low:.{digits}f}-{high:.{digits}f})"
+
+
+def success_interval(successes: int, trials: int) -> tuple[float, float, float]:
+    """Returns a success rate and the ends of its 95 % Wilson interval, in percent."""
+    low, high = wilson_interval(successes, trials)
+    return 100 * successes / trials, 100 * low, 100 * high
 
 
 def t_interval(values: Sequence[float]) -> tuple[float, float, float]:
