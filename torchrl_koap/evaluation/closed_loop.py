@@ -174,7 +174,7 @@ def choose_contexts(task: Task, config: EvalConfig) -> tuple[list[int] | None, n
                 raise ValueError(f"{name}: task {task.name!r} has no environment to roll out in: name one with --env")
         return None, None
     each, file = config.rollouts_per_context, config.contexts_file
-    if not task.objects or config.env is not None:
+    if not task.scene.varies or config.env is not None:
         where = f"task {task.name!r}" if config.env is None else "an environment of Gymnasium"
         for name, given in {"contexts_file": file is not None, "rollouts_per_context": each != 1}.items():
             if given:

@@ -2,6 +2,7 @@
 """Tests recorded demonstrations: modes, rows, repeatability, resuming after an interruption."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,8 +22,10 @@ from torchrl_koap.envs.experts.demonstrations import (
     record_to_folder,
 )
 from torchrl_koap.envs.experts.recording import ar1_noise
+from torchrl_koap.evaluation import EvalConfig
+from torchrl_koap.evaluation.closed_loop import choose_contexts
 from torchrl_koap.keys import validate
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import TASKS, Body, get_task
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS
 
 EPISODES = 26
@@ -93,6 +96,15 @@ def test_an_environment_that_draws_its_own_starts_is_seeded(monkeypatch):
         record_demonstrations("avoiding", 1, seed)
     same, other = [value for value in seeds if value is not None][:2], seeds[-1]
     assert same[0] == same[1] != other
+
+
+def test_bodies_that_start_alike_in_every_episode_have_no_contexts(monkeypatch):
+    task = get_task("avoiding")
+    drawn = replace(task, name="drawn", scene=replace(task.scene, bodies=(Body("rod", "measured_xy"),)))
+    monkeypatch.setitem(TASKS, "drawn", drawn)
+    data, _ = record_demonstrations("drawn", 1, 0)
+    assert len(data) > 50
+    assert choose_contexts(drawn, EvalConfig()) == (None, None)
 
 
 def test_modes_are_balanced():

@@ -189,7 +189,7 @@ def _play_batches(
     @functools.cache
     def contexts_of(attempt: int) -> np.ndarray | None:
         """Draws contexts of all episodes, so that none depends on the batch size."""
-        if not task.bodies:
+        if not task.scene.varies:
             return None
         return draw_contexts(task, len(modes), np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
 
