@@ -10,6 +10,7 @@ from small_networks import chunk_policy, small_planner
 from torchrl.collectors import Collector
 from toy_gym import reach
 
+from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.modules import Agent, Execution, PolicyEnv, make_koopman_inverse_dynamics, make_policy
 
 STEPS = 13
@@ -41,6 +42,15 @@ def test_the_actions_of_a_rollout_bit_for_bit(make, robots):
     for step in range(STEPS):
         action = agent.act(rollout["observation"][:, step])
         assert torch.equal(action, rollout["action"][:, step]), step
+
+
+def test_a_temperature_multiplies_the_noise_of_a_rollout_in_float64_too():
+    execution = Execution(temperature=0.4)
+    policy = make_policy(small_planner(), make_koopman_inverse_dynamics(2, 2), state_of=(2, 3), execution=execution)
+    env = PolicyEnv(AvoidingEnv(2, dtype=torch.float64), policy.double())
+    env.set_seed(7)
+    rollout = env.rollout(2, policy)
+    assert torch.equal(ready(policy, seed=7).act(rollout["observation"][:, 0]), rollout["action"][:, 0])
 
 
 def test_numpy_or_torch_one_robot_or_several():

@@ -191,7 +191,7 @@ class PlanningPolicy(TensorDictModuleBase):
             sample = partial(self.planner.sample_nearest, candidates=self.execution.candidates)
         else:
             sample = self.planner.sample
-        chunk = sample(seen, self.execution.temperature * noise, **options)
+        chunk = sample(seen, self.execution.temperature * noise.to(states.dtype), **options)
         wanted = (*seen.shape[:-2], self.planner.horizon, seen.shape[-1])
         if self.follower is not None and chunk.shape != wanted:
             raise ValueError(f"a plan must be {list(wanted)} ([*B, horizon, d]), got {list(chunk.shape)}")
