@@ -184,6 +184,16 @@ def test_decoded_commands_become_changes_of_the_last_one():
     assert sampled.act(observed, chunk, 2)[0, 1] == chunk[0, 2, 1] - 3.5
 
 
+@pytest.mark.parametrize("selected", [["action"], ["action", "plan"], ["plan"]])
+def test_plans_are_made_when_due_whichever_entries_are_selected(selected):
+    policy, td = policy_of(), step_input(torch.zeros(1, 2, 3))
+    policy.select_out_keys(*selected)
+    for step in range(9):
+        observed = torch.tensor([max(step - 1, 0), step]).float()[:, None].expand(1, 2, 3)
+        td = policy(td.set("observation_history", observed).set("is_init", torch.full((1, 1), step == 0)))
+    assert policy.planner.calls == [[0.0], [4.0], [8.0]]
+
+
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize("mpc", [False, True])
 def test_policies_are_pickled_selected_and_roll_out_in_their_own_precision(mpc, double):

@@ -263,7 +263,7 @@ class PlanningPolicy(TensorDictModuleBase):
                 f"{self.in_keys[0]!r} must be {[*batch, self.history, 'obs']} (batch size, frames, columns),"
                 f" got {list(observed.shape)}"
             )
-        if kept[0] not in tensordict.keys() and not begins.all():
+        if any(tensordict.get(key, None) is None for key in kept) and not begins.all():
             if self._continues(tensordict):
                 tensordict.update(self._written.select(*kept))
             else:  # the policy acted elsewhere in the meantime
