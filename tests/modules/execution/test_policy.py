@@ -194,6 +194,14 @@ def test_plans_are_made_when_due_whichever_entries_are_selected(selected):
     assert policy.planner.calls == [[0.0], [4.0], [8.0]]
 
 
+def test_an_environment_that_is_left_out_of_a_step_goes_on_with_its_plan():
+    policy, td, acted = policy_of(), step_input(torch.zeros(2, 2, 3)), []
+    for step, under_way in enumerate([[True, True], [True, False], [True, True]]):
+        td = policy(td.set("_step", torch.tensor(under_way)).set("is_init", torch.full((2, 1), step == 0)))
+        acted.append(td["action"][:, 2].tolist())
+    assert acted[0] == [1000.0, 1000.0] and acted[1][0] == 2000.0 and acted[2] == [3000.0, 2000.0]
+
+
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize("mpc", [False, True])
 def test_policies_are_pickled_selected_and_roll_out_in_their_own_precision(mpc, double):
