@@ -3,13 +3,16 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from pretended_gpu import pretended_gpu
+from small_networks import small_planner
 from tensordict import TensorDict
 from toy_policies import CountingPlanner, CountingSampler, EchoController
 
 from torchrl_koap import Trained, load_policy
-from torchrl_koap.modules import Execution, make_policy
+from torchrl_koap.modules import Agent, Execution, make_koopman_inverse_dynamics, make_policy
 from torchrl_koap.modules.execution.command_limits import CommandLimits
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.policy_facts import policy_facts
@@ -102,6 +105,14 @@ def policy_for(name, **execution):
     return make_policy(
         CountingPlanner(), EchoController(), **policy_facts(get_task(name)), execution=Execution(**execution)
     )
+
+
+def test_limits_are_on_the_device_of_networks_that_were_trained_there(monkeypatch):
+    with pretended_gpu(monkeypatch):
+        networks = small_planner().to("cuda:0"), make_koopman_inverse_dynamics(2, 2).to("cuda:0")
+        agent = Agent(make_policy(*networks, state_of=(2, 3), ranges=[(-0.01, 0.01)] * 2))
+        agent.reset()
+        assert np.abs(agent.act(np.ones(4))).max() <= 0.02  # the range, widened by half of it on both sides
 
 
 def test_a_task_says_which_columns_they_are():

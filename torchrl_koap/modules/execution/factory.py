@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from torchrl_koap.modules.execution.command_limits import CommandLimits, Ranges
@@ -54,7 +55,7 @@ def make_policy(
         **options: ``decoded``, ``max_steps``, ``control_hz``, ``observe``, ``origins`` and the keys.
 
     Returns:
-        PlanningPolicy: the policy.
+        PlanningPolicy: the policy, on the device of the networks.
 
     Raises:
         ValueError: as :class:`~torchrl_koap.modules.PlanningPolicy`; for a gain if no action is a change of a command;
@@ -88,7 +89,8 @@ def make_policy(
             positions=own.get("states", ()),
             state_of=columns_of(state_of),
         )
-    return PlanningPolicy(planner, follower, state_of=state_of, execution=execution, limits=limits, **options).eval()
+    policy = PlanningPolicy(planner, follower, state_of=state_of, execution=execution, limits=limits, **options)
+    return policy.eval().to(next(policy.parameters(), torch.empty(0)).device)
 
 
 def _widened(ends: Sequence[float] | None, margin: float) -> tuple[float, float] | None:
