@@ -7,6 +7,7 @@ import pytest
 import torch
 from small_networks import chunk_policy, small_planner
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from toy_policies import CountingPlanner, CountingSampler, EchoController, EpisodesOfRandomLength, state_number
@@ -125,6 +126,19 @@ def test_renamed_keys(kind):
         for td in (renamed, plain):
             td["is_init"] = torch.zeros(3, 1, dtype=torch.bool)
     assert list(policy.in_keys) == [("agent", "frames"), "is_init"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_policies_of_two_arms_in_one_sequence_keep_plans_of_their_own(kind):
+    alone = [policy_of(kind, interval) for interval in (4, 3)]
+    arms = [policy_of(kind, each, action_key=(arm, "action")) for arm, each in {"left": 4, "right": 3}.items()]
+    both, together, apart = TensorDictSequential(*arms), TensorDict(batch_size=[2]), [TensorDict(batch_size=[2])] * 2
+    for step in range(9):
+        given = step_input(torch.rand(2, 2, 3)).set("is_init", torch.tensor([[step == 0], [step in (0, 5)]]))
+        together = both(together.update(given))
+        apart = [policy(td.copy().update(given)) for policy, td in zip(alone, apart, strict=True)]
+        for arm, td in zip(("left", "right"), apart, strict=True):
+            assert torch.equal(together[arm, "action"], td["action"]), (arm, step)
 
 
 def test_wrong_arguments_are_named():

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -62,7 +62,8 @@ class PlanningPolicy(TensorDictModuleBase):
         origins (tuple, optional): offsets that were subtracted from observations ``[obs]`` and actions ``[act]`` of the
             data; an :class:`~torchrl_koap.modules.Agent` and exported files subtract and add them.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
-        action_key (NestedKey): action of the current step ``[*B, act]``.
+        action_key (NestedKey): action of the current step ``[*B, act]``. Plan and step counter stand beside it: give
+            policies of one tensordict nested keys of different groups.
 
     Raises:
         ValueError: for a replan interval longer than the horizon, a follower that does not support the execution, a
@@ -126,16 +127,17 @@ class PlanningPolicy(TensorDictModuleBase):
         self.origins = None if origins is None else [torch.tensor(part, dtype=torch.float64) for part in origins]
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
         self._decodes = follower is not None and execution.strategy != "open_loop"  # decodes at every step
-        chunk_key = PLAN if self._decodes else ACTION_CHUNK
+        group = action_key[:-1] if isinstance(action_key, tuple) else ()
+        chunk_key = unravel_key((*group, PLAN if self._decodes else ACTION_CHUNK))
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self._action_key, self._chunk_key = action_key, chunk_key  # out_keys may be selected
         self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
             _Chunk(self.plan, history_key, planner.noise_key, chunk_key),
             replan_interval=execution.replan_interval,
-            action_keys=[PLANNED_STATE if self._decodes else action_key],
+            action_keys=[unravel_key((*group, PLANNED_STATE)) if self._decodes else action_key],
             chunk_keys=[chunk_key],
-            init_key=IS_INIT,
+            init_key=unravel_key((*group, IS_INIT)),
         )
 
     @property
@@ -270,7 +272,8 @@ class PlanningPolicy(TensorDictModuleBase):
                 begins = torch.ones_like(begins)
         noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
         # MultiStepActorWrapper needs exactly one batch dimension
-        flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False).set(IS_INIT, begins)
+        flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
+        flat = flat.set(self.receding.init_key, begins)
         flat = flat.reshape(-1) if batch else flat.unsqueeze(0)
         under_way = tensordict.get(UNDER_WAY, None)
         if under_way is None or under_way.all():
