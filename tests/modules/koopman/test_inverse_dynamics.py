@@ -135,6 +135,8 @@ def test_labels_choose_the_kernel_of_their_function_and_its_decoder(kept):
     alone = make_koopman_inverse_dynamics(2, 2, num_features=256, num_past=0, look_ahead=2, kernels={"": kernels[kept]})
     alone.latent_action.load_state_dict(model.latent_action.state_dict(), strict=False)
     alone.fit_labels(data, torch.ones(60, 12, dtype=torch.bool))
+    with pytest.raises(ValueError, match="no labelled frame"):
+        model.fit_labels(data, torch.zeros(60, 12, dtype=torch.bool))  # kernel and decoder stay
     torch.testing.assert_close(model(data.clone())["action"], alone(data.clone())["action"])
 
 

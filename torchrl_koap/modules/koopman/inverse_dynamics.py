@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -168,7 +169,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
             "bias": normalizer is not None and bool(normalizer.offset.any()),
             "alike": alike,
         }
-        was_training, fits = self.training, {}
+        was_training, chosen, fits = self.training, deepcopy(network.state_dict()), {}
         self.eval()
         try:
             for block in network.blocks:
@@ -178,6 +179,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
                 if (0 if groups is None else len(groups.unique())) < network.min_trajectories:
                     break
         finally:
+            network.load_state_dict(chosen)  # the decoder belongs to this block until it is replaced
             self.train(was_training)
         best = network.best_block({block: fit.error for block, fit in fits.items()})
         self.action_decoder.assign(fits[best])
