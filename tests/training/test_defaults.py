@@ -14,6 +14,8 @@ from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.training import METHODS
 from torchrl_koap.training.defaults import resolve
+from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.networks import build_controller
 
 
 def resolved(task="avoiding", method=None, **sections):
@@ -126,6 +128,9 @@ class TestExecution:
         for method in ("koap", "lapo", "dp", "dd"):
             found = resolve(TrainConfig(out="run", method=method), task).execution
             assert found.replan_interval == (steps if found.strategy == "feedback" else 4), method
+        pca = resolve(TrainConfig(out="run", method="pca"), task)
+        assert pca.execution.replan_interval == min(steps, 7)  # it reads eight frames ahead
+        assert build_controller(task, get_method("pca"), pca.controller).reader.look_ahead[-1] == 8
 
     def test_of_a_method_goes_before_the_tasks(self):
         def execution(*names, **asked):

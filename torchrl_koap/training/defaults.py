@@ -133,6 +133,6 @@ def _execution(asked: ExecutionConfig, method: Method, task: Task, preset: str) 
     method.check_execution(asked, usual)
     if asked.on(usual).strategy == "feedback":
         # decoding later actions would need frames beyond the end of the plan
-        most = HORIZON + 1 - np.max(PRESETS[preset]["look_ahead"]).item()
+        most = HORIZON + 1 - (method.look_ahead or np.max(PRESETS[preset]["look_ahead"]).item())
         own = {"replan_interval": min(max(REPLAN_INTERVAL, round(PLAN_SECONDS * task.control_hz)), most)} | own
     return ExecutionConfig(**vars(asked.on(Execution().replaced(**own))))

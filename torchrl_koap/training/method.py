@@ -93,6 +93,7 @@ class Method:
         presets (tuple of str): values of ``--preset`` that it can be built with; the first is its default.
         columns (str, optional): what its controller reads, ``"robot"`` or ``"all"``. Default: the task's.
         updates (int, optional): updates of its controller. Default: the task's.
+        look_ahead (int, optional): planned frames that its controller reads ahead. Default: those of the preset.
         execution (mapping): fields of :class:`~torchrl_koap.modules.Execution` that it sets.
         fit (callable, optional): ``fit(controller, data, updates) -> dict``, in place of phases and closed form: fits a
             controller that is not an inverse dynamics model to flat data after the label budget was applied; returns
@@ -123,6 +124,7 @@ class Method:
     presets: tuple[str, ...] = ("default",)
     columns: str | None = None
     updates: int | None = None
+    look_ahead: int | None = None
     execution: Mapping[str, Any] = field(default_factory=dict)
     fit: Callable[[Any, Any, int], dict[str, Any]] | None = None
     phases_by_preset: Mapping[str, tuple[Phase, ...]] = field(default_factory=dict)

@@ -178,6 +178,7 @@ for _method in (
         "ridge on principal components of unlabelled windows",
         partial(_network, kind=PrincipalInverseDynamics),
         closed_form=True,
+        look_ahead=8,
     ),
     Method("linear", "ridge on raw frames", _linear, closed_form=True, execution=_OPEN_LOOP),
     Method(
