@@ -198,12 +198,14 @@ def test_decoded_commands_become_changes_of_the_last_one():
     assert sampled.act(observed, chunk, 2)[0, 1] == chunk[0, 2, 1] - 3.5
 
 
+@pytest.mark.parametrize("unread", [0.0, float("nan")])
 @pytest.mark.parametrize("selected", [["action"], ["action", "plan"], ["plan"]])
-def test_plans_are_made_when_due_whichever_entries_are_selected(selected):
+def test_plans_are_made_when_due_whichever_entries_are_selected(selected, unread):
     policy, td = policy_of(), step_input(torch.zeros(1, 2, 3))
     policy.select_out_keys(*selected)
     for step in range(9):
-        observed = torch.tensor([max(step - 1, 0), step]).float()[:, None].expand(1, 2, 3)
+        observed = torch.tensor([max(step - 1, 0), step]).float()[:, None].repeat(1, 1, 3)
+        observed[..., 0] = unread  # a column that is not in the state
         td = policy(td.set("observation_history", observed).set("is_init", torch.full((1, 1), step == 0)))
     assert policy.planner.calls == [[0.0], [4.0], [8.0]]
 

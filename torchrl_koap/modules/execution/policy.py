@@ -295,7 +295,8 @@ class PlanningPolicy(TensorDictModuleBase):
         before = None if self._written is None else self._written.get(self.in_keys[0])
         if before is None or before.shape != observed.shape:
             return False
-        follows = (observed[..., :-1, :] == before[..., 1:, :]).flatten(-2).all(-1, keepdim=True)
+        same = torch.isclose(observed[..., :-1, :], before[..., 1:, :], rtol=0.0, atol=0.0, equal_nan=True)
+        follows = same.flatten(-2).all(-1, keepdim=True)
         idle = ~tensordict.get(UNDER_WAY, torch.ones_like(begins)).reshape(begins.shape)
         return bool((follows | begins | idle).all())
 
