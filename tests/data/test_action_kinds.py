@@ -1,8 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests warnings about actions of another kind than declared, and their absence for correct ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 from torchrl_koap.data import make_demonstrations
 from torchrl_koap.data.action_kinds import command_warnings, describe_likely, kind_warnings, likely_kinds
@@ -36,6 +39,18 @@ def test_targets_that_are_declared_as_changes():
 def test_far_numbers_are_compared_as_the_robot_reports_them():
     far = [path + 4e6 for path in PATHS]
     assert not warnings(far, [frames[1:, :2] for frames in far], action_kind="absolute", targets=JOINTS[:2])
+
+
+def test_targets_are_named_behind_a_feature_of_other_width_than_its_columns():
+    data, task = demonstrations(PATHS, TARGETS)
+    turns = torch.tensor([1.0, 0, 0, 0]).expand(len(data), 4)
+    for seen in (data, data["next"]):
+        seen["observation"] = torch.cat([turns, seen["observation"]], 1)
+    parts, state = {"turn": 4, "robot": JOINTS}, {"turn": "quaternion", "robot": "plain"}
+    task = replace(task, observation_parts=parts, observation_units=(), state=state, robot=(2, 3, 4))
+    (said,) = kind_warnings(data, task, "abcd")
+    assert "of shoulder.pos, elbow pos on average: they look like absolute targets" in said
+    assert [each.column for each in likely_kinds(data, task).values()] == [2, 3]
 
 
 def test_a_name_that_is_the_same_allows_for_targets_that_lie_farther_away():

@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests the detection of labels logged after the motion that they cause, and of robots that respond late."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -48,6 +50,17 @@ def test_labels_that_are_late_are_counted(late, lag, kind, noise):
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_labels_on_time_or_early_within_a_robot_s_delay_or_without_a_column_are_no_fault(how):
     assert frames_late(*recordings(**how)) == 0
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_features_of_other_width_than_their_columns_may_precede_the_robot_s():
+    data, task = recordings(2)
+    turns = torch.tensor([1.0, 0, 0, 0]).expand(len(data), 4)
+    data["observation"] = torch.cat([turns, data["observation"]], 1)
+    parts = {"turn": 4, "joints": JOINTS}
+    state, robot = {"turn": "quaternion", "joints": "plain"}, tuple(column + 2 for column in task.robot)
+    task = replace(task, observation_parts=parts, observation_units=(), position="joints", state=state, robot=robot)
+    assert frames_late(data, task) == 2
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

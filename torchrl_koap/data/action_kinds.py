@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap import keys
@@ -152,9 +153,8 @@ def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
         return None
     before, after, actions, episodes = steps
     origin, added = map(np.asarray, task.origins or (0.0, 0.0))
-    seen = list(task.state_columns)
-    names = [task.observation_names[column] for column in seen]
-    actions, level, turns = actions + added, (after + origin)[:, seen], []
+    before, after, level = (task.state_of(torch.from_numpy(seen)).numpy() for seen in (before, after, after + origin))
+    actions, turns, names = actions + added, [], list(task.state_names)
     for start in quaternion_starts([actions]):
         for column in quaternion_starts([level]):
             turn, there = actions[:, start : start + 4], level[:, column : column + 4]
@@ -163,7 +163,7 @@ def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
             if (1 - np.abs(products)).mean() < NEAR * (1 - other).mean():
                 turns.append((start, column, int((products < 0).sum())))
                 turn *= np.where(products < 0, -1, 1)[:, None]
-    return _Labels(actions, level, (after - before)[:, seen], names, turns, episodes)
+    return _Labels(actions, level, after - before, names, turns, episodes)
 
 
 def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:

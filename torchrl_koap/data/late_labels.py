@@ -43,7 +43,7 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
     Early labels look like a robot that responds late. A robot that responds k frames late hides k late frames.
     """
     rows = _labelled_rows(data)
-    states = data.get(keys.OBSERVATION).double().cpu().numpy()[:, list(task.state_columns)]
+    states = task.state_of(data.get(keys.OBSERVATION).double()).cpu().numpy()
     actions, moved = data.get(keys.ACTION).double().cpu().numpy(), list(task.moves.values())
     change = (states[rows + 1] - states[rows])[:, moved]
     robot = states[:, list(task.robot) or moved]
