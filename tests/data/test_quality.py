@@ -199,6 +199,10 @@ def test_short_trajectories_are_left_out_and_named():
         drop_short(make_recordings([LINE[:9]], action_dim=1))
 
 
+def test_recordings_of_one_name_that_repeat_are_found():
+    assert any("take repeats take" in said for said in warnings([MOVED, MOVED], [None, STEPS], names=["take"] * 2))
+
+
 def test_a_recording_with_labels_beside_itself_without_them():
     said = warnings([MOVED, MOVED], [None, STEPS], names=["run_5.csv", "run_5_labelled.csv"])
     wanted = "run_5_labelled.csv repeats run_5.csv: all states are equal; leave out the one with fewer labels"

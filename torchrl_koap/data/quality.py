@@ -110,10 +110,11 @@ def _trajectory_warnings(
     read = (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)
     parts = [data.get(key).split(lengths) for key in read]
     for name, observed, steps, has_action, last in zip(called, *parts, strict=True):
-        same = first.setdefault(_digest(observed, last[-1:]), name)  # states only: labels may differ
-        if same is not name:
-            yield f"{name} repeats {same}: all states are equal; leave out the one with fewer labels"
+        digest = _digest(observed, last[-1:])  # states only: labels may differ
+        if digest in first:
+            yield f"{name} repeats {first[digest]}: all states are equal; leave out the one with fewer labels"
             continue
+        first[digest] = name
         labelled = steps[has_action.squeeze(-1)]
         if len(labelled) and not labelled.any():
             yield f"{name}: all {len(labelled)} labelled actions are zero"
