@@ -30,7 +30,8 @@ def test_what_has_no_label():
 
 
 def test_no_labels_at_all_needs_their_width():
-    assert make_recordings([FRAMES], action_dim=7).actions[0].shape == (4, 7)
+    for number in (7, np.int64(7)):
+        assert make_recordings([FRAMES], action_dim=number).actions[0].shape == (4, 7)
     assert make_recordings([FRAMES], action_names=["a", "b"]).actions[0].shape == (4, 2)
     with pytest.raises(DataError, match=r"number of action columns in action_dim .*, or the action columns of tables"):
         make_recordings([FRAMES])
@@ -114,7 +115,7 @@ def test_all_faults_are_told_at_once():
 class Frame:
     """What is read of a data frame of pandas."""
 
-    ndim, shape = 2, (2, 2)
+    shape = (2, 2)
 
     def __init__(self, columns, values):
         self.columns, self.values = list(columns), np.asarray(values, dtype=float)

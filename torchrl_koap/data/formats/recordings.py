@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,6 +22,14 @@ from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 
 FRAMES, STEPS = "[T, d]", "[T, a] or [T - 1, a]"
+
+
+@runtime_checkable
+class _DataFrame(Protocol):
+    """A data frame of pandas or another package."""
+
+    columns: Any  # names
+    shape: Any
 
 
 @dataclass(frozen=True)
@@ -134,7 +142,8 @@ def make_recordings(
     if wide is None and action_names is not None:
         wide = len(action_names)
     problems: list[str] = []
-    if action_dim is not None and (isinstance(action_dim, bool) or not isinstance(action_dim, int) or action_dim < 1):
+    whole = isinstance(action_dim, (int, np.integer)) and not isinstance(action_dim, bool)
+    if action_dim is not None and not (whole and action_dim > 0):
         raise DataError(source, f"{option('action_dim')} must be a positive whole number, got {action_dim!r}")
     if wide is None:
         wide = 1
@@ -209,7 +218,8 @@ def one_each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any
 
 
 def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
-    if getattr(values, "ndim", None) == 2:  # arrays and data frames; list(frame) would be its column names
+    one = values.ndim == 2 if isinstance(values, (np.ndarray, torch.Tensor)) else isinstance(values, _DataFrame)
+    if one:  # list(frame) would be its column names
         raise DataError(source, f"{what} must be a list of recordings {wanted}, got one array {list(values.shape)}")
     with contextlib.suppress(TypeError, RuntimeError):  # not a sequence; nested tensors
         if not isinstance(values, (str, Path, Mapping)):
@@ -223,7 +233,7 @@ def _by_name(
     tables: list[Any], names: Sequence[str] | None, what: str, labels: Sequence[str], faults: list[tuple[str, str]]
 ) -> tuple[list[Any], Sequence[str] | None]:
     """Orders the columns of data frames as in ``names`` or the first; other column names are faults."""
-    heads = [list(getattr(table, "columns", ())) for table in tables]
+    heads = [list(table.columns) if isinstance(table, _DataFrame) else [] for table in tables]
     order = next(filter(None, heads), [])
     if not all(isinstance(name, str) for name in order):  # pandas numbers columns without names
         return tables, names
