@@ -43,6 +43,12 @@ def test_archives_without_names_keep_the_names_of_other_entries(tmp_path):
         read_tables(tmp_path)
 
 
+def test_an_entry_does_not_replace_a_state_column_of_its_name(tmp_path):
+    np.savez(tmp_path / "a.npz", states=FRAMES, state_names=["x", "y"], x=np.arange(6.0) ** 2)
+    with pytest.raises(DataError, match="a.npz: two entries have a column x: rename one of them"):
+        read_tables(tmp_path, control_hz=25, action_dim=1, state_columns=["x"])
+
+
 def test_csv_with_gaps_in_its_labels(tmp_path):
     write_csv(tmp_path / "run.csv", columns_of(action_vx=[0.5, None, 0.25, 0.5, 1.0, 9.0]))
     recordings = read_tables(tmp_path)

@@ -147,6 +147,8 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
             continue
         if flags is not None and kind == "start":
             flags = np.roll(flags, 1)  # the first frame of an episode follows the last one of another
+        for fault in named_twice(states, {name: values}):
+            raise ValueError(fault)
         states[name] = _frame_entry(name, values, len(frames)) if flags is None else flags
         unclear += [name] if kind is None else []
     if acting is not None:
