@@ -58,6 +58,14 @@ def test_csv_with_gaps_in_its_labels(tmp_path):
     np.testing.assert_allclose(recordings.states[0], FRAMES)
 
 
+def test_a_row_of_empty_fields_between_others_is_a_lost_frame(tmp_path):
+    (tmp_path / "run.csv").write_text(",\nx,y\n1,2\n\n3,4\n,\n5,6\n,\n,\n")
+    with pytest.raises(DataError, match="states are not finite, first at frame 2 in column 'x'"):
+        read_tables(tmp_path, control_hz=10, action_dim=1)
+    (tmp_path / "run.csv").write_text(",\nx,y\n1,2\n\n3,4\n,\n,\n")
+    assert read_tables(tmp_path, control_hz=10, action_dim=1).states[0].tolist() == [[1, 2], [3, 4]]
+
+
 def test_named_action_columns_and_episodes(tmp_path):
     columns = columns_of(vx=[1.0] * 6, episode=[0, 0, 0, 1, 1, 1])
     columns["timestamp"] = [0.0, 0.1, 0.2] * 2

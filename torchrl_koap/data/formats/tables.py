@@ -246,9 +246,13 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> Piece:
 
     reader = csv.reader(io.StringIO(text), delimiter=separator)
     try:
-        found = [(reader.line_num, [plain(field) for field in row]) for row in reader if any(map(str.strip, row))]
+        found = [(reader.line_num, [plain(field) for field in row]) for row in reader]
     except csv.Error as error:
         raise ValueError(f"it is no table: {error}") from error
+    filled = [at for at, (_, row) in enumerate(found) if any(row)]
+    found = found[filled[0] : filled[-1] + 1] if filled else []
+    width = max((len(row) for _, row in found), default=0)
+    found = [(line, row) for line, row in found if any(row) or len(row) == width]  # empty fields: a lost frame
     rows = [(line, row) for line, row in found if row[0][:1] != "#"]
     if rows and None not in map(number_of, rows[0][1]):  # numpy.savetxt makes the header a comment
         rows = [*[(line, row) for line, row in found if row[0][:1] == "#" and line < rows[0][0]][-1:], *rows]
