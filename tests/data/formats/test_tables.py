@@ -66,6 +66,12 @@ def test_a_row_of_empty_fields_between_others_is_a_lost_frame(tmp_path):
     assert read_tables(tmp_path, control_hz=10, action_dim=1).states[0].tolist() == [[1, 2], [3, 4]]
 
 
+def test_rows_that_begin_like_comments_are_listed(tmp_path):
+    (tmp_path / "run.csv").write_text("# an arm\nrun,x\n#1,2\n#1,3\na,4\na,5\n")
+    recordings = read_tables(tmp_path, control_hz=10, action_dim=1)
+    assert recordings.states[0].tolist() == [[4], [5]] and "2 rows of run.csv that begin with #" in recordings.skipped
+
+
 def test_named_action_columns_and_episodes(tmp_path):
     columns = columns_of(vx=[1.0] * 6, episode=[0, 0, 0, 1, 1, 1])
     columns["timestamp"] = [0.0, 0.1, 0.2] * 2

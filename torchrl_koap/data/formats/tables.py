@@ -270,13 +270,15 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> Piece:
     for line, row in rows[1:]:
         if len(row) != len(header):
             raise ValueError(f"line {line} has {len(row)} fields, the header has {len(header)}")
+    hidden = sum(row[0][:1] == "#" for line, row in found if line > rows[0][0])
     columns: dict[str, np.ndarray | None] = {}
     for name, texts in zip(header, zip(*(row for _, row in rows[1:]), strict=True), strict=True):
         columns[name] = as_numbers(name, np.array(texts))
         odd = [row for row, text in enumerate(texts, 1) if number_of(text) is None]
         if columns[name] is None and len(odd) < len(texts):
             raise ValueError(f"line {rows[odd[0]][0]}, column {name!r}: {texts[odd[0] - 1]!r} is no number")
-    return _split(file, columns, action_columns)
+    piece = _split(file, columns, action_columns)
+    return replace(piece, unread=(*piece.unread, *[f"{hidden} rows of {file.name} that begin with #"] * bool(hidden)))
 
 
 def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> Piece:
