@@ -72,6 +72,13 @@ def test_round_trip(kind, recordings, tmp_path):
     assert again.state_names == STATES and again.action_names == ACTIONS
 
 
+@pytest.mark.parametrize("kind", ["npz", "lerobot"])
+def test_names_of_actions_survive_without_labels(kind, tmp_path):
+    bare = make_recordings([np.eye(3)], action_names=ACTIONS, state_names=STATES, control_hz=20.0)
+    again = read_recordings(write_recordings(bare, tmp_path / "out", kind))
+    assert again.action_names == ACTIONS and again.num_labels == 0
+
+
 def test_refusals_of_writing(recordings, tmp_path):
     with pytest.raises(ValueError, match="unknown format 'lerobt'; did you mean 'lerobot'"):
         write_recordings(recordings, tmp_path / "a", "lerobt")

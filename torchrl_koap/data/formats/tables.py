@@ -155,6 +155,8 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
         if entries[acting].ndim != 2 or entries[acting].dtype.kind not in "fiub":
             raise ValueError(f"{acting} must be numbers [T, a] or [T - 1, a], got {list(entries[acting].shape)}")
         steps = _named(entries[acting], entries.get("action_names"), "action")
+    elif "action_names" in entries:  # no labels, yet known columns
+        steps = _named(np.full((len(frames), entries["action_names"].size), np.nan), entries["action_names"], "action")
     rate = _declared(entries.get("control_hz"))
     return Piece(file.name, states, steps, tuple(unclear), declared_hz=rate, unread=tuple(unread))
 
