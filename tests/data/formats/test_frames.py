@@ -50,6 +50,19 @@ def test_pictures_and_arrays_beside_tables(tmp_path, clock):
     assert list(read_recordings(tmp_path, drop_columns=["wrist"]).cameras) == ["top"]
 
 
+def test_what_is_no_camera_beside_tables_is_listed_and_a_camera_that_is_there_twice_refused(tmp_path):
+    for name in ("a", "b"):
+        np.savez(tmp_path / f"{name}.npz", states=np.eye(4), actions=np.eye(4), control_hz=10)
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "top.mp4").touch()
+    assert read_recordings(tmp_path).skipped == ("a, b: top.mp4 (no frames)",)
+    np.save(tmp_path / "b/top.npy", np.zeros((4, 2, 2, 3), np.uint8))
+    (tmp_path / "b/top").mkdir()
+    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "b/top/0.png")
+    with pytest.raises(DataError, match="b.npz: camera 'top' is there twice, as top and top.npy"):
+        read_recordings(tmp_path)
+
+
 def test_frames_on_a_clock_of_their_own_are_matched(tmp_path):
     """A camera at 30 frames a second, a little late, beside rows at 10."""
     write_tables(tmp_path, lengths=(6,), clock=True)

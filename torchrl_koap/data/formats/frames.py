@@ -232,6 +232,8 @@ def clips_beside(file: Path, clock: np.ndarray | None) -> dict[str, Clip]:
             raise ValueError(
                 f"camera {name!r}: frame {some(absent)} is missing: give the times of the others in {times.name}"
             )
+        if name in found:
+            raise ValueError(f"camera {name!r} is there twice, as {Path(found[name].file).name} and {path.name}")
         found[name] = Clip(str(path.resolve()), tuple(held))
     return found
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.formats.columns import Piece, assemble
-from torchrl_koap.data.formats.frames import clips_beside
+from torchrl_koap.data.formats.frames import TIMES, clips_beside
 from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, named_twice, number_of, numbered
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
@@ -82,11 +82,17 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
         pieces = [_stamped(piece, {"timestamp": ("clock", 1.0)}) for piece in pieces]
     beside = {file.with_suffix("") for file in files}
     others = [path for path in sorted(files[0].parent.iterdir()) if path not in files and path not in beside]
+    seen = {clip.file for piece in pieces for clip in piece.cameras.values()}
+    lies = [path for each in sorted(beside) if each.is_dir() for path in sorted(each.iterdir())]
+    lies = [path for path in lies if str(path.resolve()) not in seen and not path.name.endswith(TIMES)]
     return assemble(
         _named_alike(pieces),
         str(folder),
         declared_hz=float(np.median(rates)) if rates else None,
-        skipped=[f"{path.name} (no table)" for path in others if folder.is_dir()],
+        skipped=[
+            *(f"{path.name} (no table)" for path in others if folder.is_dir()),
+            *gathered((path.parent.name, f"{path.name} (no frames)") for path in lies),
+        ],
         **options,
     )
 
