@@ -71,6 +71,28 @@ def test_columns_whose_names_repeat_are_numbered(feature, tmp_path):
 VERSIONS = pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 
 
+@pytest.mark.parametrize("given", [{"x": None}, {name: None if name == JOINTS[3] else 1 for name in JOINTS}])
+def test_names_without_numbers_are_not_used(given, tmp_path):
+    features = FEATURES | {"observation.state": {**FEATURES["observation.state"], "names": given}}
+    assert read_lerobot(write(tmp_path, features=features)).state_names[:2] == ("state_0", "state_1")
+
+
+def test_a_state_column_is_not_replaced_by_a_column_of_the_data_set_of_its_name(tmp_path):
+    features = FEATURES | {"observation.state": {**FEATURES["observation.state"], "names": ["timestamp", *JOINTS[1:]]}}
+    stamps = {"timestamp": pa.array(np.tile(np.arange(6) / 30, 2))}
+    recordings = read_lerobot(write(tmp_path, features=features, change=stamps))
+    assert recordings.state_names == (*(f"state_{index}" for index in range(7)), "force")
+    np.testing.assert_allclose(recordings.states[0][:, 0], np.linspace(0, 1, 84)[:42:7], rtol=1e-6)
+
+
+def test_features_whose_columns_have_one_name_are_refused(tmp_path):
+    features = FEATURES | {"observation.state_1": FEATURES["observation.force"]}
+    features["observation.state"] = {**FEATURES["observation.state"], "names": None}
+    more = {"observation.state_1": pa.array(np.zeros(12))}
+    with pytest.raises(DataError, match="two features have a column state_1: name those to read in observations"):
+        read_lerobot(write(tmp_path, features=features, change=more))
+
+
 @VERSIONS
 def test_actions_for_a_part_of_the_rows(version, tmp_path):
     recordings = read_lerobot(write(tmp_path, actions=[1, *range(6, 12)], version=version))

@@ -79,8 +79,14 @@ def read_lerobot(
         fault = "no file has actions, and info.json does not give the number of action columns"
         raise DataError(root, f"{fault}: pass {option('action_dim')}")
     names = [label for name in chosen for label in _names(known[name], name, first[name].shape[1])]
-    if len(set(names)) < len(names):  # two features with the same names of columns
+    beside = [name for name in (TIME, *flags) if name in first]
+    if len({*names, *beside}) < len(names) + len(beside):  # two features with the same names of columns
         names = [label for name in chosen for label in _names({}, name, first[name].shape[1])]
+    twice = sorted(name for name in {*names} if [*names, *beside].count(name) > 1)
+    if twice:
+        raise DataError(
+            root, f"two features have a column {some(twice)}: name those to read in {option('observations')}"
+        )
     acting = _names(known.get(ACTION) or {}, ACTION, first[ACTION].shape[1] if ACTION in first else width)
     clips, pieces = lerobot_clips(root, info, cameras, rows), []
     unseen = [name for name in images if cameras.get(name) not in clips[min(rows)]]
@@ -90,8 +96,8 @@ def read_lerobot(
     for number, columns in rows.items():
         states = dict(zip(names, np.concatenate([columns[name] for name in chosen], 1).T, strict=True))
         steps = dict(zip(acting, columns[ACTION].T, strict=True)) if ACTION in columns else None
-        beside = {name: columns[name][:, 0] for name in (TIME, *flags) if name in columns}
-        pieces.append(Piece(f"episode {number}", states | beside, steps, cameras=clips[number]))
+        states |= {name: columns[name][:, 0] for name in beside}
+        pieces.append(Piece(f"episode {number}", states, steps, cameras=clips[number]))
     if ACTION not in first:
         options = {"action_dim": width} | options
         absent += [f"{ACTION} (info.json lists it, no file has it)"] if ACTION in known else []
@@ -247,7 +253,8 @@ def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
     given, short = feature.get("names"), name.removeprefix(PREFIX)
     if isinstance(given, Mapping):
         listed = next(iter(given.values()), None)
-        given = listed if isinstance(listed, list) else sorted(given, key=given.get)
+        counted = all(isinstance(place, int) for place in given.values())
+        given = listed if isinstance(listed, list) else sorted(given, key=given.get) if counted else None
     if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
         given = given[0]
     named = isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given)
