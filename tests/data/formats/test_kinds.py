@@ -26,6 +26,7 @@ def test_names_identify_columns_that_are_not_states(kind, names):
 
 def test_units_of_clocks():
     assert [kind_of(f"time_{unit}")[1] for unit in ("s", "msec", "us", "ns")] == [1, 1e-3, 1e-6, 1e-9]
+    assert [kind_of(f"Time ({micro}s)") for micro in "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"] == [("clock", 1e-6)] * 2
 
 
 def test_names_with_spaces_and_points():

@@ -181,6 +181,12 @@ def test_truth_values_are_numbers_and_the_rest_is_listed(file):
     assert recordings.states[0][:, 3].tolist() == [0, 0, 1, 1]
 
 
+def test_entries_of_any_demonstration_are_listed(file):
+    with h5py.File(file, "a") as stream:
+        stream["data/demo_10/force"] = np.zeros((5, 6))
+    assert read_robomimic(file).skipped == ("force",)
+
+
 def test_a_mask_that_chooses_nothing_is_told(file):
     with h5py.File(file, "a") as stream:
         stream["mask/success"] = np.array([b"demo_2"])

@@ -38,7 +38,7 @@ _ACTING = re.compile(r"actions?(\d*|[^a-z\d].*)", re.IGNORECASE)
 _UNITS = {
     1.0: "s sec secs seconds",
     1e-3: "ms msec msecs millis milliseconds",
-    1e-6: "us usec usecs micros microseconds",
+    1e-6: "us \u00b5s \u03bcs usec usecs micros microseconds",  # micro sign, Greek mu
 }
 _UNITS |= {1e-9: "ns nsec nsecs nanos nanosec nanosecs nanoseconds", 60.0: "min minutes"}
 UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}

@@ -108,7 +108,8 @@ def _read(
     refuse(file, gathered(faults))
     seen = {name for piece in pieces for name in (*piece.states, *piece.cameras)}
     skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
-    skipped += [name for name in sorted(first) if name not in ("obs", NEXT, "actions", *seen)]
+    held = {name for demo in demos for name in data[demo]}
+    skipped += sorted(held - {"obs", NEXT, "actions", *seen})
     skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - with_next) else []
     skipped += [f"data/{name} (no group)" for name in data if name not in demos]
     said = {"mask": "mask (every demonstration is read)"}
