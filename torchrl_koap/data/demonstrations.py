@@ -68,7 +68,7 @@ def save_demonstrations(
         ...     print(about["task"], about["labelled_steps"], about["steps"])
         arm 39 195
     """
-    folder = Path(folder)
+    folder = Path(folder).expanduser()
     name = description.pop("name", None) or re.sub(r"\W+", "_", folder.resolve().name).strip("_") or "robot"
     notes: dict[str, Any] = {}
     if isinstance(states, Recordings):

@@ -104,7 +104,8 @@ def find_task_of(dataset: str | Path | None, name: str | None = None) -> Task:
 
 def check_new(folder: str | Path) -> None:
     """Raises a FileExistsError if a folder already holds a data set, recordings or a run."""
-    if (Path(folder) / "config.json").exists() or find_format(folder) is not None:
+    folder = Path(folder).expanduser()
+    if (folder / "config.json").exists() or find_format(folder) is not None:
         raise FileExistsError(f"{folder} holds a data set, recordings or a run already; choose another --out")
 
 

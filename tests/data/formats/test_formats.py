@@ -9,6 +9,7 @@ from recording_writers import WRITERS, columns
 
 from torchrl_koap.data import make_recordings, open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.formats import FORMATS, write_recordings
+from torchrl_koap.data.sources import check_new
 from torchrl_koap.files import DataError
 
 STATES, ACTIONS = ("x", "width", "y"), ("force", "turn")
@@ -39,6 +40,16 @@ def test_a_data_set_of_this_library(below, recordings, tmp_path):
     np.testing.assert_allclose(again.actions[2], recordings.actions[2], rtol=1e-6)
     with pytest.raises(ValueError, match="control_hz .*: not an option for a data set of this library"):
         read_recordings(tmp_path / "arm", control_hz=3)
+
+
+def test_a_tilde_is_the_home_folder(recordings, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert save_demonstrations("~/arm", recordings) == tmp_path / "arm"
+    assert write_recordings(recordings, "~/tables", "npz") == tmp_path / "tables"
+    assert read_recordings("~/tables").num_labels == read_recordings("~/arm").num_labels == 9
+    for check in (lambda: check_new("~/arm"), lambda: write_recordings(recordings, "~/tables", "npz")):
+        with pytest.raises(FileExistsError):
+            check()
 
 
 def test_nothing_to_read(tmp_path):

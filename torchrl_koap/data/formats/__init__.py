@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,6 +161,7 @@ def read_recordings(
     asked |= {"action_columns": list(action_columns), "action_dim": action_dim}
     asked |= {"state_columns": list(state_columns), "drop_columns": list(drop_columns)}
     given = {name: value for name, value in asked.items() if value not in (None, [])}
+    source = os.path.expanduser(source)
     name = find_format(source)
     if name is None and not Path(source).exists():
         raise FileNotFoundError(f"{source} does not exist")
@@ -190,7 +192,7 @@ def writer_of(name: str, out: str | Path) -> Callable[[Recordings, Path], None]:
         FileExistsError: if the folder ``out`` exists.
     """
     write = lookup({key: form.write for key, form in FORMATS.items() if form.write is not None}, name, "format")
-    if Path(out).exists():
+    if Path(out).expanduser().exists():
         raise FileExistsError(f"{out} exists already; choose another folder (--out)")
     return write
 
@@ -203,5 +205,6 @@ def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path
         DataError: if the format needs a rate, and none is known.
         RuntimeError: if the format's package is not installed; the message names the extra.
     """
-    writer_of(name, out)(recordings, Path(out))
-    return Path(out)
+    out = Path(out).expanduser()
+    writer_of(name, out)(recordings, out)
+    return out
