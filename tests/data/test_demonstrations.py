@@ -2,6 +2,7 @@
 """Tests a user's own arrays as a data set that holds its whole task."""
 
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -31,6 +32,17 @@ STATES = [RANDOM.normal(size=(30, 4)).cumsum(0) for _ in range(3)]
 ACTIONS = [np.diff(STATES[0][:, :2], axis=0), None, None]
 NAMES = ["q1", "q2", "cup_x", "cup_y"]
 ROBOT = ControllerConfig(columns="robot")
+
+
+def test_labels_and_trajectories_that_are_left_out_are_told(tmp_path):
+    states = [np.random.default_rng(seed).normal(size=(length, 2)) for seed, length in enumerate((60, 3, 60))]
+    partly = np.diff(states[0], axis=0)
+    partly[4:6, 0] = np.nan
+    with pytest.warns(UserWarning, match="left out: actions of which only some columns are known .2 in trajectory 0"):
+        make_demonstrations(states, [partly, None, None], control_hz=30)
+    for make in (make_demonstrations, partial(save_demonstrations, tmp_path / "arm")):
+        with pytest.warns(UserWarning, match="left out: 1 trajectories without two frames at 10 Hz: 1"):
+            make(make_recordings(states, action_dim=1, control_hz=30), resample=10)
 
 
 def test_a_folder_holds_data_and_task(tmp_path):

@@ -137,7 +137,7 @@ def make_demonstrations(
         ValueError: if a kind of action is unknown.
 
     Warns:
-        UserWarning: about unlikely data, as ``koap validate`` does.
+        UserWarning: about unlikely data, as ``koap validate`` does, and trajectories and labels that are left out.
 
     Examples:
         >>> import numpy as np
@@ -161,6 +161,7 @@ def make_demonstrations(
             action_names=action_names,
             control_hz=control_hz,
         )
+        _warn_of(recordings.skipped)
     problems = [
         f"state column {column!r} is a clock, a counter or a flag by its name: leave it out, or rename it"
         for column in recordings.state_names
@@ -257,7 +258,16 @@ def _at_rate(
 ) -> Recordings:
     """Sets the rate of recordings if one is given, then resamples them if another one is wanted."""
     recordings = recordings if control_hz is None else replace(recordings, control_hz=control_hz)
-    return recordings if resample is None else resampled(recordings, resample, action_kind)
+    if resample is None:
+        return recordings
+    found = resampled(recordings, resample, action_kind)
+    _warn_of(found.skipped[len(recordings.skipped) :])
+    return found
+
+
+def _warn_of(left_out: Sequence[str]) -> None:
+    for said in left_out:
+        warnings.warn(f"left out: {said}", stacklevel=3)
 
 
 def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str, tuple[str, ...]]:
