@@ -41,6 +41,19 @@ def test_a_counter_splits_and_sorts():
         read(frame_index=[0, 1, 1, 2, 3, 4])
 
 
+@pytest.mark.parametrize("back", [1.03, 3600])
+def test_a_clock_that_is_set_back_puts_no_rows_out_of_order(back):
+    stamps, way = np.arange(60) / 20, np.random.default_rng(2).normal(size=60)
+    late = {"x": way, "episode": np.zeros(60), "time": stamps - back * (stamps > 1.5)}
+    np.testing.assert_array_equal(read(**late).states[0][:, 0], way)
+    with pytest.raises(DataError, match="time stamps do not increase"):
+        read(control_hz=None, **late)
+    rows = np.random.default_rng(1).permutation(60)  # rows in any order, on a clock of seconds and nanoseconds
+    ros = {"secs": stamps // 1, "nsecs": np.round(stamps % 1 * 1e9)}
+    mixed = read(control_hz=None, **{name: values[rows] for name, values in ({**late} | ros).items() if name != "time"})
+    np.testing.assert_array_equal(mixed.states[0][:, 0], way)
+
+
 def test_all_columns_that_separate_episodes_are_used():
     both = read(session=[0, 0, 0, 0, 1, 1], trial=[0, 0, 1, 1, 0, 0])
     assert [frames[:, 0].tolist() for frames in both.states] == X.reshape(3, 2).tolist()

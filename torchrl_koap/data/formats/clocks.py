@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -36,6 +36,20 @@ class Clock:
     def usual(self) -> float:
         """The median step in seconds."""
         return float(np.median(np.concatenate(self.steps)))
+
+
+def clocks_of(columns: Sequence[Mapping[str, np.ndarray]], sources: Sequence[str]) -> list[Clock]:
+    """Returns time stamps, given in seconds by name for every trajectory, from the first frame of each."""
+    found: dict[str, list[np.ndarray]] = {}
+    for name in columns[0]:
+        times = [clocks[name] for clocks in columns]
+        whole = (other for other, seconds in found.items() if all((part == part.round()).all() for part in seconds))
+        seconds = next(whole, None)
+        if seconds is not None and all(((part >= 0) & (part < 1)).all() for part in times):  # ROS: s and ns apart
+            found[seconds] = [part + rest for part, rest in zip(found[seconds], times, strict=True)]
+        else:
+            found[name] = times
+    return [Clock(name, [part - part[:1] for part in times], sources) for name, times in found.items()]
 
 
 def declared_rate(value: Any) -> float | None:

@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.clocks import NOT_READ, UNEVEN, Clock, find_rate, rises_evenly, told_rate, usual_rate
+from torchrl_koap.data.formats.clocks import NOT_READ, UNEVEN, clocks_of, find_rate, rises_evenly, told_rate, usual_rate
 from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import unknown
+
+SHUFFLED = 0.25  # rows are out of order if their clock goes back in more than this share of them
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def assemble(
     usable = [name for name in names if kind_of(name)[0] is None and name not in even]
     observed = [name for name in state_columns or usable if name not in drop_columns]
     about = dict.fromkeys(even, " (it rises evenly: a clock)")
-    clocks, rate = _clocks(pieces), control_hz
+    clocks, rate = clocks_of([piece.clocks for piece in pieces], [piece.name for piece in pieces]), control_hz
     counting = clocks.pop(0) if clocks and control_hz is None else None
     if counting is not None:
         rate = find_rate(counting, declared_hz, problems) if resample is None else usual_rate(counting, problems)
@@ -155,22 +157,6 @@ def _without(columns: Mapping[str, Any], dropped: Sequence[str]) -> dict[str, An
 
 def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
     return np.stack([columns[name] for name in names], 1).astype(np.float64)
-
-
-def _clocks(pieces: Sequence[Piece]) -> list[Clock]:
-    """Returns the columns of time stamps, in seconds from the first frame of every piece."""
-    found: dict[str, list[np.ndarray]] = {}
-    seconds_of = [piece.clocks for piece in pieces]
-    for name in seconds_of[0]:
-        times = [clocks[name] for clocks in seconds_of]
-        whole = (other for other, seconds in found.items() if all((part == part.round()).all() for part in seconds))
-        seconds = next(whole, None)
-        if seconds is not None and all(((part >= 0) & (part < 1)).all() for part in times):  # ROS: s and ns apart
-            found[seconds] = [part + rest for part, rest in zip(found[seconds], times, strict=True)]
-        else:
-            found[name] = times
-    names = [piece.name for piece in pieces]
-    return [Clock(name, [part - part[:1] for part in times], names) for name, times in found.items()]
 
 
 def _lost_frames(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
@@ -229,9 +215,9 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     of an episode that are out of order are sorted by its counter or clock.
     """
     rows = np.arange(piece.frames)
-    called = {kind_of(name)[0]: name for name in reversed(piece.states)}
-    columns = {kind: piece.states[name] for kind, name in called.items()}
-    frame, clock = columns.get("frame"), columns.get("clock")
+    counter = next((name for name in piece.states if kind_of(name)[0] == "frame"), "")
+    clocks = clocks_of([piece.clocks], [piece.name])
+    frame, clock = piece.states.get(counter), clocks[0].times[0] if clocks else None
     numbers = {name: values for name, values in piece.states.items() if kind_of(name)[0] == "episode"}
     for name, values in numbers.items():
         if np.isnan(values).any():
@@ -248,6 +234,12 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
                 f"{said} returns after another one, and no frame index or time gives the order of its rows"
             )
         order = rows if sorting is None else np.lexsort((sorting, number))
+        if frame is None and clock is not None:  # a few steps back are faults of the clock, not rows out of order
+            kept = np.argsort(number, kind="stable")
+            begins = np.flatnonzero(_changes(number[kept]))[1:]
+            back = sum(int((np.diff(part) < 0).sum()) for part in np.split(clock[kept], begins))
+            even = rises_evenly(np.split(clock[order], begins), room=UNEVEN)
+            order = order if even or back > SHUFFLED * len(rows) else kept
         return order, _changes(number[order]) | _flagged(piece, order)
     if frame is not None and (np.diff(frame) <= 0).any():
         if len(np.unique(frame)) == len(rows):  # one episode, out of order
@@ -255,7 +247,7 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
         starts = np.r_[True, np.diff(frame) < 0]
         if not (frame[starts] == frame[0]).all() or (np.diff(frame) == 0).any():
             raise ValueError(
-                f"column {called['frame']!r} neither continues nor restarts: add a column 'episode' that says which"
+                f"column {counter!r} neither continues nor restarts: add a column 'episode' that says which"
                 " rows belong together"
             )
         return rows, starts
