@@ -35,6 +35,8 @@ def test_a_counter_splits_and_sorts():
     with pytest.raises(DataError, match="episode_id 0 returns"):
         read(episode_id=[0, 0, 1, 1, 0, 0])
     rows = np.random.default_rng(1).permutation(30)
+    few = read(episode=[0] * 6, x=[0, 1, 2, 3, 5, 4], time=np.array([0, 1, 2, 3, 5, 4]) / 20)
+    np.testing.assert_array_equal(few.states[0][:, 0], np.arange(6))
     by_time = read(x=rows, time=rows / 20)
     np.testing.assert_array_equal(by_time.states[0][:, 0], np.arange(30))
     with pytest.raises(DataError, match="neither continues nor restarts"):

@@ -115,13 +115,14 @@ def told_rate(clock: Clock, control_hz: float) -> str:
     return NOT_READ if rate is None else ""
 
 
-def rises_evenly(trajectories: Sequence[np.ndarray], *, room: float = ROUNDED) -> bool:
+def rises_evenly(trajectories: Sequence[np.ndarray], *, room: float = ROUNDED, least: int = _LONG) -> bool:
     """Checks whether a column, given by trajectory ``[T_i]``, rises in every frame as clocks do.
 
     Keyword Args:
         room (float): share of the mean step by which steps may differ. Default: the size of rounding errors.
+        least (int): fewest steps to judge by.
     """
     steps = np.concatenate([np.diff(values.astype(np.float64)) for values in trajectories])
-    if len(steps) < _LONG or steps.min() <= 0:
+    if len(steps) < least or steps.min() <= 0:
         return False
     return bool(np.abs(steps / steps.mean() - 1).max() <= room)

@@ -238,7 +238,7 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
             kept = np.argsort(number, kind="stable")
             begins = np.flatnonzero(_changes(number[kept]))[1:]
             back = sum(int((np.diff(part) < 0).sum()) for part in np.split(clock[kept], begins))
-            even = rises_evenly(np.split(clock[order], begins), room=UNEVEN)
+            even = rises_evenly(np.split(clock[order], begins), room=UNEVEN, least=1)
             order = order if even or back > SHUFFLED * len(rows) else kept
         return order, _changes(number[order]) | _flagged(piece, order)
     if frame is not None and (np.diff(frame) <= 0).any():
