@@ -52,3 +52,9 @@ def test_clocks_rise_evenly(clock):
     assert rises_evenly([clock, clock[:9]])
     assert not rises_evenly([clock, -1.0 * clock]) and not rises_evenly([np.sin(clock)])
     assert not rises_evenly([clock[:9]])
+
+
+@pytest.mark.parametrize("rate", [30, 60, 120])
+def test_a_clock_in_whole_milliseconds_gives_the_rate_of_its_frames(rate):
+    stamps = np.round(1000 * np.arange(121) / rate) / 1000
+    assert find_rate(Clock("time_ms", [stamps], ["a"]), None, []) == pytest.approx(rate, rel=2e-3)

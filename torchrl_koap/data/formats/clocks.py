@@ -16,6 +16,7 @@ UNEVEN = 0.2  # share of the usual step by which a step in time may differ
 SLOWEST, FASTEST = 1.0, 2000.0  # Hz; outside, stamps are assumed to have another unit
 ROUNDED = 0.03  # share of its mean step by which a rounded clock's steps may differ
 NOT_READ = " (its time stamps are ignored)"
+_SAME = 1e-3  # share of a step by which its median and mean differ if the clock is not rounded
 _LONG = 20  # steps that a column must rise evenly to be taken for a clock
 
 
@@ -34,8 +35,11 @@ class Clock:
 
     @property
     def usual(self) -> float:
-        """The median step in seconds."""
-        return float(np.median(np.concatenate(self.steps)))
+        """The median step in seconds; the mean of the steps near it if the clock is rounded, as 33 and 34 ms are."""
+        steps = np.concatenate(self.steps)
+        median = float(np.median(steps))
+        mean = float(steps[np.abs(steps - median) <= UNEVEN * abs(median)].mean())
+        return mean if abs(mean - median) > _SAME * abs(median) else median
 
 
 def clocks_of(columns: Sequence[Mapping[str, np.ndarray]], sources: Sequence[str]) -> list[Clock]:
