@@ -182,3 +182,17 @@ def test_bad_data_are_refused_by_camera_trajectory_and_frame(tmp_path):
     with pytest.raises(DataError, match="its columns are state_0, state_1, state_2"):
         other = save_demonstrations(tmp_path / "other", [np.random.rand(9, 3)], control_hz=10, action_dim=2)
         read_sources([own, other], None)
+
+
+def test_sources_of_other_units_or_kinds_of_actions_are_refused(tmp_path):
+    def stored(name, **described):
+        steps = [np.eye(9)[:8, :2]] if "action_kind" in described else None
+        how = {"control_hz": 10, "action_dim": 2} | described
+        return save_demonstrations(tmp_path / name, [np.random.default_rng(0).normal(size=(9, 2))], steps, **how)
+
+    first = stored("first", state_units="rad", action_kind="delta")
+    assert len(read_sources([first, stored("bare"), stored("same", state_units="rad")], None)[0].states) == 3
+    with pytest.raises(DataError, match="the unit of column 'state_0' is 'deg', before 'rad'"):
+        read_sources([first, stored("turned", state_units="deg")], None)
+    with pytest.raises(DataError, match="the kind of action 'action_0' is 'raw', before 'delta'"):
+        read_sources([first, stored("kind", action_kind="raw")], None)

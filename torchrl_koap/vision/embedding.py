@@ -21,7 +21,7 @@ from torchrl_koap.data import flatten_trajectories, read_recordings, save_ted
 from torchrl_koap.data.formats import Recordings
 from torchrl_koap.data.formats.clocks import UNEVEN
 from torchrl_koap.data.ted import CAMERAS, stored_folder, stored_task
-from torchrl_koap.files import DataError, option, replacing_file, some
+from torchrl_koap.files import DataError, option, refuse, replacing_file, some
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task
 from torchrl_koap.vision.backbones import load_backbone
@@ -51,17 +51,35 @@ class CameraReport:
 def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Recordings, Task]:
     """Reads data sets with camera frames as one: outputs of ``koap convert``, or any recordings if a task is given.
 
-    The task has columns for the embeddings; by default it is that of the first source. Raises a DataError if columns or
-    rates of the sources differ, or without task if a source is not converted.
+    The task has columns for the embeddings; by default it is that of the first source. Raises a DataError if columns,
+    units or rates of the sources differ, or without task if a source is not converted.
     """
-    found = []
+    found: list[Recordings] = []
+    units: dict[str, str] = {}
     for source in sources:
         stored = stored_folder(source)
         if stored is None and task is None and Path(source).exists():
             raise DataError(source, "its columns are not described: `koap convert` it, or name its --task")
         width = None if stored is not None or task is None else task.action_dim
         found.append(read_recordings(source, action_dim=width))
+        own = {} if stored is None else _units(stored_task(stored), labelled=found[-1].num_labels > 0)
+        other = [
+            f"{what} is {unit!r}, before {units[what]!r}" for what, unit in own.items() if units.get(what, unit) != unit
+        ]
+        refuse(source, other)
+        units |= own
     return join_recordings(found), task or stored_task(stored_folder(sources[0]) or sources[0])
+
+
+def _units(task: Task, *, labelled: bool) -> dict[str, str]:
+    """Returns the units that are given, and the kinds of actions; nothing about actions without labels."""
+    units = {
+        f"the unit of column {name!r}": unit
+        for name, unit in zip(task.observation_names, task.known_units, strict=True)
+    }
+    for name, action in task.actions.items() if labelled else ():
+        units |= {f"the unit of action {name!r}": action.unit, f"the kind of action {name!r}": action.kind}
+    return {what: unit for what, unit in units.items() if unit}
 
 
 def join_recordings(parts: Sequence[Recordings]) -> Recordings:
