@@ -10,6 +10,7 @@ from torch import nn
 
 from torchrl_koap import PlannerConfig, TrainConfig, Trained, fit, make_demonstrations, save_demonstrations, train
 from torchrl_koap.data import LabelBudget, open_dataset
+from torchrl_koap.modules import StatePlanner, TemporalUnet
 from torchrl_koap.modules.planning.denoisers import EMBEDDING_DIM, ConditionEncoder, Denoiser
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import defaults, networks, register_network
@@ -34,6 +35,11 @@ def test_every_network_plans(network, frames, task):
     assert planner.sample(torch.zeros(3, frames, task.state_dim)).shape == (3, 14, task.state_dim)
     assert (planner.relative, planner.history) == (task.defaults.relative, frames)
     assert sizes_of(planner) == {"network": network, "width": 16, "octaves": 2, "frames": frames}
+
+
+def test_a_network_of_one_level_has_a_width():
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(16,)), state_dim=2)
+    assert sizes_of(planner) == {"network": "unet", "width": 16, "octaves": 4, "frames": 2}
 
 
 class Transformer(Denoiser):

@@ -13,6 +13,7 @@ from tiny_runs import TINY, koap
 
 from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, load_policy
 from torchrl_koap.commands.doctor import check_run
+from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.runs.plugins import PluginError
 from torchrl_koap.runs.run_directory import RunDirectoryError, copy_run
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
@@ -154,6 +155,25 @@ def test_what_cannot_be_saved_or_executed(own, tmp_path):
             with pytest.raises(ValueError, match=f"a policy needs planner and controller: no {part} was trained here"):
                 make()
     assert not list(tmp_path.iterdir()), "a file that could not be loaded"
+
+
+@pytest.mark.parametrize(
+    ("options", "layers", "said"),
+    [
+        ({"relative": False}, {}, "relative False"),
+        ({"solver": "ddim", "num_steps": 4}, {}, "solver 'ddim', num_steps 4"),
+        ({}, {"depth": 2}, "other layers"),
+    ],
+)
+def test_a_given_planner_is_saved_only_if_a_file_can_restore_it(own, tmp_path, options, layers, said):
+    frames, width = own.config.planner.frames, own.task.state_dim
+    denoiser = MLPDenoiser(width, frames * width, horizon=14, width=8, **layers)
+    planner = StatePlanner(denoiser, state_dim=width, history=frames, **options)
+    section = replace(own.config.planner, network="mlp", width=8, octaves=1)
+    given = replace(own, planner=planner, config=replace(own.config, planner=section))
+    with pytest.raises(ValueError, match=f"planner: it has {said}, which a file does not record"):
+        given.save(tmp_path / "policy.safetensors")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_does_not_say_which_labels_were_seen(trained_run, demonstrations, tmp_path):

@@ -143,7 +143,7 @@ def sizes_of(planner: StatePlanner) -> dict[str, Any]:
     """Returns the options that a planner was built with; a ValueError if its network is not of this library."""
     network = planner.denoiser
     if isinstance(network, TemporalUnet):
-        name, width, encoder = "unet", network.shrink[0].out_channels, network.encoder
+        name, width, encoder = "unet", network.down[0][0].width, network.encoder
     elif isinstance(network, MLPDenoiser):
         name, width, encoder = "mlp", network.first.out_features, network.encoder
     elif isinstance(network, ObjectDenoiser):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torch import nn
 
@@ -146,9 +147,11 @@ class Trained:
 
         Raises:
             IsADirectoryError: if the path is a folder.
-            ValueError: if only a planner or a controller was trained.
+            ValueError: if only a planner or a controller was trained, or for a planner given to
+                :func:`~torchrl_koap.fit` with options that a file does not record, such as its solver.
         """
         self._check_parts()
+        self._check_planner()
         path = Path(path)
         if path.is_dir():
             raise IsADirectoryError(f"{path} is a folder; a policy is one file, such as {path / 'policy.safetensors'}")
@@ -224,6 +227,19 @@ class Trained:
         missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
         if self.method.plans and missing:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
+
+    def _check_planner(self) -> None:
+        """Raises a ValueError if :meth:`load` would build another planner than this one, which was given to ``fit``."""
+        if self.planner is None:
+            return
+        with torch.random.fork_rng(devices=[]):
+            both = self.planner, build_planner(self.task, self.config.planner)
+        names = ("horizon", "relative", "solver", "num_steps")
+        own, built = ({name: vars(each)[name] for name in names} for each in both)
+        shapes, wanted = ({key: value.shape for key, value in each.state_dict().items()} for each in both)
+        if own != built or shapes != wanted:
+            differ = [f"{name} {own[name]!r}" for name in names if own[name] != built[name]] or ["other layers"]
+            raise ValueError(f"planner: it has {', '.join(differ)}, which a file does not record: it cannot be saved")
 
     def data(self, dataset: str | None = None) -> TensorDictBase:
         """Reads the demonstrations of the training with all labels; ``dataset`` is their folder if it has moved.
