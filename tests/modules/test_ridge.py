@@ -163,6 +163,7 @@ def test_targets_that_are_not_alike_have_a_penalty_each():
         ({"inputs": torch.full((40, 6), torch.nan)}, "a labelled input is not finite"),
         ({"targets": torch.zeros(39, 2)}, r"targets \[n, act\]"),
         ({"groups": torch.zeros(39, dtype=torch.int64)}, r"groups must be \[40\], got \[39\]"),
+        ({"prior": torch.zeros(2, 5)}, r"prior must be \[2, 6\] \[act, m\], got \[2, 5\]"),
         ({"penalties": (1.0, 0.0)}, "penalties must be positive and finite"),
         ({"penalties": ()}, "penalties must be positive and finite"),
         ({"default_penalty": -1.0}, "penalties must be positive and finite"),

@@ -108,6 +108,8 @@ def ridge(
         raise ValueError(f"inputs must be [n, m] and targets [n, act], got {list(inputs.shape)}, {list(targets.shape)}")
     if groups is not None and groups.shape != inputs.shape[:1]:
         raise ValueError(f"groups must be [{len(inputs)}], got {list(groups.shape)}")
+    if prior is not None and prior.shape != (targets.shape[-1], inputs.shape[-1]):
+        raise ValueError(f"prior must be {[targets.shape[-1], inputs.shape[-1]]} [act, m], got {list(prior.shape)}")
     candidates = tuple(penalties) if default_penalty is None else (*penalties, default_penalty)
     if not candidates or not all(0 < penalty < float("inf") for penalty in candidates):
         raise ValueError(f"penalties must be positive and finite, got {candidates}")
