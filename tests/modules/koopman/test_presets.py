@@ -59,6 +59,7 @@ def test_options_override_the_preset_and_reach_the_parts():
         ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, delayed, absolute, semi_supervised, scene, paper"),
         ({"preset": None}, "unknown preset None"),
         ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
+        ({"normalization": {"state": "minmax"}}, "option .* preset 'default': 'normalization'"),
         ({"preset": "paper", "kernels": {}}, "option .* preset 'paper': 'kernels'"),
     ],
 )

@@ -102,7 +102,7 @@ def make_koopman_inverse_dynamics(
 
     Keyword Args:
         preset (str): a name in :data:`PRESETS`.
-        **overrides: any entry of ``PRESETS[preset]`` except ``network``.
+        **overrides: any entry of ``PRESETS[preset]`` except ``network`` and ``normalization``.
 
     Returns:
         KoopmanInverseDynamics: with random weights, drawn from torch's global generator.
@@ -117,7 +117,7 @@ def make_koopman_inverse_dynamics(
         ((8,), 64)
     """
     choice = {**lookup(PRESETS, preset, "preset")}
-    network = choice.pop("network")
+    network, _ = choice.pop("network"), choice.pop("normalization")  # the normalisers are given
     for name in overrides:
         lookup(choice, name, f"option of the inverse dynamics of preset {preset!r}:")
     choice.update(overrides)
