@@ -141,8 +141,18 @@ def test_what_is_no_method_is_refused():
         register_method(Method("mine", "another", build))
     with pytest.raises(ValueError, match="unknown kind of windows 'labeled'; did you mean 'labelled'"):
         Method("other", "", build, sees="labeled")
-    with pytest.raises(ValueError, match="the name of a method must be letters, digits"):
-        Method("a/b", "", build)
+    for name in ("a/b", "..", ""):
+        with pytest.raises(ValueError, match="the name of a method must be letters, digits"):
+            Method(name, "", build)
+    wrong = {
+        "unknown preset 'papr'; did you mean 'paper'": {"presets": ("default", "papr")},
+        "unknown controller.columns 'robots'; did you mean 'robot'": {"columns": "robots"},
+        "controller.steps must be >= 0, got -1": {"updates": -1},
+        "unknown option of an execution 'gian'; did you mean 'gain'": {"execution": {"gian": 1.0}},
+    }
+    for message, defaults in wrong.items():
+        with pytest.raises(ValueError, match=message):
+            Method("other", "", build, **defaults)
     for names in (("x", "x"), ("planner",)):
         with pytest.raises(ValueError, match="phases of method 'other' must have different names, not 'planner', got"):
             Method("other", "", build, tuple(Phase(name, loss) for name in names))

@@ -12,7 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
+from torchrl_koap.modules import PRESETS, Execution, ExecutionConfig
+from torchrl_koap.runs.config import ControllerConfig
 
 
 class Batch(NamedTuple):
@@ -91,7 +92,8 @@ class Method:
         plans (bool): it follows the plans of a planner; otherwise it is trained with the planner's number of updates.
         teacher (str): the method whose controller labels the unlabelled data first.
         presets (tuple of str): values of ``--preset`` that it can be built with; the first is its default.
-        columns (str, optional): what its controller reads, ``"robot"`` or ``"all"``. Default: the task's.
+        columns (str, optional): what its controller reads (:class:`~torchrl_koap.ControllerConfig`). Default: the
+            task's.
         updates (int, optional): updates of its controller. Default: the task's.
         look_ahead (int, optional): planned frames that its controller reads ahead. Default: those of the preset.
         execution (mapping): fields of :class:`~torchrl_koap.modules.Execution` that it sets.
@@ -131,8 +133,8 @@ class Method:
 
     def __post_init__(self):
         lookup(SEES, self.sees, "kind of windows")
-        if not re.fullmatch(r"[A-Za-z0-9_.]+", self.name):
-            raise ValueError(f"the name of a method must be letters, digits, '_' and '.', got {self.name!r}")
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.]*", self.name):
+            raise ValueError(f"the name of a method must be letters, digits, '_' and later '.', got {self.name!r}")
         names = [phase.name for phase in self.phases]
         if len({"planner", *names}) <= len(names):  # logs and checkpoints have these names
             raise ValueError(f"phases of method {self.name!r} must have different names, not 'planner', got {names}")
@@ -140,6 +142,9 @@ class Method:
             raise ValueError(f"method {self.name!r} does not plan: it must have one phase, got {len(names)}")
         if self.fit is not None and (names or self.closed_form):
             raise ValueError(f"method {self.name!r}: fit excludes phases and closed_form")
+        for preset in self.presets:
+            lookup(PRESETS, preset, "preset")
+        ControllerConfig(steps=self.updates, columns=self.columns)
         Execution().replaced(**self.execution)
 
     def phases_of(self, preset: str) -> tuple[Phase, ...]:
