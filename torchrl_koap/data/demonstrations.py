@@ -52,7 +52,7 @@ def save_demonstrations(
 
     Raises:
         DataError: listing all faults of the arrays and of their description.
-        FileExistsError: if the folder holds something other than a data set.
+        FileExistsError: if ``ted`` in the folder is something other than a data set. Other files there are kept.
 
     Examples:
         >>> import tempfile
@@ -134,7 +134,7 @@ def make_demonstrations(
         DataError: listing all faults: those of :func:`~torchrl_koap.data.make_recordings`; missing or overlapping
             columns; wrong numbers of targets or units; a robot that never moves; a column that no float can hold; a
             command, or an action without a target, whose movement float32 cannot resolve.
-        ValueError: if a kind of action is unknown.
+        ValueError: if a kind of action is unknown, or recordings come with ``actions``.
 
     Warns:
         UserWarning: about unlikely data, as ``koap validate`` does, and trajectories and labels that are left out.

@@ -62,6 +62,7 @@ class ManipulationEnv(EnvBase):
     Raises:
         ValueError: for sizes below 1 or a non-floating dtype; in ``reset`` for contexts of a wrong shape or out of
             range, in ``step`` for actions of a wrong shape or that are not finite.
+        RuntimeError: in ``step`` before the first reset.
 
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv  # a task of this base

@@ -32,7 +32,7 @@ class RidgeFit:
         penalty (float): the best penalty for all targets, in units of the mean square norm of the inputs.
         errors (dict): root mean squared held-out error of every candidate penalty, in the units of the targets.
         error (float): that of the chosen penalty, or of the penalties chosen for each target; infinite for a single
-            row, since no other row is left to fit the mean.
+            row with a bias, since no other row is left to fit the mean.
         num_labels (int): number of rows used.
     """
 
@@ -82,7 +82,7 @@ def ridge(
         targets (Tensor): ``[n, act]``.
 
     Keyword Args:
-        groups (Tensor, optional): group of every row, int64 ``[n]``.
+        groups (Tensor, optional): group of every row, int64 ``[n]``. Rows of a single group are left out one by one.
         penalties (sequence of float): candidates, in units of the mean square norm of the inputs.
         default_penalty (float, optional): used without any choice if there are fewer than three groups.
         input_noise (float): :math:`s^2`, in units of the mean square norm of the inputs. Defaults to 0.

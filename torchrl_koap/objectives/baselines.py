@@ -81,7 +81,8 @@ class QuantizedDynamicsLoss(WindowLoss):
     .. math::
         L = \overline{|h_\psi(x_{t-n}, \dots, x_t, u_t) - (x_{t+1} - x_t)|^2}
 
-    It reads no labels; :class:`~torchrl_koap.objectives.ActionLoss` trains the action decoder afterwards. Args as for
+    with steps divided by their spread, and the mean square over the columns. It reads no labels;
+    :class:`~torchrl_koap.objectives.ActionLoss` trains the action decoder afterwards. Args as for
     :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Examples:

@@ -7,8 +7,9 @@ r"""Losses of the Koopman inverse dynamics model.
     L_{kpm} = \overline{|K g(x_t) + u_t - g(x_{t+1})|^2}, \quad
     L_a = \overline{|D u_t + b - a_t|^2}
 
-All residuals are in normalised units. ``L_a`` averages over the labelled frames only. A batch without labels gives
-exactly 0; unlabelled (NaN) actions affect neither value nor gradient.
+All residuals are in normalised units; ``|.|^2`` is the mean square over their columns. ``L_a`` averages over the
+labelled frames only. A batch without labels gives exactly 0; unlabelled (NaN) actions affect neither value nor
+gradient.
 """
 
 from __future__ import annotations

@@ -86,6 +86,7 @@ def fit(
         ValueError: for an unknown method or option, data without labels or that do not fit the task, or trajectories
             shorter than a window.
         DataError: if the data do not follow the storage layout.
+        TypeError: if the data are no TensorDict.
 
     Examples:
         >>> import numpy as np

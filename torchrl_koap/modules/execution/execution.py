@@ -79,7 +79,7 @@ class ExecutionConfig:
             the simulator, which follow plans closely within the arm's reach; remaining failures are mostly the
             planner's).
         replan_interval: control steps per plan (default with feedback: the steps in 0.1 s, at least 4 and at most 10,
-            or 7 if actions are targets).
+            or 7 if the controller looks 8 steps ahead).
         blend: share of the distance between robot and plan that remains after each step; 0: plans are not shifted.
         lead: largest distance of the command from the robot along each axis, in the units of the actions; 0: no limit.
         gain: factor of actions that are changes of a command; above 1 the robot moves faster than planned.

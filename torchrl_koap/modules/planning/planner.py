@@ -64,8 +64,8 @@ class StatePlanner(ConditionalSampler):
     def fit_normalizers(self, windows: Tensor) -> None:
         """Computes the statistics of condition and plan from data, in place.
 
-        Call it before building ``SoftUpdate``: otherwise averaged weights only move towards the statistics. A loss may
-        be built earlier. Raw states are windows ``[*N, history + horizon, d]``, padded as in training; otherwise padded
+        Call it before building ``SoftUpdate``, which copies statistics to the averaged weights only then. A loss may be
+        built earlier. Raw states are windows ``[*N, history + horizon, d]``, padded as in training; otherwise padded
         plans in training, which stand still, are far outside the range of the network.
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
