@@ -62,6 +62,19 @@ def test_the_weights_of_a_training_bit_for_bit(tmp_path):
     assert loaded.hide_labels(loaded.data())[1].seed == 3
 
 
+def test_commands_are_hidden_where_their_changes_are_as_on_disk(tmp_path):
+    states, actions = [], []
+    for frames, steps in zip(*record(), strict=True):
+        states.append(np.hstack([frames, np.vstack([frames[:1, :2], frames[:1, :2] + steps[:-1].cumsum(0)])]))
+        actions.append(np.vstack([steps[:15], np.full((10, 2), np.nan), steps[25:]]))
+    roles = {"state_names": [*NAMES, "c1", "c2"], "robot": NAMES[:2], "command": ["c1", "c2"]}
+    given, few = {"states": states, "actions": actions, "control_hz": 30} | roles, {"steps": 1, **SMALL}
+    folder = save_demonstrations(tmp_path / "arm", **given)
+    train(TrainConfig(dataset=str(folder), out=tmp_path / "run", method="mpc", planner=PlannerConfig(**few)))
+    trained = fit(*make_demonstrations(name="arm", **given), method="mpc", planner=few, progress=False)
+    assert same_weights(trained.controller, load_tensors(tmp_path / "run" / "controller.safetensors")[0])
+
+
 def test_short_windows_hold_their_label_on_the_frame_that_counts(monkeypatch):
     batches = []
     monkeypatch.setattr(KOAPLoss, "forward", observed(KOAPLoss.forward, batches))
@@ -241,7 +254,7 @@ def test_refusals():
     with pytest.raises(ValueError, match="unknown method 'kaop'; did you mean 'koap'"):
         fit(data, task, method="kaop")
     unlabelled, _ = make_demonstrations(**few_labels(0, actions=None, action_dim=2))
-    with pytest.raises(ValueError, match="none of the 234 steps has an action: there are no labels to learn from"):
+    with pytest.raises(ValueError, match="none of the 234 steps has an action: there are no labels to select"):
         fit(unlabelled, task)
     with pytest.raises(ValueError, match="'state' has 3 columns, task 'robot' has 4"):
         fit(select_state(data, (0, 1, 2)), task)

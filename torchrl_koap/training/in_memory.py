@@ -26,7 +26,7 @@ from torchrl_koap.runs.device import set_up_torch, torch_as_before
 from torchrl_koap.runs.progress import without_progress_bars
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training.controller import check_lengths, learn_controller
-from torchrl_koap.training.datasets import choose_held_out, split_held_out
+from torchrl_koap.training.datasets import choose_held_out, split_held_out, within_budget
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.methods import get_method
@@ -62,7 +62,8 @@ def fit(
         data (TensorDictBase): flat data ``[N]`` (:func:`~torchrl_koap.data.make_demonstrations`, or a data set of D3IL
             or LeRobot). Without ``state``, the columns that the task names are taken from ``observation``.
             ``has_action`` marks the actions that may be seen; without it, those that are not NaN. A
-            :class:`~torchrl_koap.data.LabelBudget` hides labels.
+            :class:`~torchrl_koap.data.LabelBudget` hides labels. As in ``koap train``, commands of trajectories with a
+            hidden action are hidden.
         task (Task, optional): the task, as ``make_demonstrations`` returns it. Default: all columns of ``state`` (or
             ``observation``, if there is no state) are the robot's.
 
@@ -131,9 +132,8 @@ def fit(
         task,
     )
     seed = config.run.seed
+    data, _ = within_budget(task, config, data)  # keeps all labels; hides commands whose changes are not labels
     held_out = choose_held_out(data, config.planner.held_out, seed=seed)
-    if not data[keys.HAS_ACTION].any():
-        raise ValueError(f"none of the {len(data)} steps has an action: there are no labels to learn from")
     check_lengths(task, config, data)
     seen, unseen, data = split_held_out(data.to(device), held_out)
     results = dict[str, Any]()
