@@ -11,7 +11,7 @@ import torch
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, Trained, fit, train
 from torchrl_koap.data import LabelBudget, make_demonstrations, open_dataset, save_demonstrations
-from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import loop, on_disk
@@ -220,6 +220,21 @@ def test_a_planner_for_a_curve_knows_the_labelled_trajectories_and_holds_few_out
     known, unseen, _ = (part["episode"].unique().tolist() for part in seen[0])
     assert len(known) == 6 and {37, 38, 39} < set(known) and not seen[0][0]["has_action"].any()
     assert len(unseen) == 2 and tuple(unseen) == found.held_out
+
+
+def test_a_planner_alone_is_no_policy_and_resumes_as_a_planner(demonstrations, tmp_path):
+    out = tmp_path / "run"
+    config = TrainConfig(out=out, dataset=str(demonstrations), planner=PLANNER)
+    weights = train(config, planner_only=True).planner.state_dict()
+    with pytest.raises(
+        RunDirectoryError, match=r"run holds a planner for other runs \(planner.source\), not a policy$"
+    ):
+        Trained.load(out)
+    again = TrainConfig(out=out, run=RunConfig(resume=True))
+    with pytest.raises(RunDirectoryError, match=r"run holds a planner for other runs .*; choose another --out"):
+        train(again)
+    resumed = train(again, planner_only=True).planner.state_dict()
+    assert all(torch.equal(value, resumed[name]) for name, value in weights.items())
 
 
 def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):

@@ -20,7 +20,7 @@ from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 Config = TypeVar("Config")
 # entries of config.json that are not options
-FACTS = ("task_definition", "data", "held_out_episodes", "held_out_states", "versions", "command")
+FACTS = ("task_definition", "data", "held_out_episodes", "held_out_states", "planner_only", "versions", "command")
 _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
 
 

@@ -62,6 +62,10 @@ def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
     if not (run.path / "config.json").exists():
         return
     earlier = run.read_json("config.json")
+    if earlier.get("planner_only") and not content.get("planner_only"):
+        raise RunDirectoryError(
+            f"{run.path} holds a planner for other runs (planner.source), not a policy; choose another --out"
+        )
     before, now = earlier.get("data"), content["data"]
     if before != now:
         steps = (before or {}).get("steps")

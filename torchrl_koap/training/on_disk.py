@@ -98,6 +98,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         _check_networks(task, config)
         used, held_out, report = _read_data(task, config, planner_only)
         content = to_json(config) | {"data": fingerprint(used), "versions": versions()}
+        if planner_only:
+            content["planner_only"] = True
         if (definition := task.definition()) is not None:
             content["task_definition"] = definition
         check_data(run, content)

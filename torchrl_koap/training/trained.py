@@ -104,6 +104,8 @@ class Trained:
         except (KeyError, TypeError, ValueError) as error:
             problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error
             raise RunDirectoryError(f"{path / 'config.json'} cannot be used: {problem}") from error
+        if content.get("planner_only"):
+            raise RunDirectoryError(f"{path} holds a planner for other runs (planner.source), not a policy")
         if not (path / "summary.json").exists():  # it is written last
             how = f"`koap train --out {shlex.quote(str(path))} --resume`"
             raise RunDirectoryError(f"the training of {path} is not finished (no summary.json): resume it with {how}")
