@@ -100,6 +100,7 @@ def full_disk(*arguments, **options):
 
 @pytest.mark.parametrize("place", ["weights", "rename"])
 def test_a_full_disk_damages_no_earlier_result_of_a_training(place, copied_run, monkeypatch, capsys):
+    (copied_run / "summary.json").unlink()  # it is not finished
     before = contents(copied_run)
     monkeypatch.setattr(*((weights, "save_file") if place == "weights" else (os, "replace")), full_disk)
     assert koap("train", "--out", copied_run, "--resume") == 1

@@ -115,6 +115,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             command, content["versions"] = begun.get("command") or command, begun.get("versions") or versions()
         # only after the data were checked, so that a failed call leaves no files
         run.write_json("config.json", content | ({"command": command} if command else {}))
+        if all((run.path / name).exists() for name in ("controller.safetensors", "summary.json")):  # it is finished
+            return Trained.load(run.path)
         covers, short = plan_coverage(used, task.control_hz)
         if short is not None:
             warnings.warn(short, stacklevel=2)
