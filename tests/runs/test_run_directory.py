@@ -33,6 +33,8 @@ def test_rows_are_read_back(run):
     assert run.last_metrics("planner") == {"loss_planner": 0.15, "updates": 150}
     assert run.last_metrics("controller") == {"loss_action": 0.1, "updates": 100}
     assert run.last_metrics("other") == {}
+    run.log("controller", 150, {"kept_update": 100, "loss_action": 2.0})
+    assert [type(value) for value in run.last_metrics("controller").values()] == [float, int, int]
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,11 @@ class RunDirectory:
         rows = [row for row in self.read_metrics() if row["phase"] == phase]
         if not rows:
             return {}
-        values = {key: float(value) for key, value in rows[-1].items() if value and key not in ("phase", "step")}
+        values: dict[str, float] = {
+            key: int(value) if value.isdecimal() else float(value)
+            for key, value in rows[-1].items()
+            if value and key not in ("phase", "step")
+        }
         return values | {"updates": int(rows[-1]["step"])}
 
     def seconds(self) -> dict[str, float]:
