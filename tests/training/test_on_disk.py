@@ -4,6 +4,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -235,6 +236,19 @@ def test_a_planner_alone_is_no_policy_and_resumes_as_a_planner(demonstrations, t
         train(again)
     resumed = train(again, planner_only=True).planner.state_dict()
     assert all(torch.equal(value, resumed[name]) for name, value in weights.items())
+
+
+def test_a_run_that_took_over_its_planner_resumes_without_the_source(demonstrations, tmp_path, monkeypatch):
+    config = TrainConfig(out=tmp_path / "source", dataset=str(demonstrations), method="linear", **TINY)
+    held_out = train(replace(config, planner=replace(PLANNER, held_out=0.25))).held_out
+    config = replace(config, out=tmp_path / "run", planner=PlannerConfig(source=tmp_path / "source"))
+    with monkeypatch.context() as patch:
+        patch.setattr(on_disk, "learn_controller", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train(config)
+    (tmp_path / "source").rename(tmp_path / "elsewhere")
+    assert train(TrainConfig(out=tmp_path / "run", run=RunConfig(resume=True))).held_out == held_out
+    assert len(held_out) == 2
 
 
 def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):

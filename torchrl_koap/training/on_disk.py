@@ -207,6 +207,9 @@ def _read_data(
     # independent of the seed: runs differ only in the trajectories with labels, which come first
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:
+        run = RunDirectory(config.out)
+        if (run.path / "config.json").exists():  # resumed: the source may be gone
+            return labelled, run.read_json("config.json").get("held_out_episodes", []), report
         return labelled, held_out_by(planner.source, labelled), report
     return labelled, choose_held_out(labelled, planner.held_out, seed=seed), report
 
