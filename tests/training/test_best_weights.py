@@ -1,6 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests that weights with the best held-out score are kept, and that training then ends."""
 
+from types import SimpleNamespace
 from unittest import mock
 
 import pytest
@@ -12,7 +13,7 @@ from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.training import loop
+from torchrl_koap.training import best_weights, loop
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import train_phase
 
@@ -89,12 +90,15 @@ def test_a_missing_score_replaces_no_score(tmp_path):
 @pytest.mark.parametrize("stop", [16, 33, 61])
 def test_a_resumed_training_keeps_the_same_weights_bit_for_bit(tmp_path, stop):
     def score(network):  # of the weights alone
+        clock.now += 1
         return (network.denoiser.last.weight.abs().mean() - 0.12).abs().item()
 
-    _, whole, _ = training(tmp_path / "whole", score)
-    with pytest.raises(KeyboardInterrupt):
-        training(tmp_path / "cut", score, stop=stop)
-    _, cut, _ = training(tmp_path / "cut", score, resume=True)
+    clock = SimpleNamespace(now=0.0)
+    with mock.patch.object(best_weights, "perf_counter", lambda: clock.now):  # every score takes a second
+        _, whole, _ = training(tmp_path / "whole", score)
+        with pytest.raises(KeyboardInterrupt):
+            training(tmp_path / "cut", score, stop=stop)
+        _, cut, _ = training(tmp_path / "cut", score, resume=True)
     assert cut.state_dict().keys() == whole.state_dict().keys()
     assert all(torch.equal(value, cut.state_dict()[name]) for name, value in whole.state_dict().items())
     last = [RunDirectory(tmp_path / name).last_metrics("planner") for name in ("whole", "cut")]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from time import perf_counter
 
 import torch
 from torch import nn
@@ -28,6 +29,7 @@ class BestWeights(nn.Module):
 
     best: torch.Tensor
     step: torch.Tensor
+    seconds: torch.Tensor
 
     def __init__(self, loss: LossModule, score: Callable[[nn.Module], float], every: int):
         super().__init__()
@@ -37,16 +39,18 @@ class BestWeights(nn.Module):
         self.every = every
         self.register_buffer("best", torch.tensor(math.inf, dtype=torch.float64))
         self.register_buffer("step", torch.tensor(0))
+        self.register_buffer("seconds", torch.tensor(0.0, dtype=torch.float64))  # spent on scores, in resumed runs too
 
     def check(self, step: int) -> dict[str, float]:
         """Scores the averaged weights after ``step`` updates, keeps good ones; returns the score and :meth:`kept`."""
-        (loss,), (now,) = self._loss, self._now
+        began, (loss,), (now,) = perf_counter(), self._loss, self._now
         now.load_state_dict(loss.target_network_params.flatten_keys(".").to_dict())
         score = self._score(now)
         if score < ROOM * self.best or not self.best.isfinite():  # the score is not finite if nothing moves
             self.network.load_state_dict(now.state_dict())
             self.best.fill_(min(score, self.best.item()))
             self.step.fill_(step)
+        self.seconds += perf_counter() - began
         return {"held_out_score": score} | self.kept()
 
     def kept(self) -> dict[str, float]:

@@ -90,6 +90,7 @@ def learn_planner(
     loss.target_network_params.to_module(planner)
     if best is not None:
         planner.load_state_dict(best.network.state_dict())
+        values["held_out_seconds"] = best.seconds.item()
     return planner, values
 
 
