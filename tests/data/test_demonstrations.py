@@ -166,19 +166,6 @@ def test_faults_of_the_description(options, message):
         make_demonstrations(STATES, ACTIONS, **{"control_hz": 20, "state_names": NAMES} | options)
 
 
-def test_an_action_that_never_changes_is_commanded_as_it_is():
-    still = [np.column_stack([ACTIONS[0], np.full(29, 0.5)]), None, None]
-    _, task = make_demonstrations(STATES, still, control_hz=20)
-    assert task.actions["action_2"] == Action(constant=0.5)
-    decoded = torch.ones(1, 3, 3)
-    assert task.action_rule(torch.zeros(1, 3, 4), decoded)[0].tolist() == [[1, 1, 0.5]] * 3 and decoded.min() == 1
-    assert Task.from_json(task.to_json()) == task
-    data, raw = make_demonstrations(STATES, still, control_hz=20, action_kind="raw")
-    assert [ends is None for ends in command_ranges(raw, data)] == [False, False, True]
-    absolute = make_demonstrations(STATES, still, control_hz=20, action_kind="absolute", targets=[0, 1, 2])[1]
-    assert absolute.action_rule(torch.full((1, 3, 4), 2.0), decoded)[0].tolist() == [[3, 3, 0.5]] * 3
-
-
 def test_what_never_changes_within_a_recording_is_not_the_robot():
     with_goal = [np.insert(frames[:, :2], 2, goal, axis=1) for goal, frames in enumerate(STATES)]
     assert make_demonstrations(with_goal, ACTIONS, control_hz=20)[1].robot == (0, 1)

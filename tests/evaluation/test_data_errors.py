@@ -166,10 +166,10 @@ def test_an_action_that_never_changes_is_commanded_right_whatever_is_decoded():
     task = Task(
         name="arm",
         observation_parts={"robot": 4},
-        actions={"step": Action("m"), "grip": Action("N", constant=7.0)},
+        actions={"step": Action("m"), "grip": Action("N")},
         position="robot",
     )
-    found, drawn = errors_outside_budget(Copy(1, shift=1), data, labelled, task)
+    found, drawn = errors_outside_budget(Copy(1, shift=1), data, labelled, task, repeated=[1])
     assert [row["controller"] for row in found["column"]] == [1.0, 0.0]
     assert (drawn["predicted"][:, 1] == 7.0).all()
 

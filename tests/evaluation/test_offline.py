@@ -13,6 +13,7 @@ from offline_runs import record, save_arm, train_arm
 
 from torchrl_koap import PlannerConfig
 from torchrl_koap.commands.cli import main
+from torchrl_koap.data import save_demonstrations
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
 from torchrl_koap.evaluation.data_errors import summarise_errors
 from torchrl_koap.evaluation.findings import offline_faults
@@ -54,6 +55,16 @@ def test_a_run_of_seven_joints(run):
     assert result["control_hz"] > 0 and not (run / "rollouts.safetensors").exists()
     # 20 updates make no planner, and it is said
     assert any(fault.startswith("plans are worse than standing still (columns in rad)") for fault in result["faults"])
+
+
+def test_a_command_that_all_labels_repeat_has_no_error(tmp_path):
+    states, steps = record(12, joints=2)
+    steps = [None if each is None else np.c_[each[:, 0], np.full(len(each), 0.5)] for each in steps]
+    kinds = {"action_kind": ["delta", "absolute"], "targets": [1]}  # distances from the state are decoded
+    save_demonstrations(tmp_path / "arm", states, steps, control_hz=10, **kinds)
+    run = train_arm(tmp_path / "run", tmp_path / "arm")
+    moving, constant = evaluate(run, FEW)["action_errors"]["left_out"]["column"]
+    assert constant["controller"] == 0 < moving["controller"]
 
 
 @pytest.mark.parametrize("name", ["episodes", "rollouts_per_context", "batch_size"])

@@ -7,10 +7,18 @@ import pytest
 import torch
 
 from torchrl_koap import ControllerConfig, fit
-from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.data import LabelBudget, flatten_trajectories, make_demonstrations, select_state
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.methods import METHODS
-from torchrl_koap.training.policy_facts import decoded_commands, state_reader, tells_commands, with_commands
+from torchrl_koap.training.policy_facts import (
+    command_ranges,
+    constant_actions,
+    decoded_commands,
+    policy_facts,
+    state_reader,
+    tells_commands,
+    with_commands,
+)
 
 CHANGES = get_task("avoiding")  # observes the commanded and the measured position
 TASK = replace(CHANGES, defaults=replace(CHANGES.defaults, commands=True))
@@ -66,3 +74,26 @@ def test_relative_positions_are_read_beside_the_columns_where_asked():
     read = reader(states)
     assert read.shape == (2, 3, reader.width) and torch.equal(read[..., : task.state_dim], states)
     torch.testing.assert_close(read[..., task.state_dim :][..., :3], states[..., :3] - states[..., 4:7])
+
+
+@pytest.mark.parametrize("kind", ["delta", "raw", "absolute"])
+def test_an_action_that_labels_of_the_budget_repeat_is_commanded_as_it_is(kind):
+    torch.manual_seed(0)
+    states, actions = torch.rand(3, 30, 3).cumsum(1), torch.rand(3, 29, 2)
+    actions[:, :, 1] = 0.5
+    actions[2, 7, 1] = 0.7  # outside the budget
+    options = {"targets": [0, 1]} if kind == "absolute" else {}
+    data, task = make_demonstrations(list(states), list(actions), control_hz=20, action_kind=kind, **options)
+    data = select_state(data, task.state_of)
+    labelled, _ = LabelBudget(episodes=(0, 1)).apply(data)
+    ranges = command_ranges(task, labelled)
+    assert ranges[1] == [0.5, 0.5] and constant_actions(task, ranges) == {1: 0.5}
+    assert constant_actions(task, command_ranges(task, data)) == {}
+    facts, decoded = policy_facts(task, ranges=ranges), torch.ones(1, 3, 2)
+    assert facts["ranges"][1] is None and facts["ranges"][0] == ranges[0]
+    expected = 3 if kind == "absolute" else 1
+    assert facts["action_rule"](torch.full((1, 3, 3), 2.0), decoded)[0].tolist() == [[expected, 0.5]] * 3
+    assert decoded.min() == 1
+    told = replace(task, command=None) if kind != "delta" else replace(TASK, actions=task.actions)
+    assert (constant_actions(told, ranges) == {}) == (kind == "delta"), "decoded commands are no changes"
+    assert policy_facts(task)["action_rule"] == task.action_rule

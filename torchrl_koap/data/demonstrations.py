@@ -19,7 +19,7 @@ from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each, wrong_rate
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
 from torchrl_koap.data.planner_choices import observed_frames, planner_updates
-from torchrl_koap.data.quality import constant_columns, find_warnings
+from torchrl_koap.data.quality import find_warnings
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state
 from torchrl_koap.files import option, refuse
@@ -224,7 +224,6 @@ def make_demonstrations(
             f" {option('robot')}"
         )
     refuse(f"task {name!r}", problems)
-    constants = constant_columns(np.concatenate(actions))
     data = flatten_trajectories([frames - origin for frames in recordings.states], actions)
     moved = dict(zip(absolute, map(others.index, reached), strict=True))
     parts = _parts(names, set(own), set(commanded))
@@ -234,8 +233,8 @@ def make_demonstrations(
         observation_units=own_units,
         observation_origin=tuple(origin.tolist()) if origin.any() else (),
         actions={
-            name: Action(unit, kind, moved.get(index), constant)
-            for index, (name, unit, kind, constant) in enumerate(zip(acting, units, kinds, constants, strict=True))
+            name: Action(unit, kind, moved.get(index))
+            for index, (name, unit, kind) in enumerate(zip(acting, units, kinds, strict=True))
         },
         position=next(part for part in parts if part != _COMMAND),
         max_steps=round(_SLACK * max(map(len, recordings.states))) if max_steps is None else int(max_steps),

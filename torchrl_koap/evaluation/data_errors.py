@@ -138,20 +138,20 @@ def first_actions(
 
 
 def errors_outside_budget(
-    controller: nn.Module, data: TensorDictBase, labelled: TensorDictBase, task: Task
+    controller: nn.Module, data: TensorDictBase, labelled: TensorDictBase, task: Task, repeated: Sequence[int] = ()
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Measures errors on the trajectories whose labels are all outside the budget.
 
-    The flat ``data``, as the controller sees them, have all labels, ``labelled`` those of the budget. Returns the
-    result of :func:`summarise_errors`, or a ``note`` why there is none, and actions ``predicted`` and ``true``
-    ``[N, act]``.
+    The flat ``data``, as the controller sees them, have all labels, ``labelled`` those of the budget. A policy
+    commands ``repeated`` action columns as all labels have them. Returns the result of :func:`summarise_errors`, or a
+    ``note`` why there is none, and actions ``predicted`` and ``true`` ``[N, act]``.
     """
     outside = episodes_outside(data, labelled)
     predicted, true, episode = first_actions(controller, data, outside)
     if not len(true):
         return {"note": "no trajectory outside the budget has labels"}, {}
     try:
-        models = _with_baselines(predicted, true, labelled, data, outside, task)
+        models = _with_baselines(predicted, true, labelled, data, outside, repeated)
     except LateLabelsError as error:
         return {"note": f"the ridge on raw frames cannot be fitted: {error}"}, {}
     return summarise_errors(models, true, episode, task), {"predicted": models["controller"], "true": true}
@@ -163,21 +163,21 @@ def _with_baselines(
     known: TensorDictBase,
     data: TensorDictBase,
     episodes: Tensor | Sequence[int],
-    task: Task,
+    repeated: Sequence[int],
 ) -> dict[str, Tensor]:
     """Returns actions ``[N, act]`` of a controller, of a ridge on raw frames, and the mean of the known actions."""
-    linear = LinearInverseDynamics(known[STATE].shape[-1], task.action_dim).to(known[STATE].dtype)
+    linear = LinearInverseDynamics(known[STATE].shape[-1], true.shape[-1]).to(known[STATE].dtype)
     fit_closed_form(linear, known)
-    fixed = torch.tensor([action.constant is not None for action in task.actions.values()])
+    exact = torch.isin(torch.arange(true.shape[-1]), torch.tensor(repeated, dtype=torch.long))
     return {
-        "controller": torch.where(fixed, true, predicted),  # a policy repeats constant actions exactly
+        "controller": torch.where(exact, true, predicted),
         "ridge": first_actions(linear, data, episodes)[0],
         "mean_action": known[ACTION][known[HAS_ACTION].squeeze(-1)].mean(0).expand_as(true),
     }
 
 
 def errors_left_out(
-    controller: nn.Module, labelled: TensorDictBase, task: Task, columns: Sequence[int]
+    controller: nn.Module, labelled: TensorDictBase, task: Task, columns: Sequence[int], repeated: Sequence[int] = ()
 ) -> dict[str, Any]:
     """Measures errors on labels in the budget: hides each labelled trajectory in turn and refits the decoder.
 
@@ -198,7 +198,7 @@ def errors_left_out(
             fit_closed_form(again, fold, **action_facts(task, columns))
             predicted, true, episode = first_actions(again, labelled, [int(number)])
             if len(true):  # otherwise its labels lie too near its end
-                folds.append((_with_baselines(predicted, true, fold, labelled, [int(number)], task), true, episode))
+                folds.append((_with_baselines(predicted, true, fold, labelled, [int(number)], repeated), true, episode))
     if not folds:
         return {"note": "no labelled step has enough recorded future to decode its action"}
     models, truths, numbers = zip(*folds, strict=True)

@@ -22,7 +22,7 @@ from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
 from torchrl_koap.modules.execution.agent import FarStateWarning
 from torchrl_koap.modules.execution.command_limits import ends_of
 from torchrl_koap.modules.ridge import ridge
-from torchrl_koap.training.policy_facts import command_ranges
+from torchrl_koap.training.policy_facts import command_ranges, varied
 from torchrl_koap.training.trained import Trained
 
 STEPS, ROBOTS = 300, 16
@@ -57,7 +57,7 @@ def check_loop(
         sentences in ``faults``. If the loop cannot be judged, a ``note`` says why.
     """
     task = trained.task
-    ranges = command_ranges(task, labelled)
+    ranges = varied(command_ranges(task, labelled))
     if not any(ranges) or not (data[HAS_ACTION] & ~begins(data).unsqueeze(-1)).any():
         return {"note": "no command changes in the labels", "faults": []}
     response, explained = _fit(data)

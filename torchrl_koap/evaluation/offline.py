@@ -13,9 +13,10 @@ from torchrl_koap.evaluation.data_errors import errors_left_out, errors_of_chunk
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.loop_on_labels import check_loop
 from torchrl_koap.files import DataError
-from torchrl_koap.keys import HAS_ACTION
+from torchrl_koap.keys import ACTION, HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.training.datasets import split_held_out
+from torchrl_koap.training.policy_facts import constant_actions
 
 if TYPE_CHECKING:
     from torchrl_koap.evaluation.config import EvalConfig
@@ -109,7 +110,8 @@ def _outside_budget(
         return {"note": f"method {trained.config.method!r} samples actions: it decodes no recorded states"}, {}
     if trained.method.fit is not None:
         return {"note": _COMMANDS}, {}
-    return errors_outside_budget(trained.controller.cpu(), trained.seen(data), trained.seen(labelled), trained.task)
+    controller, repeated = trained.controller.cpu(), _repeated(trained, data)
+    return errors_outside_budget(controller, trained.seen(data), trained.seen(labelled), trained.task, repeated)
 
 
 def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, Any]) -> dict[str, Any]:
@@ -121,7 +123,15 @@ def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, 
         return {"note": _COMMANDS}
     if not trained.method.closed_form:
         return {"note": "the decoder is not fitted in closed form: leaving out a trajectory means training again"}
-    return errors_left_out(trained.controller.cpu(), trained.seen(labelled), trained.task, trained.columns)
+    controller, repeated = trained.controller.cpu(), _repeated(trained, labelled)
+    return errors_left_out(controller, trained.seen(labelled), trained.task, trained.columns, repeated)
+
+
+def _repeated(trained: Trained, data: TensorDictBase) -> list[int]:
+    """Returns the action columns in which the policy commands one number, that of all labels."""
+    steps = data[ACTION][data[HAS_ACTION].squeeze(-1)]
+    known = constant_actions(trained.task, trained.results.get("command_ranges") or ())
+    return [column for column, number in known.items() if (steps[:, column] == number).all()]
 
 
 def _per_trajectory(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[dict[str, Any]]:

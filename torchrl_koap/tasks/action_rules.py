@@ -34,13 +34,11 @@ class Action:
             ``"raw"``: anything else, such as a torque or a normalised target; nothing is assumed about it.
         column (int, optional): state column that a ``"delta"`` moves, that is the target of an ``"absolute"`` action
             (controllers then decode the distance to it), or that holds the width of a ``"gripper"``.
-        constant (float, optional): constant value that overrides the decoded one. Default: none.
     """
 
     unit: str = ""
     kind: ActionKind = "delta"
     column: int | None = None
-    constant: float | None = None
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class ActionRule:
     gripper: tuple[int, int] | None = None
     # action column and state column of each action that the controller decodes as a distance from the state
     distances: Sequence[tuple[int, int]] = ()
-    constants: Mapping[int, float] = field(default_factory=dict)  # constant action columns by number
+    constants: Mapping[int, float] = field(default_factory=dict)  # numbers that all labels repeat, by action column
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
         """Returns the actions ``[*B, T, act]`` in states ``[*B, T, d]``."""

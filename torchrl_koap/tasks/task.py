@@ -210,10 +210,7 @@ class Task(Columns):
     @property
     def action_rule(self) -> ActionRule | None:
         """Rule applied to decoded actions; None if there is none."""
-        actions = enumerate(self.actions.values())
-        constants = {index: action.constant for index, action in actions if action.constant is not None}
-        needed = self.gripper or self.distances or constants
-        return ActionRule(self.gripper, self.distances, constants) if needed else None
+        return ActionRule(self.gripper, self.distances) if self.gripper or self.distances else None
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -306,5 +303,12 @@ class Task(Columns):
 
     @classmethod
     def from_json(cls, entries: object) -> Task:
-        """Reads the task that :meth:`to_json` wrote; refuses unknown, missing and invalid entries."""
+        """Reads the task that :meth:`to_json` wrote; refuses unknown, missing and invalid entries.
+
+        An action's ``constant`` is ignored: labels of the budget tell which actions are constant.
+        """
+        if isinstance(entries, Mapping) and isinstance(entries.get("actions"), Mapping):
+            actions = {name: entry for name, entry in entries["actions"].items() if isinstance(entry, Mapping)}
+            kept = {name: {key: entry[key] for key in entry if key != "constant"} for name, entry in actions.items()}
+            entries = {**entries, "actions": {**entries["actions"], **kept}}
         return dataclass_from_json(cls, entries)

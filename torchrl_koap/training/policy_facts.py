@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_koap.data.quality import constant_columns
 from torchrl_koap.keys import ACTION, HAS_ACTION, LABEL_COMMAND, OBSERVATION, STATE
 from torchrl_koap.modules.planning.denoisers import RelativePositionFeatures
 from torchrl_koap.modules.windows import StateReader
 from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.action_rules import shift_actions
+from torchrl_koap.tasks.action_rules import ActionRule, shift_actions
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.method import Method
 
@@ -27,14 +29,15 @@ def policy_facts(
     ``reads`` is what the controller reads of states (default: all columns), ``ranges`` are those of
     :func:`command_ranges`.
     """
+    constants, rule = constant_actions(task, ranges or ()), task.action_rule
     return {
         "state_of": task.state_of,
         "reads": reads,
-        "action_rule": task.action_rule,
+        "action_rule": replace(rule or ActionRule(), constants=constants) if constants else rule,
         "changes": tuple(task.delta_actions),
         "commanded": None if task.targets else commanded_columns(task),
         "decoded": decoded_commands(task),
-        "ranges": ranges,
+        "ranges": None if ranges is None else varied(ranges),
         "max_steps": task.max_steps,
         "control_hz": task.control_hz,
         "origins": task.origins,
@@ -106,8 +109,8 @@ def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]
     Few labels show few directions. So changes of commands in one unit get the range of the largest of them, on every
     axis and in both directions. The range of a target includes the demonstrated values of its state column.
 
-    The data are flat ``[N]`` after the label budget was applied. None stands for a gripper and for a column that never
-    changes.
+    The data are flat ``[N]`` after the label budget was applied. Both ends are equal if two labels or more repeat one
+    number. None stands for a gripper, and for a single label.
     """
     labelled, meanings = data[ACTION][data[HAS_ACTION].squeeze(-1)], list(task.actions.values())
     ranges: list[list[float] | None] = [None] * len(meanings)
@@ -122,4 +125,26 @@ def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]
             numbers = labelled[:, column]
             numbers = numbers if meaning.column is None else torch.cat([numbers, data[STATE][:, meaning.column]])
             ranges[column] = [float(numbers.min()), float(numbers.max())]
-    return [None if ends is None or ends[0] == ends[1] else ends for ends in ranges]
+    repeated = constant_columns(labelled.cpu().numpy())
+    return [
+        [number, number] if number is not None and meaning.kind != "gripper" else ends
+        for meaning, number, ends in zip(meanings, repeated, varied(ranges), strict=True)
+    ]
+
+
+def varied(ranges: Sequence[Sequence[float] | None]) -> list[list[float] | None]:
+    """Returns ranges of :func:`command_ranges`, None if both ends are equal."""
+    return [None if ends is None or ends[0] == ends[1] else list(ends) for ends in ranges]
+
+
+def constant_actions(task: Task, ranges: Sequence[Sequence[float] | None]) -> dict[int, float]:
+    """Returns the numbers that all labels repeat, by action column: policies command them, whatever is decoded.
+
+    Decoded commands are left out: their labels are changes.
+    """
+    decoded = decoded_commands(task) or {"actions": []}
+    return {
+        column: ends[0]
+        for column, ends in enumerate(ranges)
+        if ends is not None and ends[0] == ends[1] and column not in decoded["actions"]
+    }
