@@ -7,14 +7,20 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.data import make_demonstrations
+from torchrl_koap.data import make_demonstrations, make_recordings
+from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.data.late_labels import frames_late
 
 JOINTS, FRAMES = 3, 80
 
 
-def recordings(late=0, *, lag=0.4, delay=0, noise=0.0, kind="delta", labelled=5):
-    """An arm that follows steps ``[T, 3]``, or targets, of an operator with unsteady hands."""
+def recordings(late=0, **how):
+    """Data and task of an arm."""
+    return make_demonstrations(*unsteady(late, **how), control_hz=30, action_kind=how.get("kind", "delta"))
+
+
+def unsteady(late=0, *, lag=0.4, delay=0, noise=0.0, kind="delta", labelled=5):
+    """States and actions of an arm that follows steps ``[T, 3]``, or targets, of an operator with unsteady hands."""
     generator, states, actions = np.random.default_rng(0), [], []
     for number in range(6):
         place, speed, command, given = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS), []
@@ -31,7 +37,7 @@ def recordings(late=0, *, lag=0.4, delay=0, noise=0.0, kind="delta", labelled=5)
         logged[max(late, 0) : FRAMES + min(late, 0)] = np.array(given)[max(-late, 0) : FRAMES - max(late, 0)]
         states.append(np.array(frames))
         actions.append(logged if number < labelled else None)
-    return make_demonstrations(states, actions, control_hz=30, action_kind=kind)
+    return states, actions
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.8])
@@ -80,6 +86,17 @@ def test_a_script_that_reacts_to_noisy_states_is_on_time():
             place = place + given[-1]
         states.append(np.array(seen)), actions.append(np.array(given))
     assert frames_late(*make_demonstrations(states, actions, control_hz=30, robot=[0, 1])) == 0
+
+
+@pytest.mark.parametrize("kind", ["velocity", "absolute"])
+@pytest.mark.parametrize("rate", [10.0, 20.0, 24.0])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_labels_that_were_resampled_are_on_time(rate, kind):
+    """A held label does not tell of the commands between two new frames; the next one does."""
+    states, actions = unsteady(lag=0.0, labelled=6, kind="delta" if kind == "velocity" else kind)
+    held = resampled(make_recordings(states, actions, control_hz=30.0), rate, kind)
+    data, task = make_demonstrations(held.states, held.actions, control_hz=rate, action_kind=kind)
+    assert frames_late(data, task) == 0
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

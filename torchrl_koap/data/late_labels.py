@@ -38,7 +38,8 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
     This is a test of Granger causality. Cross-validated ridge regression predicts the next change of every commanded
     column from past states and labels up to some frame. If labels are on time, those up to the present frame suffice.
     If later ones are needed, labels are late by that many frames. Labels of a script that reacts to noisy states look
-    the same, but their coefficient is negative, or above 1 for targets; they count as on time.
+    the same, but their coefficient is negative, or above 1 for targets; they count as on time. So do labels at another
+    rate than the commands: a later label tells of commands between two frames, but weighs less than the present one.
 
     Early labels look like a robot that responds late. A robot that responds k frames late hides k late frames.
     """
@@ -57,15 +58,16 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
         return 0
     change, errors, commands = change[:, used], errors[used], np.array(list(task.moves))[used]
     given = [actions[rows + ahead] for ahead in range(-REACH, REACH + 1)]
-    shares, gains = [], []
+    shares, gains, own = [], [], np.arange(len(used))
     for ahead in range(REACH + 1):
         error, weights = _regress([*past, *given[: REACH + ahead + 1]], change)
         shares.append(np.median(np.minimum(error / errors, 1)))
-        last = weights[-actions.shape[1] - 1 : -1]
-        gains.append(np.median(last[commands, np.arange(len(commands))]))
+        present, last = (weights[-1 - (1 + back) * actions.shape[1] :][commands, own] for back in (ahead, 0))
+        gains.append((np.median(present), np.median(last)))
     needed = next(ahead for ahead, share in enumerate(shares) if share <= min(shares) + NEAR)
     largest = LARGEST_GAIN if task.targets else np.inf
-    return needed if shares[0] - min(shares) > CLEAR and 0 < gains[needed] <= largest else 0
+    present, last = gains[needed]
+    return needed if shares[0] - min(shares) > CLEAR and max(0, present) < last <= largest else 0
 
 
 def _labelled_rows(data: TensorDictBase) -> np.ndarray:
