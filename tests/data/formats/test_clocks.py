@@ -22,9 +22,17 @@ def test_the_usual_step_is_the_rate():
 
 
 @pytest.mark.parametrize(
+    ("name", "rate"), [("timestamp_ms", 0.5), ("time_s", 0.1), ("stamp_us", 5000.0), ("Time [s]", 0.5)]
+)
+def test_slow_and_fast_clocks_are_read_if_their_name_gives_the_unit(name, rate):
+    problems: list[str] = []
+    assert find_rate(Clock(name, [TIME * 30 / rate], ["0.csv"]), None, problems) == pytest.approx(rate) and not problems
+
+
+@pytest.mark.parametrize(
     ("times", "declared", "message"),
     [
-        (TIME * 1e3, None, "gives 0.03 frames per second if it is in seconds: name it time_ms"),
+        (TIME * 1e3, None, "gives 0.03 frames per second if it is in seconds: name it time_s if it is, time_ms"),
         (-TIME, None, r"do not increase, or are missing, in column 'time' of 1 of 2 .*: 1.csv \(frame 1\)"),
         (np.r_[TIME, 9.0], None, r"1.csv: frames are 0.03333 to 7.033 s apart \(frame 59\); .* pass resample .* 30"),
         (np.insert(TIME, 9, 0.29), None, r"1.csv: frames are 0.01 to 0.03333 s apart"),

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.formats.kinds import names_unit
 from torchrl_koap.files import option, some
 
 UNEVEN = 0.2  # share of the usual step by which a step in time may differ
-SLOWEST, FASTEST = 1.0, 2000.0  # Hz; outside, stamps are assumed to have another unit
+SLOWEST, FASTEST = 1.0, 2000.0  # Hz; outside, the name of stamps must give their unit
 ROUNDED = 0.03  # share of its mean step by which a rounded clock's steps may differ
 NOT_READ = " (its time stamps are ignored)"
 _SAME = 1e-3  # share of a step by which its median and mean differ if the clock is not rounded
@@ -62,7 +63,10 @@ def declared_rate(value: Any) -> float | None:
 
 
 def usual_rate(clock: Clock, problems: list[str]) -> float | None:
-    """Returns frames per second by the median step of time stamps; None, and a problem, if they cannot be seconds."""
+    """Returns frames per second by the median step of time stamps.
+
+    Returns None, and adds a problem, if stamps do not increase, or have no unit in their name and cannot be seconds.
+    """
     back = [
         f"{name} (frame {int((~(step > 0)).argmax()) + 1})"
         for name, step in zip(clock.sources, clock.steps, strict=True)
@@ -75,11 +79,11 @@ def usual_rate(clock: Clock, problems: list[str]) -> float | None:
         )
         return None
     rate, name = 1 / clock.usual, clock.name
-    if SLOWEST <= rate <= FASTEST:
+    if SLOWEST <= rate <= FASTEST or names_unit(name):
         return rate
     problems.append(
-        f"column {name!r} gives {rate:.3g} frames per second if it is in seconds: name it {name}_ms, {name}_us or"
-        f" {name}_ns if it is in another unit, or pass {option('control_hz')}"
+        f"column {name!r} gives {rate:.3g} frames per second if it is in seconds: name it {name}_s if it is,"
+        f" {name}_ms, {name}_us or {name}_ns if it is in another unit, or pass {option('control_hz')}"
     )
     return None
 

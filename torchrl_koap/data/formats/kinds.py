@@ -88,6 +88,11 @@ def kind_of(name: str) -> tuple[str | None, float]:
     return next((kind for kind, pattern in _KIND.items() if pattern.fullmatch(_joined(plain))), None), 1.0
 
 
+def names_unit(name: str) -> bool:
+    """Checks whether the name of a clock ends with its unit: "timestamp_ms", "Time [s]"."""
+    return _UNIT.fullmatch(name.strip().lower()) is not None
+
+
 def is_action(name: str) -> bool:
     """Checks whether a column of a table is an action by its name: "action", "Action_0", "actions[1]"."""
     return _ACTING.fullmatch(name) is not None
