@@ -196,3 +196,11 @@ def test_sources_of_other_units_or_kinds_of_actions_are_refused(tmp_path):
         read_sources([first, stored("turned", state_units="deg")], None)
     with pytest.raises(DataError, match="the kind of action 'action_0' is 'raw', before 'delta'"):
         read_sources([first, stored("kind", action_kind="raw")], None)
+
+
+def test_a_network_of_new_weights_each_time_is_refused_before_it_embeds(tmp_path):
+    (tmp_path / "net.py").write_text("import torch\n\n\ndef make():\n    return torch.nn.Conv2d(3, 4, 3)\n")
+    recordings, task = read_sources([write_own(tmp_path)], None)
+    with pytest.raises(ValueError, match="net.py:make' has other weights each time it is made: load them"):
+        embed_recordings(recordings, task, tmp_path / "seen", network=f"{tmp_path / 'net.py'}:make")
+    assert not (tmp_path / "seen").exists()

@@ -139,6 +139,9 @@ def embed_recordings(
         raise ValueError(f"a projection fits one camera, got {len(chosen)}: name one of {', '.join(chosen)}")
     given = None if projection is None else load_encoder(projection, network)
     backbone = load_backbone(network) if given is None else given.backbone
+    if network is not None and load_backbone(network).digest != backbone.digest:
+        cause = "has other weights each time it is made"
+        raise ValueError(f"network {network!r} {cause}: load them from a file, or seed them before they are drawn")
     total, done = len(chosen) * sum(map(len, recordings.states)), 0
     embedded: dict[str, list[Tensor]] = {}
     reports = {}
