@@ -112,6 +112,21 @@ def test_paths_without_anything_unforeseen_say_nothing():
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
+def test_differences_of_smooth_paths_are_on_time_beside_a_quaternion_of_another_sign():
+    """A fit of many inputs extrapolates badly to the recording with the other sign; more labels seem to help."""
+    time, states, actions = np.linspace(0, 1, 60)[:, None], [], []
+    for number in range(8):
+        generator = np.random.default_rng(number)
+        start, goal = 0.3 * generator.normal(size=3), generator.normal(size=3)
+        path = start + (goal - start) * (3 * time**2 - 2 * time**3)
+        path += 0.2 * generator.normal(size=3) * np.sin(np.pi * time)
+        half, sign = 0.5 * np.sin(2 * time + number) + 1.2, -1 if number == 3 else 1
+        states.append(np.c_[path, 0 * half, 0 * half, sign * np.sin(half), sign * np.cos(half)])
+        actions.append(np.diff(path, axis=0) if number < 5 else None)
+    assert frames_late(*make_demonstrations(states, actions, control_hz=30)) == 0
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_few_or_constant_labels_say_nothing():
     data, task = recordings(2)
     data["has_action"][16:] = False

@@ -36,7 +36,8 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
     """Counts the frames by which the labels of flat data ``[N]`` are late; 0 where that is not clear.
 
     This is a test of Granger causality. Cross-validated ridge regression predicts the next change of every commanded
-    column from past states and labels up to some frame. If labels are on time, those up to the present frame suffice.
+    column from past states and labels up to some frame. If labels are on time, those up to the present frame suffice,
+    or present state and label alone.
     If later ones are needed, labels are late by that many frames. Labels of a script that reacts to noisy states look
     the same, but their coefficient is negative, or above 1 for targets; they count as on time. So do labels at another
     rate than the commands: a later label tells of commands between two frames, but weighs less than the present one.
@@ -52,15 +53,17 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
     if not moved or len(rows) <= inputs:
         return 0
     past = [robot[rows]] + [robot[rows - i] - robot[rows - i - 1] for i in range(REACH)]
-    errors = _regress(past, change)[0]
+    errors, simple = _regress(past, change)[0], _regress([robot[rows], actions[rows]], change)[0]
     used = np.flatnonzero(errors > INNOVATION * change.var(0) * len(rows))
     if not len(used):
         return 0
-    change, errors, commands = change[:, used], errors[used], np.array(list(task.moves))[used]
+    change, commands = change[:, used], np.array(list(task.moves))[used]
+    errors, simple = errors[used], simple[used]
     given = [actions[rows + ahead] for ahead in range(-REACH, REACH + 1)]
     shares, gains, own = [], [], np.arange(len(used))
     for ahead in range(REACH + 1):
         error, weights = _regress([*past, *given[: REACH + ahead + 1]], change)
+        error = error if ahead else np.minimum(error, simple)  # fewer inputs extrapolate better to other recordings
         shares.append(np.median(np.minimum(error / errors, 1)))
         present, last = (weights[-1 - (1 + back) * actions.shape[1] :][commands, own] for back in (ahead, 0))
         gains.append((np.median(present), np.median(last)))
