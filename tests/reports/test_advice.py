@@ -90,7 +90,7 @@ def test_more_labels_are_not_proposed_where_the_planner_fails():
 
 def test_a_ridge_that_errs_less_is_pointed_out():
     (item,) = found(config={"method": "koap"}, evaluation=actions(0.32, 0.31))
-    assert item.finding == "the action error of koap is 0.32 times the mean action's, a plain ridge's 0.31 times"
+    assert item.finding == "the action error of koap is 0.32 times the mean action's, of a ridge on raw frames 0.31"
     assert not found(config={"method": "linear"}, evaluation=actions(0.3, 0.3))
     call = shlex.split(item.command.format(data="arm"))
     study = parse(Subcommand, call[1:]).config

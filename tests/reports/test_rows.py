@@ -61,5 +61,5 @@ def test_numbers_without_a_unit_are_in_units_of_the_data():
     row = {"unit": "", "columns": ["q"], "controller": 0.5, "ridge": 0.6, "mean_action": 2.0}
     errors = {"left_out": {"labels": 1200, "unit": [row]}}
     (found,) = evaluation_rows(run_of(None, evaluation={"action_errors_on": "left_out", "action_errors": errors}))
-    note = "root mean square in units of the data; ridge regression 0.6, always the mean action 2"
+    note = "root mean square in units of the data; ridge on raw frames 0.6, always the mean action 2"
     assert found == Row("action error, q", "0.5", f"{note}; 1,200 labels of recordings left out of the fit")

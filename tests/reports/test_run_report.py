@@ -32,7 +32,7 @@ def test_headline_has_intervals_and_n(run):
     for wanted in (
         "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts",
         f"0.22 2 of 24 modes; a uniform choice averages {expected_entropy(2, 24):.2f}, n = 2",
-        "action error, 2 columns 0.91 mm root mean square; ridge regression 1.04, always the mean action 3; 20 labels",
+        "action error, 2 columns 0.91 mm root mean square; ridge on raw frames 1.04, always the mean action 3; 20",
         "time of a plan 8.5 ms then 0.5 ms per control step; the robot's step has 35 ms",
         "Outside the budget, for evaluation only: 20 labels",
     ):

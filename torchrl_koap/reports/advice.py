@@ -88,7 +88,7 @@ def advice(run: RunFacts) -> Iterator[Advice]:
     own, ridge = (entry_at(run.action_errors, split, name) for name in ("relative", "ridge_relative"))
     if own is not None and ridge is not None and own >= ridge and method not in CONTROLS:
         yield Advice(
-            f"the action error of {method} is {own:.3g} times the mean action's, a plain ridge's {ridge:.3g} times",
+            f"the action error of {method} is {own:.3g} times the mean action's, of a ridge on raw frames {ridge:.3g}",
             "the ridge is simpler; compare both in closed loop before keeping either",
             "koap curve --datasets {data} --methods koap koap_untrained linear_steps linear --out curves/compare",
         )

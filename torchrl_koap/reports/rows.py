@@ -13,7 +13,7 @@ from torchrl_koap.tasks.columns import thousandths
 _ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
 # the run's own model first, then baselines
 _PLANS = {"planner": "", "standing_still": "standing still", "constant_velocity": "constant velocity"}
-_ACTIONS = {"controller": "", "ridge": "ridge regression", "mean_action": "always the mean action"}
+_ACTIONS = {"controller": "", "ridge": "ridge on raw frames", "mean_action": "always the mean action"}
 _LABELS = {"outside_budget": "outside the budget", "left_out": "of recordings left out of the fit"}
 _LATE = 0.8  # if weights after this share of the updates are best, more updates may help
 _NOT_MEASURED = "not measured"
