@@ -24,7 +24,7 @@ Bar = tuple[str, float, float, float]  # name, mean, low, high
 COLORS = (BLUE, ORANGE, "#0b6e4f", "#7a7a7a")
 MARKERS = ("o", "s", "^", "D")
 SHOWN = {"koap": "KOAP", "koap_untrained": "random features", "linear_steps": "ridge", "dp": "Diffusion Policy"}
-_ROBOT = {"KOAP": "action", "ridge regression": "ridge"}
+_ROBOT = {"KOAP": "action", "ridge on raw frames": "ridge"}
 
 
 def draw_all(folder: Path) -> list[Path]:
