@@ -209,3 +209,13 @@ def test_the_nearest_body_that_is_not_noted_arrives_if_it_is_inside():
     inside = np.array([[True, True, True], [True, True, True], [True, True, False], [True, True, True]])
     note_arrivals(orders, np.array([[0.3, 0.1, 0.2], [0.1, 0.2, 0.0], [0.0, 0.2, 0.1], [0.1, 0.1, 0.1]]), inside)
     assert orders.tolist() == [[1, -1, -1], [2, 0, -1], [0, -1, -1], [2, 0, 1]]
+
+
+def test_a_stored_constant_of_an_action_is_ignored():
+    task = Task(**TOY)
+    stored = task.to_json()
+    for action in stored["actions"].values():
+        action["constant"] = 0.5
+    assert Task.from_json(stored) == task and stored["actions"]["x"]["constant"] == 0.5
+    with pytest.raises((TypeError, ValueError), match="steady"):
+        Task.from_json(stored | {"actions": {"x": {"steady": 1}}})
