@@ -37,10 +37,10 @@ def frames_late(data: TensorDictBase, task: Task) -> int:
 
     This is a test of Granger causality. Cross-validated ridge regression predicts the next change of every commanded
     column from past states and labels up to some frame. If labels are on time, those up to the present frame suffice,
-    or present state and label alone.
-    If later ones are needed, labels are late by that many frames. Labels of a script that reacts to noisy states look
-    the same, but their coefficient is negative, or above 1 for targets; they count as on time. So do labels at another
-    rate than the commands: a later label tells of commands between two frames, but weighs less than the present one.
+    or present state and label alone. If later ones are needed, labels are late by that many frames. Labels of a script
+    that reacts to noisy states look the same, but their coefficient is negative, or above 1 for targets; they count as
+    on time. So do labels at another rate than the commands: a later label tells of commands between two frames, but
+    weighs less than the present one.
 
     Early labels look like a robot that responds late. A robot that responds k frames late hides k late frames.
     """

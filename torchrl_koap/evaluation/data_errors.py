@@ -30,7 +30,7 @@ from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.tasks.columns import unit_groups
-from torchrl_koap.training.closed_form import LateLabelsError, action_facts, fit_closed_form
+from torchrl_koap.training.closed_form import UnusableLabelsError, action_facts, fit_closed_form
 from torchrl_koap.training.controller import FEW_VALUES
 
 SAMPLES = 16  # plans per situation
@@ -152,7 +152,7 @@ def errors_outside_budget(
         return {"note": "no trajectory outside the budget has labels"}, {}
     try:
         models = _with_baselines(predicted, true, labelled, data, outside, repeated)
-    except LateLabelsError as error:
+    except UnusableLabelsError as error:
         return {"note": f"the ridge on raw frames cannot be fitted: {error}"}, {}
     return summarise_errors(models, true, episode, task), {"predicted": models["controller"], "true": true}
 
@@ -194,7 +194,7 @@ def errors_left_out(
         fold[HAS_ACTION] = labelled[HAS_ACTION] & ~hidden.unsqueeze(-1)
         fold[ACTION] = torch.where(fold[HAS_ACTION], labelled[ACTION], math.nan)
         again = copy.deepcopy(controller)
-        with suppress(LateLabelsError):  # of the other trajectories
+        with suppress(UnusableLabelsError):  # of the other trajectories
             fit_closed_form(again, fold, **action_facts(task, columns))
             predicted, true, episode = first_actions(again, labelled, [int(number)])
             if len(true):  # otherwise its labels lie too near its end

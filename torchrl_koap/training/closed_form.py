@@ -18,7 +18,7 @@ from torchrl_koap.tasks import Task
 MOST = 50_000  # labelled steps at most: random features of this many take a gigabyte
 
 
-class LateLabelsError(ValueError):
+class UnusableLabelsError(ValueError):
     """All labels lie so near the ends of their trajectories that no controller can be fitted to them."""
 
 
@@ -27,14 +27,14 @@ def fit_closed_form(controller: InverseDynamics, data: TensorDictBase, **known: 
 
     At most 50,000 steps are used, spread evenly. The data are flat ``[N]``, after the label budget was applied;
     ``known`` are the facts of :func:`action_facts`. Returns the result of
-    :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels`. Raises a LateLabelsError if there is no such step.
+    :meth:`~torchrl_koap.modules.InverseDynamics.fit_labels`. Raises an UnusableLabelsError if there is no such step.
     """
     data = data[torch.isin(data[EPISODE], labelled_episodes(data))]
     now, entries = controller.num_past, {controller.in_key: STATE, controller.out_key: ACTION, EPISODE: EPISODE}
     select = list(entries.values())
     cut = cut_windows(data, controller.num_window_frames, select=select, pad_before=now, labelled_frame=now, most=MOST)
     if not len(cut):
-        raise LateLabelsError(f"no label is followed by {controller.num_window_frames - 1 - now} recorded steps")
+        raise UnusableLabelsError(f"no label is followed by {controller.num_window_frames - 1 - now} recorded steps")
     windows = TensorDict({own: cut[name] for own, name in entries.items()}, cut.shape)
     mask = torch.zeros_like(cut[EPISODE], dtype=torch.bool)
     mask[:, now] = True  # other frames would use a step twice, with a clamped look-ahead

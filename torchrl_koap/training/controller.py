@@ -20,7 +20,7 @@ from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.tasks.action_rules import shift_actions
-from torchrl_koap.training.closed_form import LateLabelsError, action_facts, fit_closed_form
+from torchrl_koap.training.closed_form import UnusableLabelsError, action_facts, fit_closed_form
 from torchrl_koap.training.loop import Phases, moving_average
 from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
@@ -82,7 +82,7 @@ def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None
     WindowTable.build(data, window, pad_before=past)
     counted = range(past, past + 1) if method.closed_form else controller.valid_frames(shortest)
     if not WindowTable.build(data, shortest, counted=counted, pad_before=past).labelled.any():
-        raise LateLabelsError(
+        raise UnusableLabelsError(
             f"no label is followed by the {shortest - counted.stop} recorded steps that method {config.method!r} needs:"
             " label earlier steps"
         )
