@@ -46,7 +46,6 @@ COVERED_BY = {
     "tasks/modes.py": "tasks/test_task.py",
     "tasks/scene.py": "reports/test_scenes.py",
     "training/checkpoints.py": "training/test_loop.py",
-    "training/controller.py": "training/test_methods.py",
     "training/method.py": "training/test_methods.py",
     "vision/backbones.py": "vision/test_encoder.py",
 }

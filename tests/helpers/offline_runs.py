@@ -8,6 +8,7 @@ import numpy as np
 from torchrl_koap import ControllerConfig, PlannerConfig, TrainConfig, Trained, fit, train
 from torchrl_koap.data import make_demonstrations, save_ted
 
+NAMES = ["q1", "q2", "goal_1", "goal_2"]
 TINY = {"planner": {"steps": 20, "batch_size": 8, "width": 8}, "controller": {"steps": 20}}
 
 
@@ -27,6 +28,13 @@ def record(count: int = 10, steps: int = 40, joints: int = 7, *, seed: int = 0):
         states.append(np.array(frames))
         actions.append(np.array(commands))
     return states, actions
+
+
+def few_labels(labelled=2, **options):
+    """Returns arguments of ``make_demonstrations``: a robot of two joints, of which some recordings are labelled."""
+    states, actions = record(6, joints=2)
+    actions = [steps if index < labelled else None for index, steps in enumerate(actions)]
+    return {"states": states, "actions": actions, "control_hz": 30, "state_names": NAMES, "robot": NAMES[:2]} | options
 
 
 def fit_walks(columns: int, **description) -> Trained:

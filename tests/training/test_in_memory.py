@@ -1,29 +1,24 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests that fitting in memory does what `koap train` does, on data with missing labels."""
 
-from pathlib import Path
-
 import numpy as np
 import offline_runs
 import pytest
 import torch
+from offline_runs import NAMES, few_labels
 from tensordict import TensorDict
 
 from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig, Trained, fit, train
 from torchrl_koap.data import LabelBudget, cut_windows, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.data.ted import load_ted
 from torchrl_koap.files import DataError
-from torchrl_koap.modules import LinearInverseDynamics, StatePlanner, TemporalUnet
+from torchrl_koap.modules import StatePlanner, TemporalUnet
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.objectives import DiffusionPolicyLoss, KOAPLoss
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import WINDOW
-from torchrl_koap.training import METHODS, Method
 from torchrl_koap.training import planner as planner_training
-from torchrl_koap.training.controller import check_lengths
-from torchrl_koap.training.defaults import resolve
 
-NAMES = ["q1", "q2", "goal_1", "goal_2"]
 SMALL = {"batch_size": 8, "width": 8}
 
 
@@ -35,12 +30,6 @@ def record(number=6, **options):
 def fit_controller(data, task=None, *, steps=500, preset=None, columns=None, **options):
     section = {"steps": steps, "preset": preset, "columns": columns}
     return fit(data, task, planner=False, controller=section, progress=False, **options)
-
-
-def few_labels(labelled=2, **options):
-    states, actions = record()
-    actions = [steps if index < labelled else None for index, steps in enumerate(actions)]
-    return {"states": states, "actions": actions, "control_hz": 30, "state_names": NAMES, "robot": NAMES[:2]} | options
 
 
 def same_weights(module, other):
@@ -188,61 +177,6 @@ def test_the_decoder_beats_a_ridge_on_a_lagging_robot():
     data, task = make_demonstrations(**few_labels(3))
     koap, ridge = (errors_of(method, task, data) for method in ("koap", "linear"))
     assert koap < 0.08 and koap < 0.75 * ridge, (koap, ridge)
-
-
-@pytest.mark.parametrize("preset", [None, "semi_supervised"])
-def test_a_short_recording_is_refused_before_the_planner_is_trained(preset, monkeypatch):
-    monkeypatch.setattr("torchrl_koap.training.in_memory.learn_planner", pytest.fail)
-    states, actions = record()
-    data, task = make_demonstrations(**few_labels(states=[states[0][:9], *states[1:]], actions=[None, *actions[1:]]))
-    with pytest.raises(ValueError, match=r"1 of 6 trajectories are shorter than a window .*: 0 \(8 steps\)"):
-        fit(data, task, controller={"preset": preset})
-
-
-@pytest.mark.parametrize(("method", "behind"), [("koap", 5), ("linear", 8), ("dd", 1), ("vae", 1)])
-def test_labels_that_no_controller_can_use_are_refused_before_the_planner_is_trained(method, behind, monkeypatch):
-    monkeypatch.setattr("torchrl_koap.training.in_memory.learn_planner", pytest.fail)
-    data, task = make_demonstrations(**few_labels())
-    left = torch.cat([torch.arange(n - 1, -1, -1) for n in data["episode"].unique(return_counts=True)[1].tolist()])
-
-    def fit_where(chosen, **options):
-        labelled = data["has_action"] & chosen.unsqueeze(-1)
-        action = torch.where(labelled, data["action"], torch.nan)
-        few = data.clone().update({"has_action": labelled, "action": action})
-        return fit(few, task, method=method, controller={"steps": 2}, **options)
-
-    fit_where(left == behind, planner=False)
-    with pytest.raises(ValueError, match=f"no label is followed by the {behind} recorded steps that method '{method}'"):
-        fit_where(left < behind)
-
-
-class Failing(LinearInverseDynamics):
-    def predict(self, state, frames=None):
-        return {}["speed"]
-
-
-@pytest.mark.parametrize(
-    ("network", "says"),
-    [
-        (LinearInverseDynamics(4, 3), r"method 'odd': its network gave \[1, 16, 3\], wanted \[1, 16, 2\]"),
-        (Failing(4, 2), r"method 'odd': its network failed on .* \[1, 16, 4\]: KeyError: 'speed'"),
-    ],
-)
-def test_a_method_that_cannot_act_is_refused_before_the_planner_is_trained(network, says, monkeypatch):
-    for module in ("in_memory", "on_disk"):
-        monkeypatch.setattr(f"torchrl_koap.training.{module}.learn_planner", pytest.fail)
-    monkeypatch.setitem(METHODS, "odd", Method("odd", "", lambda *_: network, closed_form=True))
-    data, task = make_demonstrations(**few_labels())
-    with pytest.raises(ValueError, match=says):
-        fit(data, task, method="odd", controller={"columns": "all"})
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_checks_before_training_do_not_change_random_numbers(method):
-    data, task = make_demonstrations(**few_labels())
-    before = torch.get_rng_state()
-    check_lengths(task, resolve(TrainConfig(out=Path(), method=method), task), data)
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_refusals():
