@@ -136,6 +136,55 @@ def test_ends_of_episodes_beside_the_observations(file):
     assert [frames[:, 3].tolist() for frames in recordings.states[:2]] == [[0, 1], [2, 3]]
 
 
+@pytest.mark.parametrize("layout", ["data/demo_0/obs", "observations"])
+def test_groups_in_the_observations_are_read(layout, tmp_path):
+    path, joints = tmp_path / "nested.hdf5", np.arange(12.0).reshape(4, 3)
+    with h5py.File(path, "w") as stream:
+        stream[f"{layout}/left/joints"], stream[f"{layout}/right/joints"] = joints, -joints
+        stream[f"{layout}/images/left/top"] = np.zeros((4, 2, 2, 3), np.uint8)
+        stream[f"{layout}/left/text"] = np.array([b"a"] * 4)
+    found = read_robomimic(path, control_hz=20, action_dim=1)
+    assert found.state_names == tuple(f"{side}/joints_{index}" for side in ("left", "right") for index in range(3))
+    np.testing.assert_array_equal(found.states[0], np.hstack([joints, -joints]))
+    assert [*found.cameras] == ["left_top"] and found.skipped == ("obs/left/text",)
+    found = read_robomimic(path, control_hz=20, action_dim=1, observations=["right/joints"])
+    np.testing.assert_array_equal(found.states[0], -joints)
+    with h5py.File(path, "a") as stream:
+        stream[f"{layout}/left_top"] = stream[f"{layout}/images/left/top"]
+    with pytest.raises(DataError, match="two entries have a column left_top: rename one of them"):
+        read_robomimic(path, control_hz=20, action_dim=1)
+
+
+def test_frames_do_not_replace_numbers_of_their_name(tmp_path):
+    with h5py.File(tmp_path / "hand.hdf5", "w") as stream:
+        stream["observations/wrist"] = np.ones((4, 2))
+        stream["observations/images/wrist"] = np.zeros((4, 2, 2, 3), np.uint8)
+    found = read_robomimic(tmp_path / "hand.hdf5", control_hz=20, action_dim=1)
+    assert found.state_names == ("wrist_0", "wrist_1") and [*found.cameras] == ["wrist"]
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"observations": 3, "actions": 2, "timeouts": 1}, "wanted the layout of .*holds actions, observations, time"),
+        ({"observations/images": 9}, "no entry is a table of numbers; there are images"),
+        ({"data/demo_0/obs/top": 9, "data/demo_0/actions": 2}, "no entry is a table of numbers; there are top"),
+    ],
+)
+def test_other_layouts(entries, message, tmp_path):
+    with h5py.File(tmp_path / "other.hdf5", "w") as stream:
+        for name, width in entries.items():
+            stream[name] = np.zeros((6, 2, 2, 3) if width == 9 else (6, width), np.uint8)
+    with pytest.raises(DataError, match=message):
+        read_robomimic(tmp_path / "other.hdf5", control_hz=20)
+
+
+def test_next_observations_in_one_table_are_listed(file):
+    with h5py.File(file, "a") as stream:
+        stream["data/demo_2/next_obs"] = np.zeros((4, 4))
+    assert read_robomimic(file).skipped == ("next_obs",)
+
+
 def test_faults(file, tmp_path):
     with pytest.raises(DataError, match="data/demo_2, data/demo_10: obs has no entry 'arm'; it has camera, eef, width"):
         read_robomimic(file, observations=["arm"])

@@ -5,7 +5,7 @@
 
     data                     attribute env_args (JSON; env_kwargs/control_freq is the rate)
     data/demo_0/obs/<name>   [T, d] or [T] numbers, side by side the state; frames of a camera [T, H, W, 3]
-                             or JPEG or PNG files [T, bytes]
+                             or JPEG or PNG files [T, bytes]; <name> may be a path, such as arm/joints
     data/demo_0/actions      [T, a]; may be missing
     data/demo_0/next_obs     optional; its last row is the frame after the last action, the others repeat obs
     data/demo_0/dones        optional, like time stamps, counters and numbers of episodes: [T] beside obs
@@ -86,8 +86,9 @@ def _read(
     stream: Any, file: Path, observations: Sequence[str] | None, *, use_next: bool
 ) -> tuple[list[Piece], float | None, list[str]]:
     """Returns demonstrations, the declared rate, and the entries that are not read."""
-    data = stream.get("data") if "observations" not in stream else {file.stem: _aloha(stream)}
-    if not isinstance(data, Mapping):  # h5py groups are mappings
+    aloha = isinstance(stream.get("observations"), Mapping)  # h5py groups are mappings
+    data = {file.stem: _aloha(stream)} if aloha else stream.get("data")
+    if not isinstance(data, Mapping):
         wanted = (
             "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions), or ALOHA's (observations, action)"
         )
@@ -97,17 +98,18 @@ def _read(
     faults = [(f"data/{name}", "it has no group 'obs'") for name in lacking]
     if faults or not demos:
         raise DataError(file, gathered(faults) or "'data' holds no trajectories")
-    first = data[demos[0]]
-    entries = {name: data[demo]["obs"].get(name) for demo in demos for name in data[demo]["obs"]}
+    entries = {name: part for demo in demos for name, part in _entries(data[demo]["obs"]).items()}
     usable = sorted(name for name, part in entries.items() if _is_table(part))
     chosen = usable if observations is None else list(observations)
     if not chosen:
-        faults.append(("data/*/obs", f"no entry is a table of numbers; there are {', '.join(first['obs'])}"))
-    with_next = {name for name in demos if use_next and all(entry in data[name].get(NEXT, {}) for entry in chosen)}
+        faults.append(("data/*/obs", f"no entry is a table of numbers; there are {', '.join(entries)}"))
+    following = {name: data[name].get(NEXT) for name in demos if use_next}
+    following = {name: _entries(part) for name, part in following.items() if isinstance(part, Mapping)}
+    with_next = {name for name, parts in following.items() if chosen and all(entry in parts for entry in chosen)}
     pieces = [_piece(data[name], name, chosen, faults, has_next=name in with_next) for name in demos]
     refuse(file, gathered(faults))
     seen = {name for piece in pieces for name in (*piece.states, *piece.cameras)}
-    skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and name not in seen]
+    skipped = [f"obs/{name}" for name in sorted(entries) if name not in chosen and _camera(name) not in seen]
     held = {name for demo in demos for name in data[demo]}
     skipped += sorted(held - {"obs", NEXT, "actions", *seen})
     skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - with_next) else []
@@ -119,20 +121,32 @@ def _read(
 
 def _aloha(stream: Any) -> dict[str, Any]:
     """Converts the demonstration of a file in ALOHA's layout to robomimic's."""
-    beside, observed = {**stream}, {**stream["observations"]}
-    observed |= observed.pop("images", {})
-    del beside["observations"]
-    return {"obs": observed} | {"actions" if name == "action" else name: part for name, part in beside.items()}
+    called = {"observations": "obs", "action": "actions"}
+    return {called.get(name, name): part for name, part in stream.items()}
+
+
+def _entries(group: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Returns the data sets of a group, and of the groups in it, by path."""
+    found: dict[str, Any] = {}
+    for name in group:
+        part = group.get(name)
+        found |= _entries(part, f"{above}{name}/") if isinstance(part, Mapping) else {f"{above}{name}": part}
+    return found
+
+
+def _camera(path: str) -> str:
+    """Returns the name of a camera, which also names files."""
+    return path.removeprefix("images/").replace("/", "_")
 
 
 def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str, str]], *, has_next: bool) -> Piece:
     states: dict[str, np.ndarray] = {}
-    following = group[NEXT] if has_next else {}
+    observed, following = _entries(group["obs"]), group[NEXT] if has_next else {}
     for entry in chosen:
-        part = group["obs"].get(entry)
+        part = observed.get(entry)
         last = following[entry] if has_next else part
         if part is None:
-            said = f"obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}"
+            said = f"obs has no entry {entry!r}; it has {', '.join(sorted(observed))}"
         elif not _is_table(part):
             said = f"obs/{entry} is {_shape(part)}, no table of numbers: it cannot be part of the state"
         elif _shape(last) != _shape(part):
@@ -155,13 +169,15 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
             if single and (kind == "clock" or kind in BESIDE and len(part) == frames):
                 beside = as_numbers(entry, part[()].ravel())
                 states = states if beside is None else {entry: beside} | states
-    cameras = {}
-    for film, part in group["obs"].items():
+    cameras: dict[str, Clip] = {}
+    for film, part in observed.items():
         if len(_shape(part)) == 4 or _is_compressed(part):
             # without next_obs of this camera, its last frame is repeated
             last = (len(part) - (film not in following),) if has_next else ()
             file = str(Path(part.file.filename).resolve())
-            cameras[film] = Clip(file, (*range(len(part)), *last), part.name.removeprefix("/"))
+            clip = Clip(file, (*range(len(part)), *last), part.name.removeprefix("/"))
+            faults += [(f"data/{name}", fault) for fault in named_twice(cameras, {_camera(film): clip})]
+            cameras[_camera(film)] = clip
     actions = group.get("actions")
     if actions is not None and not _is_table(actions):
         faults.append((f"data/{name}", f"actions must be numbers [T, a], got {_shape(actions)}"))
