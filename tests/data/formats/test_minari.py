@@ -55,3 +55,10 @@ def test_observations_that_are_a_tuple(width, tmp_path, monkeypatch):
     found = read_minari(name, control_hz=25)
     assert found.state_names == (("0", "1") if width == 1 else ("0", "1_0", "1_1"))
     np.testing.assert_array_equal(found.states[0], np.repeat(PLACES, 1 + width, 1))
+
+
+def test_parts_of_a_tuple_are_in_the_order_of_their_numbers(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    parts = tuple([np.full(1, number, np.float32)] * 7 for number in range(12))
+    found = read_minari(write(tmp_path, Tuple([Box(-99, 99, (1,))] * 12), parts), control_hz=25)
+    assert found.state_names == tuple(map(str, range(12))) and found.states[0][0].tolist() == [*range(12)]

@@ -55,14 +55,16 @@ def numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def leaves(observations: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """Yields the arrays of nested dictionaries and tuples with joined names, in the order of the names."""
-    if isinstance(observations, tuple):
-        observations = {str(index): part for index, part in enumerate(observations)}
-    if not isinstance(observations, Mapping):
+    """Yields the arrays of nested dictionaries, by name, and tuples, by number, with joined names."""
+    if isinstance(observations, Mapping):
+        parts = [(key, observations[key]) for key in sorted(observations)]
+    elif isinstance(observations, tuple):
+        parts = list(enumerate(observations))
+    else:
         yield name, np.asarray(observations)
         return
-    for key in sorted(observations):
-        yield from leaves(observations[key], f"{name}_{key}" if name else str(key))
+    for key, part in parts:
+        yield from leaves(part, f"{name}_{key}" if name else str(key))
 
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
