@@ -204,3 +204,23 @@ def test_a_network_of_new_weights_each_time_is_refused_before_it_embeds(tmp_path
     with pytest.raises(ValueError, match="net.py:make' has other weights each time it is made: load them"):
         embed_recordings(recordings, task, tmp_path / "seen", network=f"{tmp_path / 'net.py'}:make")
     assert not (tmp_path / "seen").exists()
+
+
+def test_actions_are_those_of_the_first_source_with_labels(tmp_path):
+    states = np.random.default_rng(0).normal(size=(9, 2))
+
+    def stored(name, steps, names, *targets):
+        how = {"action_kind": "absolute", "targets": targets} if targets else {}
+        how |= {"control_hz": 10, "state_names": ["x", "y"], "action_names": names}
+        return save_demonstrations(tmp_path / name, [states], steps, **how)
+
+    hand = stored("hand", None, ["a", "b"])
+    robot = stored("robot", [states[1:]], ["to_x", "to_y"], "x", "y")
+    recordings, task = read_sources([hand, robot], None)
+    assert recordings.action_names == task.action_names == ("to_x", "to_y") and task.name == "robot"
+    assert [(action.kind, action.column) for action in task.actions.values()] == [("absolute", 0), ("absolute", 1)]
+    assert [np.isnan(steps).all() for steps in recordings.actions] == [True, False]
+    with pytest.raises(DataError, match="the target of action 'to_x' is 'y', before 'x'"):
+        read_sources([robot, stored("turned", [states[1:]], ["to_x", "to_y"], "y", "x")], None)
+    with pytest.raises(DataError, match="its actions are other, to_y; those of the first to_x, to_y"):
+        read_sources([hand, robot, stored("other", [states[1:]], ["other", "to_y"], "x", "y")], None)

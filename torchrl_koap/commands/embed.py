@@ -37,7 +37,8 @@ class Embed(Command):
         components: principal components per camera, fitted to the frames (a task with embeddings has its own number).
         network: "package.module:name" or "file.py:name" of a network of your own (default: EfficientNet-Lite0 of the
             extra "vision").
-        task: a task with embeddings among its columns, such as "scooping" (default: that of the first source).
+        task: a task with embeddings among its columns, such as "scooping" (default: that of the first
+            source with labels).
         projection: file of principal components to use (default: those of the task that come with the package, else
             they are fitted).
         plugins: modules that register tasks; imported before anything else.

@@ -51,8 +51,8 @@ class CameraReport:
 def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Recordings, Task]:
     """Reads data sets with camera frames as one: outputs of ``koap convert``, or any recordings if a task is given.
 
-    The task has columns for the embeddings; by default it is that of the first source. Raises a DataError if columns,
-    units or rates of the sources differ, or without task if a source is not converted.
+    The task has columns for the embeddings; by default it is that of the first source with labels. Raises a DataError
+    if columns, units or rates of the sources differ, or without task if a source is not converted.
     """
     found: list[Recordings] = []
     units: dict[str, str] = {}
@@ -68,24 +68,31 @@ def read_sources(sources: Sequence[str | Path], task: Task | None) -> tuple[Reco
         ]
         refuse(source, other)
         units |= own
-    return join_recordings(found), task or stored_task(stored_folder(sources[0]) or sources[0])
+    joined, telling = join_recordings(found), sources[_first_labelled(found)]
+    return joined, task or stored_task(stored_folder(telling) or telling)
+
+
+def _first_labelled(parts: Sequence[Recordings]) -> int:
+    """Returns the number of the first part with labels, which knows names, units and kinds of the actions; else 0."""
+    return next((number for number, part in enumerate(parts) if part.num_labels), 0)
 
 
 def _units(task: Task, *, labelled: bool) -> dict[str, str]:
-    """Returns the units that are given, and the kinds of actions; nothing about actions without labels."""
+    """Returns the units that are given, and kinds and targets of actions; nothing about actions without labels."""
     units = {
         f"the unit of column {name!r}": unit
         for name, unit in zip(task.observation_names, task.known_units, strict=True)
     }
     for name, action in task.actions.items() if labelled else ():
         units |= {f"the unit of action {name!r}": action.unit, f"the kind of action {name!r}": action.kind}
+        units |= {} if action.column is None else {f"the target of action {name!r}": task.state_names[action.column]}
     return {what: unit for what, unit in units.items() if unit}
 
 
 def join_recordings(parts: Sequence[Recordings]) -> Recordings:
     """Concatenates recordings with the same columns, with the cameras that all of them have."""
-    first = parts[0]
-    for other in parts[1:]:
+    first = parts[_first_labelled(parts)]
+    for other in parts:
         source, both = f"the source of {other.sources[0]}", (other, first)
         if other.state_names != first.state_names or other.actions[0].shape[1] != first.actions[0].shape[1]:
             columns = "; those of the first ".join(", ".join(part.state_names) for part in both)
