@@ -24,6 +24,9 @@ def test_a_data_set_of_format_3(tmp_path):
     assert info["features"]["observation.state"] == {"dtype": "float32", "shape": [2], "names": ["x", "y"]}
     listed = pq.read_table(tmp_path / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
     assert listed["length"] == [4, 6] and listed["dataset_to_index"] == [4, 10] and listed["tasks"] == [["go"]] * 2
+    tasks = pq.read_table(tmp_path / "meta/tasks.parquet")
+    assert tasks.to_pydict() == {"task_index": [0], "task": ["go"]}
+    assert tasks.schema.pandas_metadata["index_columns"] == ["task"]  # LeRobot takes a task's text from this index
     for number, file in enumerate(listed["data/file_index"]):
         place = info["data_path"].format(chunk_index=listed["data/chunk_index"][number], file_index=file)
         rows = pq.read_table(tmp_path / place).to_pydict()

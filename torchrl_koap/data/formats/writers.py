@@ -18,6 +18,13 @@ from torchrl_koap.files import DataError, option, replacing_file
 
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _CHUNK = 1000  # files per folder
+_INDEX = {  # LeRobot reads tasks by pandas and finds their descriptions in its index
+    "index_columns": ["task"],
+    "columns": [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": number, "metadata": None}
+        for name, kind, number in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ],
+}
 
 
 def write_npz(recordings: Recordings, out: Path) -> None:
@@ -111,7 +118,8 @@ class LeRobotWriter:
             "dataset_to_index": ends,
         }
         self._write("meta/episodes/chunk-000/file-000.parquet", listed)
-        self._write("meta/tasks.parquet", {"task_index": np.zeros(1, dtype=np.int64), "task": [self._task]})
+        tasks = {"task_index": np.zeros(1, dtype=np.int64), "task": [self._task]}
+        self._write("meta/tasks.parquet", tasks, {"pandas": json.dumps(_INDEX)})
         single = {"shape": [1], "names": None}
         features: dict[str, Any] = {
             name: {"dtype": "float32", "shape": [len(columns)], "names": columns}
@@ -141,9 +149,9 @@ class LeRobotWriter:
         flat = self._pyarrow.array(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
         return self._pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
-    def _write(self, place: str, columns: dict[str, Any]) -> None:
+    def _write(self, place: str, columns: dict[str, Any], about: dict[str, str] | None = None) -> None:
         with replacing_file(self._folder / place) as aside:
-            self._pyarrow.parquet.write_table(self._pyarrow.table(columns), aside)
+            self._pyarrow.parquet.write_table(self._pyarrow.table(columns, metadata=about), aside)
 
 
 def encode_png(frame: np.ndarray) -> bytes:
