@@ -138,6 +138,33 @@ def test_faults(tmp_path):
         read_lerobot(root, observations=["observation.sate"])
 
 
+def test_features_of_other_names_and_shapes(tmp_path):
+    matrix = {"dtype": "float32", "shape": [2, 2], "names": None}
+    with pytest.raises(DataError, match=r"'observation.turn' has shape \[2, 2\] and cannot be part of the state"):
+        read_lerobot(
+            write(tmp_path / "a", features=FEATURES | {"observation.turn": matrix}), observations=["observation.turn"]
+        )
+    features = {"state": FEATURES["observation.state"], "actions": FEATURES["action"]}
+    with pytest.raises(DataError, match=r"name those of the state in observations .*; there are state, actions"):
+        read_lerobot(write(tmp_path / "b", features=features))
+
+
+def test_a_data_set_without_rows(tmp_path):
+    root = write(tmp_path)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps(info | {"total_episodes": 0}))
+    file = root / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(file).slice(0, 0), file)
+    with pytest.raises(DataError, match="there are no trajectories"):
+        read_lerobot(root)
+
+
+def test_hidden_files_are_not_read(tmp_path):
+    root = write(tmp_path)
+    (root / "data/chunk-000/._file-000.parquet").write_bytes(b"of a file manager")
+    assert len(read_lerobot(root).states) == 2
+
+
 def test_a_silent_description_of_missing_actions(tmp_path):
     features = {name: feature for name, feature in FEATURES.items() if name != "action"}
     with pytest.raises(DataError, match="info.json does not give the number of action columns"):
@@ -166,6 +193,9 @@ FILES = [
     (lambda t: t.slice(0, 4), "FILE: episode 1 has 4 rows, its description says 6"),
     (edited("frame_index", put(5, 9)), "FILE: column 'frame_index' of episode 1 must count 0, 1, 2, ..."),
     (edited("observation.state", lambda rows: [row[:3] for row in rows]), "'observation.state' has rows of 3 and 7"),
+    (edited("episode_index", put(3, None)), "FILE: column 'episode_index' must hold whole numbers, got nan"),
+    (edited("episode_index", put(0, 1.5)), "FILE: column 'episode_index' must hold whole numbers, got 1.5"),
+    (lambda t: t.append_column("action", t["action"]), "FILE: two columns are named action"),
 ]
 
 

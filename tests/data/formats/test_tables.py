@@ -130,6 +130,14 @@ def test_columns_of_parquet_that_would_replace_each_other_are_refused(kind, tmp_
         read_tables(tmp_path)
 
 
+def test_columns_of_parquet_with_one_name_are_refused(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(pyarrow.table([np.arange(6)] * 2, names=["x", "x"]), tmp_path / "run.parquet")
+    with pytest.raises(DataError, match="run.parquet: two columns are named x"):
+        read_tables(tmp_path)
+
+
 def test_what_is_not_read_is_named(tmp_path):
     extra = {"obs": np.ones((6, 3)), "reward": np.zeros(5)}
     np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((5, 1)), control_hz=30.0, **extra)

@@ -289,7 +289,7 @@ def _video_starts(root: Path, camera: str) -> dict[int, tuple[int, int, float]]:
     """Returns chunk, file and start time (s) of every episode's video; empty before format 3.0."""
     columns = [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     found = {}
-    for file in (root / "meta/episodes").rglob("*.parquet"):
+    for file in (root / "meta/episodes").rglob("[!.]*.parquet"):
         table = import_pyarrow().parquet.read_table(file)
         if set(columns) <= set(table.column_names):
             for row in table.select(["episode_index", *columns]).to_pylist():

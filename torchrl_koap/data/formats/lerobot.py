@@ -52,6 +52,8 @@ def read_lerobot(
     chosen = usable if observations is None else list(observations)
     problems = [
         f"feature {name!r} is an image ({known[name].get('dtype')}) and cannot be part of the state: embed it first"
+        if name in cameras
+        else f"feature {name!r} has shape {known[name]['shape']} and cannot be part of the state, wanted a vector"
         for name in chosen
         if name in images
     ]
@@ -61,7 +63,8 @@ def read_lerobot(
         if name not in known
     ]
     if not chosen:
-        problems.append(f"no feature {PREFIX}* holds numbers; there are {', '.join(observed) or 'none'}")
+        cure = f"name those of the state in {option('observations')}"
+        problems.append(f"no feature {PREFIX}* holds numbers: {cure}; there are {', '.join(known) or 'none'}")
     refuse(root, problems)
     flags = [name for name in known if name not in observed and kind_of(name)[0] in ("start", "end")]
     rows, undescribed = _read_rows(Path(root), info, chosen, flags, episodes)
@@ -76,7 +79,7 @@ def read_lerobot(
     ]
     refuse(root, problems)
     if ACTION not in first and not width:
-        fault = "no file has actions, and info.json does not give the number of action columns"
+        fault = f"no file has a column {ACTION!r}, and info.json does not give the number of action columns"
         raise DataError(root, f"{fault}: pass {option('action_dim')}")
     names = [label for name in chosen for label in _names(known[name], name, first[name].shape[1])]
     beside = [name for name in (TIME, *flags) if name in first]
@@ -145,10 +148,13 @@ def _read_rows(
                 columns[name] = numbers(table[name], name, announced=announced, files=files)
             except ValueError as error:
                 problems.append(str(error))
+    if EPISODE in columns and (odd := np.flatnonzero(columns[EPISODE][:, 0] % 1 != 0)).size:
+        value = columns[EPISODE][odd[0], 0]
+        problems.append(f"{files[odd[0]]}: column {EPISODE!r} must hold whole numbers, got {value:g}")
     refuse(root, problems)
     episode, frame = (columns.pop(name)[:, 0] for name in (EPISODE, FRAME))
-    found, starts = np.unique(episode.astype(int), return_index=True)
-    ends, expected = [*starts[1:], len(episode)], _expected_lengths(root, info)
+    found, starts, lengths = np.unique(episode.astype(int), return_index=True, return_counts=True)
+    ends, expected = starts + lengths, _expected_lengths(root, info)
     missing = sorted((set(episodes) or expected.keys()) - {*found.tolist()})
     if missing:
         cure = f"name in {option('episodes')} those to read: {some(found)}"
@@ -178,7 +184,7 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
     The second value names the columns that are not read.
     """
     pyarrow = import_pyarrow()
-    files = sorted((root / "data").rglob("*.parquet"))
+    files = sorted((root / "data").rglob("[!.]*.parquet"))
     faults: list[tuple[str, str]] = []
     kinds: dict[str, Any] = {}
     there: dict[str, None] = {}
@@ -197,6 +203,9 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
         there |= dict.fromkeys(schema.names)
         lacking = [name for name in needed if name not in schema.names]
         faults += [(str(file), f"missing column {name!r}; it has {', '.join(schema.names)}") for name in lacking]
+        if twice := [name for name in (*needed, *wanted) if schema.names.count(name) > 1]:
+            faults.append((str(file), f"two columns are named {some(twice)}"))
+            continue
         for name in {*needed, *wanted}.intersection(schema.names):
             got = schema.field(name).type
             kind = number_type(got)
@@ -216,7 +225,7 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
 
 def _expected_lengths(root: Path, info: Mapping[str, Any]) -> dict[int, int | None]:
     """Returns the number of rows of every described episode; None if only the episode's number is known."""
-    listed, tables = root / "meta/episodes.jsonl", sorted((root / "meta/episodes").rglob("*.parquet"))
+    listed, tables = root / "meta/episodes.jsonl", sorted((root / "meta/episodes").rglob("[!.]*.parquet"))
     try:
         if listed.is_file():
             entries = [json.loads(line) for line in read_bytes(listed).splitlines() if line.strip()]

@@ -292,6 +292,9 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> Piece:
 def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> Piece:
     pyarrow = import_pyarrow()
     try:
+        names = pyarrow.parquet.read_schema(file).names
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two columns are named {some(twice)}")
         table = pyarrow.parquet.read_table(file)
     except pyarrow.ArrowException as error:
         raise ValueError("it is no parquet file, or damaged") from error
