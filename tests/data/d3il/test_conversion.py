@@ -152,6 +152,8 @@ def with_nan(robot):
         (broken(c_pos=with_nan), ["'robot/c_pos' is NaN or infinite in 1 values, first in row 3"]),
         (broken(c_pos=lambda r: r["c_pos"] / 0), ["'robot/c_pos' is NaN or infinite"]),
         (lambda c: c["red-box1"].update(quat=np.zeros((5, 3))), ["'red-box1/quat' must have shape (T, 4), got (5, 3)"]),
+        (lambda c: c["red-box1"].update(quat=np.zeros((5, 4))), ["'red-box1/quat' has norm 0 in row 0, wanted 1"]),
+        (lambda c: c["red-box1"]["quat"].__imul__([[1]] * 3 + [[2]] * 2), ["'red-box1/quat' has norm 2 in row 3"]),
         (broken(gripper_width=lambda r: r["c_pos"]), ["'robot/gripper_width' must have shape (T,), got (5, 3)"]),
         (broken(c_pos=lambda r: r["c_pos"].tolist()), ["'robot/c_pos' must be an array (T, 3), got list"]),
         (broken(c_pos=lambda r: r["c_pos"].astype("U8")), ["'robot/c_pos' must hold real numbers, got dtype <U8"]),

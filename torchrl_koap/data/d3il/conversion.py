@@ -38,6 +38,7 @@ ROBOT_COLUMNS: dict[str, tuple[int, ...]] = {
 }
 OBJECT_COLUMNS = {"sim_step": (), "pos": (3,), "quat": (4,)}
 _LEAST_ROWS = 2
+_UNIT = 0.01  # tolerance of a quaternion's norm, as of other recordings
 _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
 
 
@@ -179,6 +180,8 @@ def _problems(robot: Mapping[str, Any], objects: Mapping[str, Any], converter: C
         problems += [f"missing key '{name}/{key}'" for key in required if key not in entries]
         for key in (key for key in columns if key in entries):  # unknown entries are ignored
             problem = _array_problem(entries[key], columns[key])
+            if problem is None and key == "quat" and key in required:
+                problem = _rotation_problem(entries[key])
             if problem:
                 problems.append(f"'{name}/{key}' {problem}")
             else:
@@ -202,3 +205,9 @@ def _array_problem(value: Any, shape: tuple[int, ...]) -> str | None:
     if bad.any():
         return f"is NaN or infinite in {int(bad.sum())} values, first in row {int(np.argwhere(bad)[0][0])}"
     return None
+
+
+def _rotation_problem(quaternions: np.ndarray) -> str | None:
+    norms = np.linalg.norm(quaternions, axis=1)
+    off = np.flatnonzero(np.abs(norms - 1) > _UNIT)
+    return f"has norm {norms[off[0]]:.3g} in row {off[0]}, wanted 1 as of rotations" if len(off) else None
