@@ -166,6 +166,13 @@ def test_faults_of_the_description(options, message):
         make_demonstrations(STATES, ACTIONS, **{"control_hz": 20, "state_names": NAMES} | options)
 
 
+@pytest.mark.parametrize("given", [{"state_names": NAMES}, {"action_names": ["a", "b"]}, {"action_dim": 2}])
+def test_recordings_keep_their_names(given):
+    recordings = make_recordings(STATES, ACTIONS, control_hz=20)
+    with pytest.raises(ValueError, match=f"recordings already hold their actions and names; {[*given][0]} must be Non"):
+        make_demonstrations(recordings, **given)
+
+
 def test_what_never_changes_within_a_recording_is_not_the_robot():
     with_goal = [np.insert(frames[:, :2], 2, goal, axis=1) for goal, frames in enumerate(STATES)]
     assert make_demonstrations(with_goal, ACTIONS, control_hz=20)[1].robot == (0, 1)

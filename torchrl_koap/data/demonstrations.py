@@ -134,7 +134,7 @@ def make_demonstrations(
         DataError: listing all faults: those of :func:`~torchrl_koap.data.make_recordings`; missing or overlapping
             columns; wrong numbers of targets or units; a robot that never moves; a column that no float can hold; a
             command, or an action without a target, whose movement float32 cannot resolve.
-        ValueError: if a kind of action is unknown, or recordings come with ``actions``.
+        ValueError: if a kind of action is unknown, or recordings come with ``actions``, names or ``action_dim``.
 
     Warns:
         UserWarning: about unlikely data, as ``koap validate`` does, and trajectories and labels that are left out.
@@ -149,8 +149,9 @@ def make_demonstrations(
     for kind in (action_kind,) if isinstance(action_kind, str) else action_kind:
         lookup(ACTION_KINDS, kind, "kind of action")
     if isinstance(states, Recordings):
-        if actions is not None:
-            raise ValueError("recordings already hold their actions; actions must be None")
+        held = {"actions": actions, "state_names": state_names, "action_names": action_names, "action_dim": action_dim}
+        if given := [argument for argument, value in held.items() if value is not None]:
+            raise ValueError(f"recordings already hold their actions and names; {', '.join(given)} must be None")
         recordings = states
     else:
         recordings = make_recordings(
