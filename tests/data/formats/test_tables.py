@@ -72,6 +72,12 @@ def test_rows_that_begin_like_comments_are_listed(tmp_path):
     assert recordings.states[0].tolist() == [[4], [5]] and "2 rows of run.csv that begin with #" in recordings.skipped
 
 
+def test_only_the_first_name_loses_the_mark_of_comments(tmp_path):
+    (tmp_path / "run.csv").write_text("# t,x,joint #,#\n0,1,2,3\n1,4,5,6\n")
+    found = read_tables(tmp_path, action_dim=1)
+    assert found.state_names == ("x", "joint #", "#") and found.states[0].tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
 def test_named_action_columns_and_episodes(tmp_path):
     columns = columns_of(vx=[1.0] * 6, episode=[0, 0, 0, 1, 1, 1])
     columns["timestamp"] = [0.0, 0.1, 0.2] * 2

@@ -266,8 +266,8 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> Piece:
         rows = [*[(line, row) for line, row in found if row[0][:1] == "#" and line < rows[0][0]][-1:], *rows]
     if len(rows) < 2:
         raise ValueError("wanted a header and a row per frame")
-    header = [" ".join(name.strip("# ").split()) for name in rows[0][1]]
-    header[0] = header[0] or "unnamed: 0"  # the row index of pandas
+    header = [" ".join(name.split()) for name in rows[0][1]]
+    header[0] = header[0].lstrip("# ") or "unnamed: 0"  # the row index of pandas
     if None not in map(number_of, header):
         raise ValueError("its first row holds numbers, wanted the names of the columns")
     for place, name in enumerate(header):
