@@ -126,3 +126,11 @@ def test_episodes_may_have_names_instead_of_numbers(kind, tmp_path):
     named = states | {"episode": np.array(["reach", "push"]).repeat(20)}
     found = read_recordings(WRITERS[kind](tmp_path, [(named, actions)]))
     np.testing.assert_array_equal(np.stack(found.states)[..., 0], states["q0"].reshape(2, 20))
+
+
+def test_recordings_in_another_format_are_listed(recordings, tmp_path):
+    write_recordings(recordings, tmp_path / "arm", "lerobot")
+    assert "another format" not in str(read_recordings(tmp_path / "arm").skipped)
+    np.savez(tmp_path / "arm" / "more.npz", states=np.zeros((4, 2)))
+    (said,) = [said for said in read_recordings(tmp_path / "arm").skipped if "another format" in said]
+    assert said.startswith("a table, or a folder of tables")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +173,9 @@ def read_recordings(
     unfit = [name for name in given if name not in form.options]
     if unfit:
         raise ValueError(f"{', '.join(map(option, unfit))}: not an option for {form.what}")
-    return form.read(str(source), **given)
+    found = form.read(str(source), **given)
+    others = [f"{other.what} (another format)" for other in FORMATS.values() if other != form and other.matches(source)]
+    return replace(found, skipped=(*found.skipped, *others))
 
 
 def find_format(source: str | Path) -> str | None:
