@@ -159,6 +159,14 @@ def test_a_data_set_without_rows(tmp_path):
         read_lerobot(root)
 
 
+def test_a_damaged_name_of_a_column(tmp_path):
+    root = write(tmp_path, change={"zzzz": pa.array(np.arange(12))})
+    file = root / "data/chunk-000/file-000.parquet"
+    file.write_bytes(file.read_bytes().replace(b"zzzz", b"\xe3zzz"))
+    with pytest.raises(DataError, match="file-000.parquet: it is no parquet file, or damaged"):
+        read_lerobot(root)
+
+
 def test_hidden_files_are_not_read(tmp_path):
     root = write(tmp_path)
     (root / "data/chunk-000/._file-000.parquet").write_bytes(b"of a file manager")

@@ -196,8 +196,10 @@ def test_faults(file, tmp_path):
     with pytest.raises(DataError, match="data/demo_10: it has no group 'obs'"):
         read_robomimic(file)
     (tmp_path / "text.hdf5").write_text("text")
-    with pytest.raises(DataError, match="no HDF5 file"):
-        read_robomimic(tmp_path / "text.hdf5")
+    (tmp_path / "damaged.hdf5").write_bytes(file.read_bytes().replace(b"SNOD", b"SNOX"))  # marks of groups
+    for name in ("text", "damaged"):
+        with pytest.raises(DataError, match=f"{name}.hdf5 cannot be used: it is no HDF5 file, or damaged"):
+            read_robomimic(tmp_path / f"{name}.hdf5")
 
 
 @pytest.mark.parametrize(

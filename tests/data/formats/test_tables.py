@@ -185,9 +185,11 @@ def test_a_rate_that_is_given_needs_no_time_stamps(tmp_path):
         read_tables(tmp_path, control_hz=30, action_columns=["akcion"])
 
 
-@pytest.mark.parametrize("content", [b"", b"PK no archive", b"\x93NUMPY"])
+@pytest.mark.parametrize("content", [b"", b"PK no archive", b"\x93NUMPY", None])
 def test_damaged_archives_are_named(content, tmp_path):
-    (tmp_path / "a.npz").write_bytes(content)
+    np.savez(tmp_path / "a.npz", states=FRAMES)
+    damaged = (tmp_path / "a.npz").read_bytes().replace(b"PK\1\2", b"PK\1\3")  # of the list of entries
+    (tmp_path / "a.npz").write_bytes(damaged if content is None else content)
     with pytest.raises(DataError, match=r"a\.npz: "):
         read_tables(tmp_path)
 

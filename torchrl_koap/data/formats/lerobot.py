@@ -194,13 +194,13 @@ def _read_table(root: Path, needed: Sequence[str], wanted: Sequence[str]):
         try:
             check_file(file, largest=_LARGEST)
             schema = pyarrow.parquet.read_schema(file)
-        except pyarrow.ArrowException:
+            there |= dict.fromkeys(schema.names)
+        except (pyarrow.ArrowException, UnicodeDecodeError):
             faults.append((str(file), "it is no parquet file, or damaged"))
             continue
         except OSError as error:
             faults.append((str(file), f"it cannot be read: {error}"))
             continue
-        there |= dict.fromkeys(schema.names)
         lacking = [name for name in needed if name not in schema.names]
         faults += [(str(file), f"missing column {name!r}; it has {', '.join(schema.names)}") for name in lacking]
         if twice := [name for name in (*needed, *wanted) if schema.names.count(name) > 1]:

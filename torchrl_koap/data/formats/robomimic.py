@@ -62,7 +62,7 @@ def read_robomimic(
         try:
             with h5py.File(each, "r") as stream:
                 found, rates[each], unread = _read(stream, each, observations, use_next=NEXT not in drop_columns)
-        except OSError as error:
+        except (OSError, RuntimeError, KeyError, UnicodeDecodeError) as error:  # depending on what is damaged
             raise DataError(each, "it is no HDF5 file, or damaged") from error
         several = len(files) > 1 and len(found) > 1
         pieces += [replace(piece, name=f"{each.stem}/{piece.name}") if several else piece for piece in found]

@@ -118,10 +118,15 @@ def _stamped(piece: Piece, counted: Mapping[str, tuple[str | None, float]]) -> P
 
 
 def _entries(file: Path) -> dict[str, np.ndarray]:
+    damaged = "it is no NumPy archive, as np.savez writes them, or damaged"
     if not zipfile.is_zipfile(file):
-        raise ValueError("it is no NumPy archive, as np.savez writes them, or damaged")
+        raise ValueError(damaged)
+    try:
+        opened = np.load(file, allow_pickle=False)
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise ValueError(damaged) from error
     entries = {}
-    with np.load(file, allow_pickle=False) as archive:
+    with opened as archive:
         for name in archive.files:
             try:
                 entries[name] = archive[name]
