@@ -76,7 +76,7 @@ def write_hdf5(folder: Path, episodes: Episodes) -> str:
     return str(folder / "all.hdf5")
 
 
-def store_minari(root: Path, name: str, space, action_space, episodes: list[tuple]) -> str:
+def store_minari(root: Path, name: str, space, action_space, episodes: list[tuple], infos=None) -> str:
     """Writes through Minari's own storage, since its collector needs further packages."""
     pytest.importorskip("minari")
     from minari.data_collector import EpisodeBuffer
@@ -86,7 +86,7 @@ def store_minari(root: Path, name: str, space, action_space, episodes: list[tupl
     storage = MinariStorage.new(root / name / "data", space, action_space)
     for number, (observations, actions) in enumerate(episodes):
         steps = len(actions)
-        rest = {"rewards": [0.0] * steps, "truncations": [False] * steps, "infos": {}}
+        rest = {"rewards": [0.0] * steps, "truncations": [False] * steps, "infos": infos or {}}
         ends = [False] * (steps - 1) + [True]
         storage.update_episodes(
             [EpisodeBuffer(id=number, observations=observations, actions=actions, terminations=ends, **rest)]

@@ -71,6 +71,12 @@ def test_columns_whose_names_repeat_are_numbered(feature, tmp_path):
 VERSIONS = pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 
 
+def test_names_in_several_groups(tmp_path):
+    arms = {"left": [f"left_{joint}" for joint in JOINTS[:4]], "right": [f"right_{joint}" for joint in JOINTS[:3]]}
+    features = FEATURES | {"observation.state": {**FEATURES["observation.state"], "names": arms}}
+    assert read_lerobot(write(tmp_path, features=features)).state_names[:7] == (*arms["left"], *arms["right"])
+
+
 @pytest.mark.parametrize("given", [{"x": None}, {name: None if name == JOINTS[3] else 1 for name in JOINTS}])
 def test_names_without_numbers_are_not_used(given, tmp_path):
     features = FEATURES | {"observation.state": {**FEATURES["observation.state"], "names": given}}

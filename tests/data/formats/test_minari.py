@@ -12,9 +12,9 @@ from torchrl_koap.files import DataError
 PLACES = [np.full(1, 0.5 * step, np.float32) for step in range(7)]
 
 
-def write(root, space, observations):
+def write(root, space, observations, infos=None):
     episode = observations, [np.full(1, 0.5, np.float32)] * 6
-    return store_minari(root, "slider/test-v0", space, Box(-1, 1, (1,)), [episode] * 2)
+    return store_minari(root, "slider/test-v0", space, Box(-1, 1, (1,)), [episode] * 2, infos)
 
 
 @pytest.fixture
@@ -62,3 +62,10 @@ def test_parts_of_a_tuple_are_in_the_order_of_their_numbers(tmp_path, monkeypatc
     parts = tuple([np.full(1, number, np.float32)] * 7 for number in range(12))
     found = read_minari(write(tmp_path, Tuple([Box(-99, 99, (1,))] * 12), parts), control_hz=25)
     assert found.state_names == tuple(map(str, range(12))) and found.states[0][0].tolist() == [*range(12)]
+
+
+def test_infos_are_listed(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    infos = {"force": [np.zeros(3)] * 7, "robot": {"joint": [0.0] * 7}}
+    found = read_minari(write(tmp_path, Box(-9, 9, (1,)), PLACES, infos), control_hz=25)
+    assert found.skipped == ("infos/force", "infos/robot_joint") and found.state_names == ("state",)

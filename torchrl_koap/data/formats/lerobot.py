@@ -255,15 +255,14 @@ def _camera_names(features: Sequence[str]) -> dict[str, str]:
 
 
 def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
-    """Returns a feature's column names: a list (in a list), ``{"motors": [...]}``, ``{"pan": 0, ...}``, or numbers.
+    """Returns a feature's column names: a list (in a list), ``{"left": [...], ...}``, ``{"pan": 0}``, or numbers.
 
     Names of another number, or that repeat, are not used.
     """
     given, short = feature.get("names"), name.removeprefix(PREFIX)
     if isinstance(given, Mapping):
-        listed = next(iter(given.values()), None)
-        counted = all(isinstance(place, int) for place in given.values())
-        given = listed if isinstance(listed, list) else sorted(given, key=given.get) if counted else None
+        listed, counted = (all(isinstance(part, kind) for part in given.values()) for kind in (list, int))
+        given = sum(given.values(), []) if listed else sorted(given, key=given.get) if counted else None
     if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
         given = given[0]
     named = isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given)

@@ -35,7 +35,7 @@ def read_minari(source: str, **options: Any) -> Recordings:
     pieces, faults = [], []
     for episode in dataset.iterate_episodes():
         states: dict[str, np.ndarray] = {}
-        unread: list[str] = []
+        unread = [f"infos/{name}" for name, _ in leaves(episode.infos or {})]
         called = f"episode {episode.id}"
         for name, array in leaves(episode.observations):
             if array.ndim > 2 or array.dtype.kind not in "fiub":
