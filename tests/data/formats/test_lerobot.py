@@ -285,6 +285,16 @@ def test_invalid_descriptions(tmp_path):
         (root / "meta/info.json").write_text(text)
         with pytest.raises(DataError, match=message):
             read_lerobot(root)
+    shaped = FEATURES | {"action": {"dtype": "float32", "shape": 7}}
+    for change, message in (
+        ({"features": shaped}, "info.json cannot be used: 'shape' of action must be a list of numbers"),
+        ({"video_path": "{camera}/{file_index}.mp4"}, "info.json: 'video_path' has an unknown part: 'camera'"),
+        ({"fps": float("inf")}, "info.json holds no fps: pass control_hz"),
+    ):
+        described = {"codebase_version": "v3.0", "fps": 30, "total_episodes": 2, "features": FEATURES} | change
+        (root / "meta/info.json").write_text(json.dumps(described))
+        with pytest.raises(DataError, match=message):
+            read_lerobot(root)
     root = write(tmp_path / "other")
     (root / "meta/episodes.jsonl").write_text('{"episode_index": 0}')
     with pytest.raises(DataError, match="list of its episodes cannot be read"):

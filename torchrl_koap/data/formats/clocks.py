@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -59,7 +60,7 @@ def clocks_of(columns: Sequence[Mapping[str, np.ndarray]], sources: Sequence[str
 
 def declared_rate(value: Any) -> float | None:
     """Returns the frames per second that a source declares; None if the value is no positive number."""
-    return float(value) if isinstance(value, (int, float)) and value > 0 else None
+    return float(value) if isinstance(value, (int, float)) and 0 < value < math.inf else None
 
 
 def usual_rate(clock: Clock, problems: list[str]) -> float | None:

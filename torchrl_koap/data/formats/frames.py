@@ -25,7 +25,7 @@ import numpy as np
 
 from torchrl_koap.data.formats.clocks import declared_rate
 from torchrl_koap.data.formats.parquet import import_pyarrow
-from torchrl_koap.files import read_bytes, some
+from torchrl_koap.files import DataError, read_bytes, some
 from torchrl_koap.lookup import import_extra
 
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -276,7 +276,11 @@ def lerobot_clips(
             size = int(info.get("chunks_size") or 1000)
             names = {"video_key": camera, "episode_index": number, "episode_chunk": number // size}
             chunk, file, start = begins.get(number, (0, 0, 0.0))
-            path = Path(root) / str(info.get("video_path")).format(**names, chunk_index=chunk, file_index=file)
+            try:
+                place = str(info.get("video_path")).format(**names, chunk_index=chunk, file_index=file)
+            except (KeyError, IndexError, ValueError) as error:
+                raise DataError(root, f"info.json: 'video_path' has an unknown part: {error}") from error
+            path = Path(root) / place
             if fps is not None and path.is_file():
                 stamps = columns.get("timestamp", np.full((1, 1), np.nan))[:, 0]
                 shown = stamps * fps if np.isfinite(stamps).all() else columns["frame_index"]

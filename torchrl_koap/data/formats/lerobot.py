@@ -125,6 +125,9 @@ def _read_info(root: str | Path) -> dict[str, Any]:
     features = info.get("features") or {}
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
         raise DataError(file, "'features' must be a dictionary of dictionaries")
+    odd = [name for name, feature in features.items() if not isinstance(feature.get("shape") or [], list)]
+    if odd:
+        raise DataError(file, f"'shape' of {some(odd)} must be a list of numbers")
     if (version := str(info.get("codebase_version", "v3.0")))[:3] not in ("v2.", "v3."):
         raise DataError(file, f"its codebase_version is {version}, wanted 2.x or 3.x")
     return info | {"features": features}
