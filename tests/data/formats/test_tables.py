@@ -126,6 +126,17 @@ def test_parquet_is_read_as_csv_is(tmp_path):
     np.testing.assert_allclose(recordings.states[0], FRAMES)
 
 
+@pytest.mark.parametrize("kind", ["null", "list"])
+def test_a_column_of_empty_lists_holds_no_actions(kind, tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    empty = pyarrow.nulls(6, pyarrow.null() if kind == "null" else pyarrow.list_(pyarrow.float32()))
+    for name, actions in (("a", [[0.1, 0.2]] * 6), ("b", empty)):
+        parquet.write_table(pyarrow.table(columns_of(action=actions)), tmp_path / f"{name}.parquet")
+    found = read_tables(tmp_path, control_hz=10)
+    assert found.num_labels == 5 and np.isnan(found.actions[1]).all() and found.action_names == ("action_0", "action_1")
+
+
 @pytest.mark.parametrize("kind", [int, float])
 def test_columns_of_parquet_that_would_replace_each_other_are_refused(kind, tmp_path):
     pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")

@@ -309,6 +309,8 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> Piece:
         if pyarrow.types.is_boolean(values.type):
             values = values.cast(pyarrow.int8())
         kind = number_type(values.type)
+        if is_action(name) and values.null_count == len(values) and kind in (None, pyarrow.list_(pyarrow.float64())):
+            continue  # no labels, and no width
         whole = pyarrow.types.is_integer(values.type)
         if kind is None or whole:  # text, dates, pictures, numbers of episodes
             plain = whole or pyarrow.types.is_temporal(values.type)
