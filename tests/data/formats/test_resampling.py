@@ -51,7 +51,7 @@ def test_changes_are_summed_and_other_actions_are_held():
 def test_steps_with_an_unlabelled_part(kind, known):
     steps = np.ones((40, 1))
     steps[11] = np.nan  # in the second half of the second new step
-    found = resampled(recorded(TIME, actions=steps), 2.5 if kind == "change" else 10, kind)
+    found = resampled(recorded(TIME, actions=steps), 2.5, kind)
     np.testing.assert_array_equal(np.isfinite(found.actions[0][:4, 0]), known)
 
 

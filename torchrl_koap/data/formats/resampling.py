@@ -34,7 +34,7 @@ def resampled(
 
     States are interpolated linearly. The nearest frame is used where a column leaps (a wrapped angle, a quaternion that
     changes sign), in columns of at most ten integers (a switch), and for cameras. Changes over one frame are summed
-    over the new step; other actions take their value at its beginning. A step with an unlabelled part has no label. A
+    over the new step; if part of it is unlabelled, it has no label. Other actions take their value at its beginning. A
     gap of more than 2.5 steps, recorded or new, ends a trajectory; ``skipped`` counts these.
 
     ``action_kind`` is as for :func:`~torchrl_koap.data.make_demonstrations`. ``times`` are the increasing times of
