@@ -52,6 +52,7 @@ FEW = rates(0.95) | {"mode_entropy": 0.3}
         ({"evaluation": rates(0.5), "summary": {"planner_parameters": 0}}, []),  # a policy of its own
         ({"evaluation": FEW, "task": AVOIDING}, ["koap inspect {run}"]),
         ({"evaluation": FEW | {"mode_entropy": 0.8}, "task": AVOIDING}, []),
+        ({"evaluation": FEW | {"pooled_mode_entropy": 0.9}, "task": AVOIDING}, []),  # few rollouts per context
         ({"evaluation": FEW}, []),  # modes of which nothing is known
         ({"evaluation": {"plan_ms": 40.0}, "task": AVOIDING}, ["koap latency {run}"]),
         ({"evaluation": {"plan_ms": 30.0}, "task": AVOIDING}, []),

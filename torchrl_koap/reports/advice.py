@@ -68,8 +68,8 @@ def advice(run: RunFacts) -> Iterator[Advice]:
             "a few more labels may suffice, where they teach the decoder most",
             "koap suggest {run} --count 5",
         )
-    entropy, even = run.evaluation.get("mode_entropy"), run.expected_entropy
-    entropy = run.evaluation.get("pooled_mode_entropy") if entropy is None else entropy
+    # an entropy per context is lower, since a context has few successes
+    entropy, even = run.evaluation.get("pooled_mode_entropy", run.evaluation.get("mode_entropy")), run.expected_entropy
     if entropy is not None and even and entropy < FEW_MODES * even:
         seen = f"the entropy of the modes is {entropy:.2f}, a uniform choice would average {even:.2f}"
         if policy:
