@@ -89,3 +89,13 @@ def test_a_training_whose_first_gradients_are_zero_begins_later():
         x.grad = torch.full_like(x, length)
         factor = limit().item()
     assert factor == 1.0 and x.grad.item() == 3.0
+
+
+def test_a_gradient_too_long_for_its_type_does_not_end_the_clipping():
+    """Its entries are finite, the sum of their squares is not."""
+    x = nn.Parameter(torch.zeros(2))
+    limit = AdaptiveClipping([x], decay=0.999)
+    for length in [3.0] * SETTLED + [1e25, 60.0]:
+        x.grad = torch.full_like(x, length)
+        factor = limit().item()
+    assert factor == pytest.approx(0.25, rel=0.01)

@@ -38,7 +38,7 @@ def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
 def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
     """Makes the moving average, in a loss's ``target_*_params``, that is used after training.
 
-    :func:`train_phase` steps it. The decay per update is ``1 - 10 / (num_steps + 10)``, at most 0.998.
+    :func:`train_phase` steps it. The decay per update is ``1 - 10 / (num_steps + 10)``, but in 0.84 to 0.998.
     """
     decay = min(0.998, 1 - 10 / (num_steps + 10))
     return SoftUpdate(loss_module, eps=max(0.5, decay**AVERAGE_EVERY))  # SoftUpdate warns below 0.5
@@ -231,6 +231,7 @@ class AdaptiveClipping(nn.Module):
         factor = torch.where((self.seen < SETTLED) | (typical == 0), 1.0, factor).to(length)
         if factor.is_cuda or factor < 1:  # reading it on a GPU would synchronise
             torch._foreach_mul_(gradients, factor)
-        self.mean_square.lerp_((factor * length).square().to(self.mean_square), 1 - self.decay)
+        square = (factor * length).square().nan_to_num(0.0, posinf=0.0)
+        self.mean_square.lerp_(square.to(self.mean_square), 1 - self.decay)
         self.seen += 1
         return factor
