@@ -40,7 +40,7 @@ from torchrl_koap.tasks import Task, get_task
 MAX_ATTEMPTS = 20
 BATCH_SIZE = 50  # parallel episodes; few enough that the first end within seconds
 _PER_CONTEXT = 4  # attempts before an episode gets another context
-_CONTEXT_STREAM = 1  # random stream of contexts, separate from those of the experts
+_CONTEXT_STREAM = 1  # last number in the seed of contexts, which second attempts of episodes 0, 4, ... share
 
 
 class RecordingError(RuntimeError):
