@@ -47,6 +47,14 @@ def test_labels_of_first_steps_alone_show_no_change(trained):
     assert check_loop(model, first, first) == {"note": "no command changes in the labels", "faults": []}
 
 
+def test_replayed_actions_do_not_continue_behind_a_gap_in_the_labels(trained, monkeypatch):
+    monkeypatch.setattr(loop_on_labels, "STEPS", 30)
+    model, data = trained
+    step = data["step_count"].reshape(-1, 1)
+    apart = data.clone().set("has_action", data["has_action"] & ((step < 5) | (step > 73)))
+    assert "note" not in check_loop(model, apart, apart)
+
+
 def test_commands_are_counted_in_those_of_the_budget_and_noise_is_that_of_the_seed(trained, monkeypatch):
     monkeypatch.setattr(loop_on_labels, "STEPS", 30)
     model, data = trained

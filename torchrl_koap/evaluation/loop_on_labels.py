@@ -141,11 +141,17 @@ def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, flo
 
 
 def _replay_error(response: Response, data: TensorDictBase) -> float:
-    """Returns how far replayed actions end from their recordings (median of trajectories, standard deviations)."""
+    """Returns how far replayed actions end from their recordings (median of trajectories, standard deviations).
+
+    Replays the longest unbroken stretch of labels of each trajectory.
+    """
     spread = _spread(data)
     apart = []
     for number in labelled_episodes(data)[:ROBOTS].tolist():
-        rows = data[(data[EPISODE] == number) & data[HAS_ACTION].squeeze(-1)][:STEPS]
+        rows = data[data[EPISODE] == number]
+        labelled, lengths = rows[HAS_ACTION].squeeze(-1).unique_consecutive(return_counts=True)
+        stretches = zip(labelled.tolist(), rows.split(lengths.tolist()), strict=True)
+        rows = max((part for known, part in stretches if known), key=len)[:STEPS]
         frames, action = rows[OBSERVATION].double(), rows[ACTION].double()
         if len(rows) < 3:
             continue
