@@ -54,7 +54,7 @@ def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
 
 
 def plan_errors(planner: StatePlanner, data: TensorDictBase, task: Task, *, seed: int = 0) -> dict[str, Any]:
-    """Scores a planner on unseen trajectories and compares it with standing still and constant velocity.
+    """Scores a planner on held-out trajectories and compares it with standing still and constant velocity.
 
     Samples :data:`SAMPLES` plans in each of at most :data:`SITUATIONS` situations. These are spread evenly over all
     steps whose whole future is recorded.

@@ -30,8 +30,9 @@ _COMMANDS = "the controller decodes no recorded states: it follows plans from it
 def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Evaluates a run on recorded data; raises an error if the data set is missing or changed.
 
-    Plans are scored on trajectories that the planner has not seen. Actions are scored on labels outside the budget and,
-    leaving out one trajectory at a time, inside it. The whole policy acts on a linear model of the robot's response.
+    Plans are scored on held-out trajectories, which only chose the planner's weights. Actions are scored on labels
+    outside the budget and, leaving out one trajectory at a time, inside it. The whole policy acts on a linear model of
+    the robot's response.
 
     Returns:
         tuple: ``kind`` ``"offline"``, ``plan_errors``, ``action_errors`` and ``loop``, ``relative_plan_error`` (1: no

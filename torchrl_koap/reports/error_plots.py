@@ -173,7 +173,8 @@ def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
     "plan_errors.png",
     source="eval.json",
     title="Errors of the plans",
-    caption="Measured on held-out recordings, which the planner has never seen, for each planned step. Lower is better."
+    caption="Measured on held-out recordings, which only chose the planner's weights, for each planned step. Lower is"
+    " better."
     " Left: the energy score, which is the distance of the plans from the recording, less half of the distance between"
     " plans. Right: the distance of the nearest plan. Dashed lines need no learning. Each row of panels is one unit; a"
     " distance is over all columns of that unit.",

@@ -67,7 +67,7 @@ def held_out_facts(data: TensorDictBase, episodes: Sequence[int]) -> dict[str, A
 
 
 def held_out_by(source: Path, data: TensorDictBase) -> list[int]:
-    """Returns the numbers that the trajectories which a run's planner has never seen have in flat data ``[N]``.
+    """Returns the numbers that the trajectories held out from a run's planner have in flat data ``[N]``.
 
     If these numbers now mean others, they are found by their states; none if the run holds no demonstrations.
     """

@@ -49,7 +49,7 @@ class Trained:
         controller (nn.Module, optional): the controller, or the network that samples actions; None if only a planner
             was trained.
         results (mapping): last losses, labels used and results of a closed form, as in ``summary.json``.
-        held_out (tuple of int): trajectories that the planner has never seen.
+        held_out (tuple of int): trajectories that did not train the planner; its score on them chose its weights.
         folder (Path, optional): the run directory or file that it was loaded from.
         cameras (mapping): projection of every camera whose embeddings are columns of the task.
 
