@@ -150,6 +150,7 @@ def test_rows_are_taken_evenly_from_the_first_to_the_last():
     rows = torch.arange(10)
     assert spread_evenly(rows, 4).tolist() == [0, 3, 6, 9]
     assert spread_evenly(rows, 10) is rows and len(spread_evenly(rows[:0], 4)) == 0
+    assert len(spread_evenly(rows[:1].expand(2**24 + 4), 4)) == 4  # float32 does not hold the last row's number
 
 
 def make(share):

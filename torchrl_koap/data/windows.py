@@ -229,7 +229,10 @@ class WindowSampler(RandomSampler):
 
 def spread_evenly(rows: Rows, most: int) -> Rows:
     """Returns at most ``most`` of the rows, spread evenly from the first to the last."""
-    return rows if len(rows) <= most else rows[torch.linspace(0, len(rows) - 1, most).round().long()]
+    if len(rows) <= most:
+        return rows
+    last = len(rows) - 1  # may be rounded up
+    return rows[torch.linspace(0, last, most).round().long().clamp_max(last)]
 
 
 def cut_windows(
