@@ -75,7 +75,8 @@ def prediction_errors(
     ``reconstruction``, :math:`g_\psi(g_\theta(x_{t+h}))`, is the part of the first one's error due to mapping back.
 
     Both ``u`` and ``v`` read recorded states *ahead* of every step, so this tests the models; it is no forecast. The
-    linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others.
+    linear model is fitted on the trajectories ``fit_on``, and all three are tested on the others. The training of the
+    Koopman model has seen most of these.
 
     Returns, by model and part, the root mean square distance after ``1 .. horizon`` steps, in raw units. A horizon that
     exceeds a trajectory is an error.
