@@ -129,6 +129,10 @@ def test_states_beside_the_demonstrations_are_far():
     distances = distance_to_demonstrations(AVOIDING, [near], data)
     assert distances["visited_95"] < 1.5 * distances["demonstrated_95"]
     assert distance_to_demonstrations(AVOIDING, [far], data)["visited_95"] > 5
+    there, moved = data.clone(), near.clone()
+    there["state"] += 256  # m; float32 squares of such numbers hide the distances
+    moved["observation"] += 256
+    assert distance_to_demonstrations(AVOIDING, [moved], there) == pytest.approx(distances, rel=0.05)
 
 
 @pytest.mark.parametrize("command", ["eval --no-report", "eval --no-report --strategy oracle", "inspect"])

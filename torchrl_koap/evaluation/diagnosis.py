@@ -182,11 +182,12 @@ def distance_to_demonstrations(task: Task, episodes: Sequence[TensorDict], data:
     in standard deviations (root mean square over columns); an empty dict for a single demonstration.
     """
     even = data[EPISODE] % 2 == 0
-    known, held_out = data[STATE][even], data[STATE][~even]
+    recorded = data[STATE].double()  # distances are small compared with coordinates
+    known, held_out = recorded[even], recorded[~even]
     if not len(held_out):
         return {}
     scale = known.std(0).clamp_min(1e-6) * task.state_dim**0.5
-    visited = torch.cat([task.state_of(episode[OBSERVATION]) for episode in episodes])
+    visited = torch.cat([task.state_of(episode[OBSERVATION]).double() for episode in episodes])
     known, found = known[:: max(1, len(known) // 20000)] / scale, {}
     for name, states in {"visited_95": visited, "demonstrated_95": held_out}.items():
         parts = (states[:: max(1, len(states) // _MOST_STATES)] / scale).split(2048)
