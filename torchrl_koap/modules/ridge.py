@@ -87,7 +87,8 @@ def ridge(
         default_penalty (float, optional): used without any choice if there are fewer than three groups.
         input_noise (float): :math:`s^2`, in units of the mean square norm of the inputs. Defaults to 0.
         bias (bool): fit ``b``; otherwise it is 0. Defaults to ``True``.
-        prior (Tensor, optional): the penalty shrinks ``D`` towards it, ``[act, m]``. Defaults to 0.
+        prior (Tensor, optional): the penalty shrinks ``D`` towards it, ``[act, m]``. Defaults to 0. If it was fitted to
+            the targets, held-out errors are too low.
         alike (bool): all targets share one penalty; otherwise each has its own. Defaults to ``True``.
 
     Returns:
