@@ -86,6 +86,15 @@ def test_labels_that_leap():
     assert list(spike_warnings([(np.arange(19) == 7).astype(float)[:, None]], ["a.csv"], ["v"])) == []  # a switch
 
 
+def test_a_single_label_between_gaps_is_no_leap():
+    steps = np.sin(np.arange(200)[:, None] / 11)
+    steps[60:95] = steps[96:130] = np.nan
+    assert list(spike_warnings([steps], ["a.csv"], ["v"])) == []
+    steps[150] += 2 * np.pi
+    (warning,) = spike_warnings([steps], ["a.csv"], ["v"])
+    assert "in label 150 of a.csv" in warning
+
+
 OFTEN = np.where(np.arange(60) % 3, 1, -1)[:, None]
 
 

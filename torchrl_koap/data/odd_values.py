@@ -179,11 +179,12 @@ def scale_warnings(
 
 
 def spike_warnings(actions: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> Iterator[str]:
-    """Finds labels ``[T_i, a]`` that leap for one frame."""
-    known = [(name, steps) for name, steps in zip(called, actions, strict=True) if len(steps) > 2]
+    """Finds labels in actions ``[T_i, a]``, NaN where unlabelled, that leap for one frame."""
+    labels = [steps[np.isfinite(steps).all(-1)] for steps in actions]
+    known = [each for *each, own in zip(called, actions, labels, strict=True) if len(own) > 2]
     if not known:
         return
-    bound, _ = leap_bounds([steps for _, steps in known])
+    bound, _ = leap_bounds([own for own in labels if len(own) > 2])
     for column, name in enumerate(names):
         found = []
         for source, steps in known:

@@ -64,8 +64,8 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
     constants = zip(task.action_names, constant_columns(data.get(keys.ACTION).cpu().numpy()), strict=True)
     _, short_plans = plan_coverage(data, task.control_hz)
     known = data.get(keys.HAS_ACTION).squeeze(-1).split(lengths)
-    actions = zip(data.get(keys.ACTION).split(lengths), known, strict=True)
-    labels = [steps[labelled].double().cpu().numpy() for steps, labelled in actions]
+    actions = [steps.double().cpu().numpy() for steps in data.get(keys.ACTION).split(lengths)]
+    labels = [steps[labelled.cpu().numpy()] for steps, labelled in zip(actions, known, strict=True)]
     return [
         *kind_warnings(data, task, called),
         *command_warnings(data, task),
@@ -88,7 +88,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *_stillness(frames, called),
         *_clocks(frames, task),
         *_goals(frames, task),
-        *spike_warnings(labels, called, task.action_names),
+        *spike_warnings(actions, called, task.action_names),
         *mark_warnings(np.concatenate(labels), task.action_names, "action"),
         *scale_warnings(labels, called, task.action_names, "action"),
         *_single_labels(known, called),
