@@ -38,7 +38,7 @@ def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
 def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
     """Makes the moving average, in a loss's ``target_*_params``, that is used after training.
 
-    :func:`train_phase` steps it. The decay per update is ``1 - 10 / (num_steps + 10)``, but in 0.84 to 0.998.
+    :func:`train_phase` steps it. The decay per update is ``1 - 10 / (num_steps + 10)``, at least 0.84, at most 0.998.
     """
     decay = min(0.998, 1 - 10 / (num_steps + 10))
     return SoftUpdate(loss_module, eps=max(0.5, decay**AVERAGE_EVERY))  # SoftUpdate warns below 0.5

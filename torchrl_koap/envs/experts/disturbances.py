@@ -20,7 +20,7 @@ from torchrl_koap.tasks import Task
 
 KINDS = ("impulse", "slip", "late_turn", "drift")
 _SIDEWAYS = KINDS[:3]
-# last numbers in seeds; numpy fills seeds up with zeros, so the choice shares its stream with the expert of episode 3
+# last numbers in seeds. Numpy appends zeros to seeds: the choice shares its stream with the expert of episode 3
 _STREAM, _CHOICE_STREAM, _HEIGHT_STREAM = 2, 3, 4
 _QUIET, _MEAN_GAP = 12, 45  # control steps to the next disturbance: minimum, and mean of what is added
 # duration in control steps, low and high end

@@ -160,7 +160,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
 
         With ``axes``, and a latent action that contains the steps along them, the decoder is shrunk towards one filter
         of the steps that all axes share, instead of towards 0. Guessed axes are used only if they lower the held-out
-        error. The filter is fitted to all labels, so with few of them this error is too low, and wrong guesses may be
+        error. The filter is fitted to all labels, so this error is too low if they are few. Wrong guesses may then be
         used. The summary names the ``block`` if there were several.
         """
         network, normalizer = self.latent_action, self.action_normalizer
