@@ -10,8 +10,9 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, SerialEnv
 from toy_gym import reach
+from toy_policies import EpisodesOfRandomLength
 
-from torchrl_koap.modules import PolicyEnv, make_koopman_inverse_dynamics
+from torchrl_koap.modules import Agent, PolicyEnv, make_koopman_inverse_dynamics
 from torchrl_koap.modules import make_policy as build
 
 
@@ -80,6 +81,20 @@ def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout, co
         env.close()
     assert rollout.shape == (*env.batch_size, 8)
     alone(make_policy, rollout)
+
+
+def test_a_first_episode_is_that_of_an_agent_although_others_end_earlier():
+    policy = build(small_planner(), make_koopman_inverse_dynamics(2, 2), state_of=(0, 2))
+    env = PolicyEnv(EpisodesOfRandomLength(2, [[3], [20]], action_dim=2), policy)
+    env.set_seed(0)
+    with torch.no_grad():
+        rollout = env.rollout(12, policy, break_when_any_done=False)
+    noise = rollout["noise"]
+    assert noise.reshape(24, -1).unique(dim=0).shape[0] == 24
+    agent = Agent(policy, seed=1)
+    agent.reset()
+    for observation, action in zip(rollout["observation"][1], rollout["action"][1], strict=True):
+        torch.testing.assert_close(agent.act(observation), action, rtol=1e-3, atol=1e-5)
 
 
 def alone(make_policy, rollout):

@@ -62,16 +62,22 @@ class NoiseTransform(Transform):
         """Restarts all streams with a seed."""
         self.seed = int(seed)
         self._streams = NoiseStreams([], self.shape, block=self.block)
+        self._drawn: Tensor | None = None  # noise of the present step
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         count = next_tensordict.batch_size.numel()
         if len(self._streams) != count:
             self._streams = NoiseStreams(range(self.seed, self.seed + count), self.shape, block=self.block)
         noise = self._streams.draw().reshape(*next_tensordict.batch_size, *self.shape)
-        return next_tensordict.set(self.out_keys[0], noise.to(next_tensordict.device or noise.device))
+        self._drawn = noise.to(next_tensordict.device or noise.device)
+        return next_tensordict.set(self.out_keys[0], self._drawn)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
+        begins = [tensordict.get(key, None) for key in self.parent.reset_keys]
+        if self._drawn is None or all(mask is None or mask.all() for mask in begins):
+            return self._call(tensordict_reset)
+        # the noise after an episode's last step is unused: a new draw would advance the streams of running episodes
+        return tensordict_reset.set(self.out_keys[0], self._drawn)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Adds the noise to the specification."""
