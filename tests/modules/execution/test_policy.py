@@ -198,6 +198,22 @@ def test_decoded_commands_become_changes_of_the_last_one():
     assert sampled.act(observed, chunk, 2)[0, 1] == chunk[0, 2, 1] - 3.5
 
 
+@pytest.mark.parametrize("options", [{"ranges": [None, (-600.0, 600.0), None, None]}, {"changes": [1], "gain": 1.5}])
+def test_actions_decoded_ahead_continue_from_limited_commands_as_those_of_an_open_loop_do(options):
+    gain, decoded = options.pop("gain", 1.0), {"actions": [1], "commands": [2]}
+    execution = Execution("open_loop", blend=0.0, replan_interval=4, gain=gain)
+    policy = make_policy(
+        CountingPlanner(), EchoController(), state_of=(0, 1), decoded=decoded, execution=execution, **options
+    )
+    observed, noise = torch.tensor([[[3.0, 7.0, 0.0], [4.0, 8.0, -2000.0]]]), torch.zeros(1, 6, 2)
+    ahead, _ = policy.decode_ahead(observed, noise)
+    plan, seen = policy.plan(observed, noise), observed.clone()
+    for step in range(4):
+        action = policy.act(seen, plan, step)
+        torch.testing.assert_close(ahead[:, step], action)
+        seen[:, -1, 2] += action[:, 1]  # the observation repeats the command
+
+
 @pytest.mark.parametrize("unread", [0.0, float("nan")])
 @pytest.mark.parametrize("selected", [["action"], ["action", "plan"], ["plan"]])
 def test_plans_are_made_when_due_whichever_entries_are_selected(selected, unread):

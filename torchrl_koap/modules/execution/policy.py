@@ -207,11 +207,9 @@ class PlanningPolicy(TensorDictModuleBase):
         left = remaining_plan(plan, age)
         if self._decodes:
             left = self.follower(observations, self.state_of(observations), left)
-        action = self._taken(observations, left[..., :1, :]).squeeze(-2)
-        if self.limits is None:
-            return action
-        action, outside = self.limits(observations, action)
-        self.limited += torch.stack([outside.sum(), torch.ones_like(outside).sum()])
+        action, outside = self._executed(observations, left[..., 0, :])
+        if self.limits is not None:
+            self.limited += torch.stack([outside.sum(), torch.ones_like(outside).sum()])
         return action
 
     def decode_ahead(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -228,20 +226,27 @@ class PlanningPolicy(TensorDictModuleBase):
         actions = self.sample(states, noise)
         if self.follower is not None:
             actions = self.follower(observations, states, actions, steps)
-        actions = self._taken(observations, actions[..., :steps, :])
-        if self.limits is None:
-            return actions, torch.zeros_like(actions[..., 0], dtype=torch.bool)
-        return self.limits(observations.unsqueeze(-3), actions)
+        moved: Tensor | float = 0.0
+        found = []
+        for action in actions[..., :steps, :].unbind(-2):
+            found.append(self._executed(observations, action, moved))
+            if self.decoded is not None:
+                moved = moved + found[-1][0][..., self.decoded["actions"]]
+        taken, outside = zip(*found, strict=True)
+        return torch.stack(taken, -2), torch.stack(outside, -1)
 
-    def _taken(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Turns ``decoded`` commands in actions ``[*B, n, act]``, after observations ``[*B, h, obs]``, into changes."""
-        if self.decoded is None:
-            return actions
-        commands, taken = actions[..., self.decoded["actions"]], actions.clone()
-        last = observations[..., -1:, self.decoded["commands"]]
-        changes = torch.cat([last, commands.to(last.dtype)], -2).diff(dim=-2)
-        taken[..., self.decoded["actions"]] = changes.to(taken.dtype)
-        return taken
+    def _executed(self, observations: Tensor, action: Tensor, moved: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+        """Turns ``decoded`` commands in actions ``[*B, act]`` into changes, limits them and returns which were clipped.
+
+        Since the observations ``[*B, history, obs]``, these commands have ``moved`` ``[*B, k]``.
+        """
+        if self.decoded is not None:
+            columns, action = self.decoded["actions"], action.clone()
+            last = observations[..., -1, self.decoded["commands"]] + moved
+            action[..., columns] = (action[..., columns].to(last.dtype) - last).to(action.dtype)
+        if self.limits is None:
+            return action, torch.zeros_like(action[..., 0], dtype=torch.bool)
+        return self.limits(observations, action)
 
     def attach(self, env: EnvBase) -> None:
         """Passes to the follower the batch of environments whose episodes are about to begin."""
