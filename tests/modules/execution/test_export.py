@@ -51,6 +51,24 @@ def test_the_stateless_policy_is_the_open_loop_one():
     torch.testing.assert_close(actions[:, 0], whole.act(observed, plan, 0))
 
 
+class StandStill(torch.nn.Module):
+    """A planner without parameters."""
+
+    history, horizon, noise_shape, noise_key = 2, 14, (14, 2), None
+
+    def sample(self, history, noise):
+        return history[..., -1:, :].expand(*history.shape[:-2], 14, -1)
+
+
+def test_a_planner_without_parameters_is_exported(tmp_path):
+    own = make_policy(StandStill(), make_koopman_inverse_dynamics(2, 3), state_of=(2, 3))
+    what = exportable(own, columns=COLUMNS)
+    inputs = what.batch(3)
+    actions, _ = export_policy(what, tmp_path / "policy.pt2")(*inputs)
+    with torch.no_grad():
+        torch.testing.assert_close(actions, own.decode_ahead(*inputs)[0], atol=1e-5, rtol=1e-5)
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     what, path = exportable(policy(candidates=3), columns=COLUMNS), tmp_path_factory.mktemp("exported") / "policy.pt2"

@@ -77,9 +77,10 @@ def exportable(
 
     ``columns`` maps names to units, for the columns of ``"observations"`` and of ``"actions"``.
     """
-    planner, generator = policy.planner, torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
     sizes = (1, policy.history, len(columns["observations"])), (1, *policy.noise_shape)
-    seen, noise = (torch.randn(*size, generator=generator).to(next(planner.parameters())) for size in sizes)
+    like = next(policy.parameters(), torch.empty(0))
+    seen, noise = (torch.randn(*size, generator=generator).to(like) for size in sizes)
     seen = 0.1 * seen
     if policy.origins is not None:
         seen = seen.double() + policy.origins[0].to(seen.device)
