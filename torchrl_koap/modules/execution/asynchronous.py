@@ -36,7 +36,7 @@ class AsynchronousAgent(Agent):
     before control begins.
 
     Args:
-        policy (PlanningPolicy): follows plans with strategy ``"feedback"``.
+        policy (PlanningPolicy): follows plans with strategy ``"feedback"``; its planner samples with a ``prefix``.
 
     Keyword Args:
         control_hz (float): control steps per second; converts planning time to steps.
