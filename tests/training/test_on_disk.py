@@ -223,6 +223,18 @@ def test_a_planner_for_a_curve_knows_the_labelled_trajectories_and_holds_few_out
     assert len(unseen) == 2 and tuple(unseen) == found.held_out
 
 
+def test_what_a_shared_planner_has_not_seen_is_known_whatever_share_a_run_uses(tmp_path):
+    states = [np.random.default_rng(index).normal(size=(40, 2)).cumsum(0) for index in range(10)]
+    data = save_demonstrations(tmp_path / "arm", states, [np.diff(frames, axis=0) for frames in states], control_hz=30)
+    few = {"dataset": str(data), "controller": ControllerConfig(steps=0), "method": "linear"}
+    planner = train(
+        TrainConfig(out=tmp_path / "planner", planner=PLANNER, run=RunConfig(seed=1), **few), planner_only=True
+    )
+    labels, source = LabelConfig(count=1, trajectories=0.3), PlannerConfig(source=tmp_path / "planner")
+    run = train(TrainConfig(out=tmp_path / "run", labels=labels, planner=source, **few))
+    assert len(planner.held_out) == 2 and run.held_out == planner.held_out
+
+
 def test_a_planner_alone_is_no_policy_and_resumes_as_a_planner(demonstrations, tmp_path):
     out = tmp_path / "run"
     config = TrainConfig(out=out, dataset=str(demonstrations), planner=PLANNER)

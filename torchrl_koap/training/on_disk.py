@@ -205,13 +205,13 @@ def _read_data(
         return hidden[known].to(config.run.device), held_out, None
     labelled, report = within_budget(task, config, data)
     # independent of the seed: runs differ only in the trajectories with labels, which come first
-    labelled = subsample_trajectories(labelled, share).to(config.run.device)
+    used = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:
         run = RunDirectory(config.out)
         if (run.path / "config.json").exists():  # resumed: the source may be gone
-            return labelled, run.read_json("config.json").get("held_out_episodes", []), report
-        return labelled, held_out_by(planner.source, labelled), report
-    return labelled, choose_held_out(labelled, planner.held_out, seed=seed), report
+            return used, run.read_json("config.json").get("held_out_episodes", []), report
+        return used, held_out_by(planner.source, labelled), report  # which need not be used here
+    return used, choose_held_out(used, planner.held_out, seed=seed), report
 
 
 def _report_data(task: Task, data: TensorDictBase) -> dict[str, Tensor]:
