@@ -3,6 +3,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -161,6 +162,35 @@ def test_windows_that_had_labels_are_proposed_as_whole_trajectories(demonstratio
     assert set(found["labelled_episodes"]) & {row["episode"] for row in found["suggestions"]}  # in part labelled
     words = found["next"].removesuffix(" NEW").split()
     assert koap(*words[1:], tmp_path / "new", "--quiet") == 0
+
+
+def test_labelled_parts_of_a_recording_are_no_labels_of_the_rest(tmp_path):
+    states = [np.random.default_rng(index).normal(size=(30, 2)).cumsum(0) for index in range(3)]
+    actions = [np.diff(frames, axis=0) for frames in states]
+    for steps in actions[:2]:
+        steps[10:] = np.nan
+    data = save_demonstrations(tmp_path / "arm", states, actions, control_hz=30)
+    few = {"planner": PlannerConfig(steps=2, width=8), "controller": ControllerConfig(steps=2)}
+    train(TrainConfig(dataset=str(data), out=tmp_path / "run", labels=LabelConfig(episodes=(0,)), **few))
+    found = suggest(tmp_path / "run", SuggestConfig(count=3))
+    assert {row["episode"] for row in found["suggestions"]} == {0, 1, 2}
+    assert found["next"].startswith("add actions to recordings 0 (")  # those of 1 and 2 are hidden, not missing
+
+
+def test_the_next_training_has_more_labels_than_a_share_of_the_trajectories_allows(demonstrations, tmp_path):
+    few = [*TINY, "--labels.trajectories", "0.25"]
+    assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, *few) == 0
+    words = suggest(tmp_path / "run", SuggestConfig(count=2))["next"].removesuffix(" NEW").split()
+    assert koap(*words[1:], tmp_path / "new", "--quiet") == 0
+
+
+def test_nothing_is_written_for_a_pretrained_run(copied_run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(copied_run, tmp_path / "pretrained" / "mine")
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    assert koap("suggest", "pretrained:mine", "--count", "1") == 0
+    assert "next" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
 
 def test_suggest_from_the_shell(copied_run, capsys):

@@ -147,7 +147,8 @@ class Suggest(Command):
     def __call__(self) -> dict[str, Any]:
         """Ranks the unlabelled demonstrations and writes ``suggestions.json``."""
         found = suggest(self.run, self.config)
-        RunDirectory(self.run).write_json("suggestions.json", found)
+        if self.run.is_dir():  # nothing is written into pretrained:NAME
+            RunDirectory(self.run).write_json("suggestions.json", found)
         shown = ("source", "steps", "score")
         rows = {
             f"episode {row['episode']}": {name: row[name] for name in shown if name in row}

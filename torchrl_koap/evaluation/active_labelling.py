@@ -221,8 +221,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     ]
     labelled = labelled_episodes(data).tolist()
     every = list(dict.fromkeys([*labelled, *(choice.episode for choice in choices)]))
-    known = labelled_episodes(recorded).tolist()
-    without = [episode for episode in every if episode not in known]
+    more = recorded[EPISODE][(recorded[HAS_ACTION] & ~data[HAS_ACTION]).squeeze(-1)].unique().tolist()
+    without = [choice.episode for choice in choices if choice.episode not in more]  # no recorded action is hidden
     converted = f"convert them again (--name {shlex.quote(trained.task.name)} --out DATA)"
     which = some([names[episode] for episode in without] if names else without)
     counted = "" if names else " (counted from 0; files in the order of their names, run_10 before run_2)"
@@ -233,6 +233,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     for plugin in config.plugins:
         again += ["--plugin", plugin]
     again += [] if trained.config.labels.unit == "trajectory" else ["--labels.unit", "trajectory"]
+    again += [] if trained.config.labels.trajectories == 1 else ["--labels.trajectories", "1"]  # a share may be too few
     again += ["--planner.source", str(trained.folder)]  # the planner uses no labels
     return {
         "penalty": penalty,
