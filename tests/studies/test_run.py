@@ -116,6 +116,14 @@ def test_methods_labels_and_seeds_may_be_added(curve, demonstrations, monkeypatc
     assert (kept["methods"], kept["labels"], kept["seeds"]) == (["linear", "dp", "dd"], [0.25, 0.5], 2)
 
 
+def test_a_finished_cell_without_a_log_stays_in_the_table(curve, demonstrations):
+    for cell in (DP, LINEAR):  # as if they were run by hand
+        (curve / cell / "log.txt").unlink()
+    before = rows_of(curve)
+    assert run(curve, demonstrations, methods=("linear",))["done"] == 2
+    assert rows_of(curve) == before
+
+
 def test_part_of_the_demonstrations_has_a_planner_of_its_own(curve, demonstrations):
     assert run(curve, demonstrations, methods=("linear",), demonstrations=(0.5,))["done"] == 3
     cell = curve / "cells/avoiding/linear-0.25-0.5-seed0"
@@ -236,6 +244,8 @@ def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations, capsy
     assert koap(*command_of(curve, demonstrations, methods=("dd",)), "--quiet") == 1
     said = capsys.readouterr()
     assert said.out == "" and said.err.startswith("koap: avoiding, dd, 25 % labels, seed 0: failed: FileExistsError")
+    assert run(curve, demonstrations, methods=("linear",))["failed"] == 1  # not asked again, but still reported
+    assert rows_of(curve)[str(blocked.relative_to(curve))] == row
     blocked.unlink()
     assert run(curve, demonstrations, methods=("linear", "dp", "dd", "pretrain"))["done"] == 4
     after = marks(curve)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from torchrl_koap.runs.config_files import changed_options, from_json, to_json, 
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.resume import check_data
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.studies.cells import Cell, Result, cell_row, prepare_cell, read_result, run_cell
+from torchrl_koap.studies.cells import FOUND, Cell, Result, cell_row, prepare_cell, read_result, run_cell
 from torchrl_koap.studies.launchers import Job, Machines, launch
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
@@ -94,7 +95,8 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
                 _begun(study, name).write_json("config.json", content)
         asked = set(cells)  # the order of all cells gives a method its place and colour in every call
         shown = [cell for cell in whole.cells() if cell in asked or _was_begun(study.out / cell.folder)]
-        results = {cell: cell_row(study.out, cell, label_unit=study.label_unit) for cell in shown}
+        failed, unit = _failed_before(study.out), study.label_unit
+        results = {cell: cell_row(study.out, cell, label_unit=unit, reason=failed.get(cell.folder)) for cell in shown}
         _work(study, cells, results, machines or Machines())
         rows, tasks = _write_rows(study, results), whole.tasks
         outcomes = {row["run"]: found for row, found in results.values() if found}
@@ -150,7 +152,16 @@ def _check_folder(study: Study) -> None:
 
 
 def _was_begun(folder: Path) -> bool:
-    return (folder / "log.txt").exists() or folder.is_file()  # a file in place of the folder made the cell fail
+    # a cell that was run by hand has no log; a file in place of the folder made the cell fail
+    return (folder / "log.txt").exists() or (folder / FOUND).exists() or folder.is_file()
+
+
+def _failed_before(folder: Path) -> dict[str, str]:
+    """Returns why cells failed in the last call, by their folder."""
+    if not (folder / "cells.csv").exists():
+        return {}
+    with (folder / "cells.csv").open(newline="", encoding="utf-8") as file:
+        return {row.get("run"): row.get("reason") for row in csv.DictReader(file) if row.get("status") == "failed"}
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
