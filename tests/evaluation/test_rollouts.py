@@ -61,6 +61,7 @@ def test_results_do_not_depend_on_the_batch_size(together, batch_size):
     for one, other in zip(apart, together, strict=True):
         assert (one["observation"] - other["observation"]).abs().max() < 1e-4
         assert (one["next", "observation"] - other["next", "observation"]).abs().max() < 1e-4
+        assert (one["plan"] - other["plan"]).abs().max() < 1e-3
     assert finished == [min(done, 8) for done in range(batch_size, 8 + batch_size, batch_size)]
 
 

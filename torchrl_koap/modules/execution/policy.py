@@ -286,7 +286,7 @@ class PlanningPolicy(TensorDictModuleBase):
         else:
             rows = under_way.reshape(-1)
             part = self._step(flat[rows])
-            written = part.new_zeros(flat.batch_size).update(flat.select(*kept, strict=False))
+            written = part.new_zeros(flat.batch_size).update(flat.select(*kept, strict=False).clone())
             written[rows] = part
         written = written.select(self._action_key, *kept, *self.receding.action_keys)
         tensordict.update(written.reshape(batch) if batch else written[0])
