@@ -68,6 +68,16 @@ def test_nothing_to_draw_removes_an_earlier_picture(tmp_path):
     assert "None: not drawn, the evaluation is short." in write_report(run, draw=False).read_text()
 
 
+def test_films_keep_colours_that_are_in_a_few_frames_only(tmp_path):
+    frames = np.full((60, 9, 9, 3), 255, np.uint8)
+    frames[:, :2, :2] = 10, 127, 127
+    frames[12:24, 4:7, 4:7] = 41, 106, 204
+    pictures.save_film(pictures.Film(frames, 0.1), tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as film:
+        film.seek(1)  # equal neighbours are one frame
+        assert film.convert("RGB").getpixel((5, 5)) == (41, 106, 204)
+
+
 @pytest.mark.parametrize(("age", "stays"), [(-10, False), (10, True)])
 def test_films_of_an_earlier_evaluation_do_not_stay_beside_the_figures_of_another(age, stays, tmp_path):
     run = write_run(tmp_path)

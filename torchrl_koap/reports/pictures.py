@@ -33,6 +33,7 @@ from torchrl_koap.reports.run_facts import RunFacts
 
 FOLDER = "plots"
 HOLD_SECONDS = 1.5  # duration of the last frame of a film
+_PALETTE_FRAMES = 20  # frames that choose the colours of a film; dots of brief episodes are in some of them only
 _BUILT_IN = ("rollout_plots", "demonstrations", "error_plots", "animation", "inspection_plots")
 EVAL = "koap eval {run} --episodes 60 --seed 100"
 TRAIN = "koap train --out {run}"
@@ -159,7 +160,7 @@ def save_film(film: Film, path: str | Path) -> None:
     frames = list(film.frames)
     with replacing_file(path) as aside:
         # one palette for all frames, without dithering: still parts neither flicker nor cost bytes
-        some = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
+        some = Image.fromarray(np.concatenate([*frames[:: -(-len(frames) // _PALETTE_FRAMES)], frames[-1]]))
         palette = some.quantize(224, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)  # keeps rare colours
         images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
         times = [round(1000 * film.seconds)] * (len(images) - 1) + [round(1000 * HOLD_SECONDS)]
