@@ -26,6 +26,7 @@ def test_demonstrations_with_objects():
     data = make_demonstrations() | {"objects": np.random.rand(40, 3, 2)}
     axes, beside = draw_demonstrations(data, run_of("stacking")).axes
     np.testing.assert_allclose(axes.collections[0].get_segments()[1], data["position"][20:])
+    assert (axes.get_xlim(), axes.get_ylim()) == (beside.get_xlim(), beside.get_ylim())  # only one has tick labels
     np.testing.assert_allclose(drawn_lines(beside)[3], data["objects"][20:, 1])  # green box of the second one
     assert [text.get_text() for text in beside.get_legend().get_texts()] == ["red box", "green box", "blue box", "end"]
 

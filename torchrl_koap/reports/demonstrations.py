@@ -56,7 +56,7 @@ def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Fig
     position = entry(demonstrations, "position", [len(episode), 2])
     moved = "objects" in demonstrations
     figure = Figure(figsize=(10.9, 6.2) if moved else (5.9, 6.4), layout="constrained")
-    axes, *beside = figure.subplots(1, 1 + moved, squeeze=False)[0]
+    axes, *beside = figure.subplots(1, 1 + moved, squeeze=False, sharex=True, sharey=True)[0]
     for panel in beside:
         objects = np.split(entry(demonstrations, "objects", [len(episode), None, 2]), borders)
         draw_bodies(draw_scene(panel, run.task), objects, run.task, [True] * len(objects))

@@ -176,7 +176,7 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     bodies, colors = body_paths(rollouts), episode_colors(mode, outcome, run.modes)
     good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
     figure = Figure(figsize=(9.4 if bodies else 6.2, 5.9), layout="constrained")
-    axes, *beside = figure.subplots(1, 2 if bodies else 1, squeeze=False)[0]
+    axes, *beside = figure.subplots(1, 2 if bodies else 1, squeeze=False, sharex=True, sharey=True)[0]
     draw_scene(axes, run.task)
     axes.add_collection(
         LineCollection(
