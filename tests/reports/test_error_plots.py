@@ -73,6 +73,11 @@ def test_actions_of_another_robot():
     assert titles(draw_actions(data, RunFacts(Path("run"), arm)))[6:] == ["torque 6: RMSE 0.5 N m"]
     figure = draw_actions(data, NOTHING)
     assert titles(figure)[0] == "action 1: RMSE 0.5" and figure.axes[0].get_xlabel().endswith("(per step)")
+    speeds = {"forward": Action("m/s"), "a_very_long_name_of_a_turn": Action("rad")}
+    base = Task(name="base", observation_parts={"q": 7}, actions=speeds, position="q")
+    drawn = draw_actions({name: value[:, :2] for name, value in data.items()}, RunFacts(Path("run"), base)).axes
+    assert drawn[0].get_xlabel() == "recorded forward (m/s)"  # no second "per"
+    assert drawn[1].get_xlabel() == "recorded a_very_l…f_a_turn (mrad per step)"
 
 
 def test_actions_that_do_not_belong_together():
@@ -95,4 +100,11 @@ def test_errors_of_actions_are_shares_so_that_small_ones_can_be_read():
     colors = [to_hex(bar.get_facecolor()) for bar in axes.patches]
     assert [colors[0], colors[1], colors[3]] == [BLUE.lower(), RED.lower(), PALE_BLUE.lower()]
     assert axes.lines[0].get_ydata() == [1, 1]  # always the mean action
+    rows[1]["controller"] = 0.4
+    still = draw_action_errors(
+        {"action_errors": {"left_out": {"labels": 1, "trajectories": 1, "column": rows}}}, NOTHING
+    )
+    said = [text.get_text() for text in still.axes[0].get_legend().get_texts()]
+    assert said == ["controller", "ridge on raw frames", "always the mean action"]  # nothing red, nothing said of it
+    assert still.axes[0].get_title(loc="left").endswith("1 labels of 1 recording")
     assert [label.get_text() for label in axes.get_xticklabels()] == ["dx\n0.5 mm", "gripper\n0.6", "still\n0"]

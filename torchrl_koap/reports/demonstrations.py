@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from torchrl_koap.reports.pictures import picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.scenes import bodies_of, body_handles, draw_bodies, draw_scene, keep_inside
-from torchrl_koap.reports.style import BLUE, GREY, entry, panels, set_title, tidy, with_unit
+from torchrl_koap.reports.style import BLUE, GREY, entry, panels, set_title, shorten, tidy, with_unit
 from torchrl_koap.tasks import Task
 
 _MOST_COLUMNS = 12  # panels of single state columns at most
@@ -81,7 +81,8 @@ def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, t
     for index, axes in enumerate(beside):
         _draw_lines(axes, np.column_stack([time, state[:, index]]), borders, along, (0.6, 1.3))
         axes.autoscale_view()
-        set_title(axes, with_unit(*columns[index]))
+        name, unit = columns[index]
+        set_title(axes, with_unit(shorten(name, 24), unit))
         if index + 4 >= len(drawn):
             axes.set_xlabel("time (s)")
         tidy(axes)

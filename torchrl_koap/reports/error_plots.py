@@ -27,6 +27,7 @@ from torchrl_koap.reports.style import (
     panels,
     put_legend,
     set_title,
+    shorten,
     tidy,
     with_unit,
 )
@@ -144,10 +145,11 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     shown, factor = zip(*map(thousandths, units), strict=True)
     true, predicted = true * factor, predicted * factor
     error = predicted - true
-    figure, drawn = panels(width, width if width < 5 else -(-width // 2), (3.2, 3.4), (0.6, 0.35))
+    figure, drawn = panels(width, width if width < 5 else min(-(-width // 2), 5), (3.2, 3.4), (0.6, 0.35))
     for index, (axes, name) in enumerate(zip(drawn, names, strict=True)):
         _scatter(axes, true[:, index], predicted[:, index])
-        each = " ".join(filter(None, (shown[index], "" if name in absolute else "per step")))
+        rate = name in absolute or "/" in shown[index]
+        each, name = " ".join(filter(None, (shown[index], "" if rate else "per step"))), shorten(name)
         axes.set_xlabel(with_unit(f"recorded {name}", each))
         axes.set_ylabel(with_unit(f"predicted {name}", each))
         set_title(axes, f"{name}: RMSE {np.sqrt(np.square(error[:, index]).mean()):.3g} {shown[index]}".rstrip())
@@ -226,14 +228,16 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     if not parts:
         raise NothingToDraw("no action was evaluated on recorded data")
     count = len(parts[0][1]["column"])
-    figure = Figure(figsize=(4.8 + 0.8 * count, 0.8 + 2.9 * len(parts)), layout="constrained")
+    figure = Figure(
+        figsize=(4.8 + (0.5 if count > _MANY else 0.8) * count, 0.8 + 2.9 * len(parts)), layout="constrained"
+    )
     rows = figure.subplots(len(parts), squeeze=False)[:, 0]
     for (name, part), axes in zip(parts, rows, strict=True):
         _draw_shares(axes, part["column"])
-        judged = f"{part['labels']:,} labels of {part['trajectories']} recordings"
+        judged = f"{part['labels']:,} labels of {part['trajectories']} recording{'s' * (part['trajectories'] > 1)}"
         set_title(axes, f"{_SPLITS.get(name, name)}\n{judged}")
     handles = [Line2D([], [], color=color, linewidth=6, label=label) for label, color in _ACTIONS.values()]
-    if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
+    if any(row["controller"] >= row["mean_action"] > 0 for _, part in parts for row in part["column"]):
         handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
     handles.append(Line2D([], [], color=MUTED, linestyle="dashed", label="always the mean action"))
     put_legend(rows[0], handles=handles)
@@ -249,7 +253,7 @@ def _draw_shares(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.axhline(1, color=MUTED, linestyle="dashed")
     for row in rows:
         shown, factor = thousandths(row["unit"])
-        names.append(f"{row['name']}\n{factor * row['controller']:.2g} {shown}".rstrip())
+        names.append(f"{shorten(row['name'])}\n{factor * row['controller']:.2g} {shown}".rstrip())
     axes.set_xticks(places, names, rotation=45 if len(rows) > _MANY else 0)
     axes.set_xlim(-0.6, len(rows) - 0.4)
     axes.set_ylabel("RMSE, share of the mean's")
@@ -258,4 +262,5 @@ def _draw_shares(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _list_names(names: Sequence[str]) -> str:
+    names = [shorten(name) for name in names]
     return ", ".join(names) if len(names) <= 3 else f"{names[0]} ... {names[-1]} ({len(names)} columns)"

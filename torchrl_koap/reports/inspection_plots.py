@@ -14,7 +14,19 @@ from matplotlib.ticker import MaxNLocator
 from torchrl_koap.evaluation.findings import OUTSIDE_THE_BUDGET, error_unit
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, WARNING, put_legend, tidy
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAINT,
+    INK,
+    MUTED,
+    ORANGE,
+    PALE,
+    PALE_BLUE,
+    WARNING,
+    put_legend,
+    shorten,
+    tidy,
+)
 from torchrl_koap.tasks import Task
 
 ON_THE_CIRCLE = 1e-3  # eigenvalues with a magnitude this near to 1 count as on the unit circle
@@ -151,7 +163,7 @@ def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     axes.set_ylabel("root mean square distance" + (f" ({shown})" if shown else ""))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     judged = f"on {errors['held_out_trajectories']} demonstrations"
-    put_legend(axes, below=0.22)
+    put_legend(axes, below=0.27)
     tidy(axes, f"Error of the predicted {part.replace('_', ' ')}\n{judged}", grid=True)
 
 
@@ -168,8 +180,12 @@ def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> Non
                 style = {"ha": "center", "fontsize": 7, "color": INK, "rotation": 90 if len(names) > 4 else 0}
                 axes.annotate(f"{value:.3f}", (place, max(value, 0) + 0.01), **style)
     axes.set_ylim(0, 1.12)
-    axes.set_xticks(places, names, fontsize=8, rotation=45 if len(names) > 4 else 0)
+    axes.set_xticks(places, [shorten(name) for name in names], fontsize=8, rotation=45 if len(names) > 4 else 0)
     axes.set_yticks((0, 0.25, 0.5, 0.75, 1))
     axes.set_ylabel("share of variance explained (R²)")
-    put_legend(axes, below=0.22, columnspacing=1)
+    if len(names) > 4:  # below the rotated names
+        handles, labels = axes.get_legend_handles_labels()
+        axes.figure.legend(handles, labels, loc="outside lower right", ncols=2, frameon=False, fontsize=8)
+    else:
+        put_legend(axes, below=0.22, columnspacing=1)
     tidy(axes, "True actions from latent actions\non the same held-out demonstrations")

@@ -41,6 +41,7 @@ from torchrl_koap.reports.style import (
     panels,
     put_legend,
     set_title,
+    shorten,
     tidy,
     with_unit,
 )
@@ -300,7 +301,7 @@ def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
             axes.plot(state[index, : length[index] + 1, place], color=color, linewidth=4, alpha=0.5, zorder=2)
             axes.autoscale_view()
             if index == episodes[0]:
-                axes.set_ylabel(with_unit(run.task.state_names[column], run.task.state_units[column]))
+                axes.set_ylabel(with_unit(shorten(run.task.state_names[column]), run.task.state_units[column]))
             tidy(axes)
         set_title(down[0], f"episode {index}: {OUTCOMES[outcome[index]]}")
         down[-1].set_xlabel("control step")

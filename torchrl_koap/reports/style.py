@@ -31,6 +31,12 @@ def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.
     return value
 
 
+def shorten(name: str, most: int = 18) -> str:
+    """Returns a name of at most ``most`` characters; dots replace the middle of a longer one."""
+    half = (most - 1) // 2
+    return name if len(name) <= most else f"{name[:half]}\N{HORIZONTAL ELLIPSIS}{name[-half:]}"
+
+
 def with_unit(name: str, unit: str) -> str:
     """Returns a name, with its unit in brackets if it has one."""
     return f"{name} ({unit})" if unit else name
