@@ -3,6 +3,8 @@
 
 import importlib.util
 import io
+import os
+import struct
 import sys
 
 import pytest
@@ -75,6 +77,19 @@ def test_in_a_file_a_bar_is_lines_not_carriage_returns(monkeypatch, tmp_path):
     assert first.startswith("updates:   0%") and "3000/3000" in last and last.endswith("planner=0.2500]")
     assert gone.startswith("gone:   0%")
     assert "\r" not in log.read_bytes().decode()
+
+
+def test_a_bar_is_no_wider_than_the_terminal(monkeypatch):
+    fcntl, pty, termios = (pytest.importorskip(name) for name in ("fcntl", "pty", "termios"))
+    above, below = pty.openpty()
+    fcntl.ioctl(below, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    with os.fdopen(above, "rb"), open(below, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        with progress_bar(9, "controller", mininterval=0.0) as bar:
+            bar.set_postfix(dict.fromkeys(("reconstruction", "koopman", "action"), "0.1234"))
+            drawn = os.read(above, 9999).decode()
+    assert "reconstruction" in drawn
+    assert max(map(len, drawn.split("\r"))) <= 80  # a longer bar would start a new line at every update
 
 
 def test_a_bar_of_a_terminal_is_drawn_over_itself(monkeypatch):

@@ -75,6 +75,7 @@ def progress_bar(total: int | None, description: str, *, unit: str = "it", **opt
         options |= {"mininterval": FILE_INTERVAL, "maxinterval": FILE_INTERVAL}
     elif not disable:
         stream = _Forgiving(sys.stderr)
+        options |= {"dynamic_ncols": True}  # the width of the terminal, which tqdm finds for sys.stderr itself only
     return tqdm(total=total, desc=description, unit=unit, disable=disable, file=stream, **options)
 
 
