@@ -70,6 +70,12 @@ def test_one_rollout_per_context_has_no_entropy_per_context():
     assert result["mode_entropy"] is None and result["pooled_mode_entropy"] == pytest.approx(1.0)
 
 
+def test_the_entropy_of_a_single_success_has_no_interval():
+    episodes = [episode_of(5, success=success, mode=0) for success in (True, False)]
+    result = score(episodes, range(2), numbered_modes(2))
+    assert (result["mode_entropy"], result["mode_entropy_low"], result["mode_entropy_high"]) == (0.0, None, None)
+
+
 @pytest.mark.parametrize("contexts", [None, [0, 0]])
 def test_without_a_success_no_entropy_is_known(contexts):
     episodes = [episode_of(5, success=False, mode=mode) for mode in (0, 1)]

@@ -110,6 +110,14 @@ def test_too_few_labels_in_a_row_are_refused():
         fit_response(columns(), data)
 
 
+def test_predictions_that_are_worse_than_standing_still_are_refused():
+    data = recordings()
+    data["state"].copy_(data["observation"][:, :2])  # the robot is where it was told to be, at once
+    data["state"] += 1e-9 * torch.randn_like(data["state"])
+    with pytest.raises(ValueError, match="standing still one of .*without any lag"):
+        fit_response(columns(), data)
+
+
 def test_columns_of_the_tasks():
     assert tracked_columns(get_task("aligning"))["states"] == [0, 1, 2]
     stacking = tracked_columns(get_task("stacking"))

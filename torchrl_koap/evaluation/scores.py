@@ -79,7 +79,8 @@ def _mode_scores(rows: Sequence[dict[str, Any]], modes: Modes, contexts: int | N
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
     value = statistic(units) if len(units) else None  # undefined without successes
-    interval = (None, None) if value is None else bootstrap_interval(units, statistic)
+    # resamples of a single unit never differ
+    interval = (None, None) if value is None or len(units) < 2 else bootstrap_interval(units, statistic)
     low, high = (None if end is None else min(max(end, 0.0), 1.0) for end in interval)
     return {name: value, f"{name}_low": low, f"{name}_high": high}
 

@@ -24,6 +24,7 @@ MOST = 4000  # stretches that are predicted at most, evenly spaced
 STAY = 1e-3  # weight of changes of the coefficients (unit: mean step per mean coordinate) against relative errors
 _ITERATIONS = 30
 _FOLDS = 5
+_USELESS = 10  # times the error of standing still; short noisy stretches give up to 2
 _LEAST = 9  # fewest steps per fold when folds are blocks of a few stretches
 
 
@@ -91,7 +92,7 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
     steps, in the unit of the axes; None if there were too few steps for cross-validation.
 
     Raises:
-        ValueError: if no stretch of labelled steps is long enough.
+        ValueError: if no stretch of labelled steps is long enough, or predictions are ten times worse than standing still.
     """
     steps, changes = labelled_steps(response, data)
     if not len(steps.row):
@@ -108,6 +109,13 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
         found[coupled] = torch.cat(errors).pow(2).mean().sqrt().item()
     coupled = min(found, key=found.__getitem__, default=False)
     _fit(response, data, steps, changes, coupled=coupled)
+    whole = _stretches(response, data, steps, changes)
+    still = (whole.measured - whole.positions[:, -1:]).square().mean().sqrt().item()
+    if found and not found[coupled] <= _USELESS * still:
+        raise ValueError(
+            f"predicted positions have an error of {found[coupled]:.3g}, standing still one of {still:.3g}: the robot"
+            " does not follow its commands, or follows them without any lag; use another method"
+        )
     return {
         "coupled": coupled,
         "labels_used": len(steps.row),
