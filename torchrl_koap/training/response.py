@@ -92,7 +92,8 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
     steps, in the unit of the axes; None if there were too few steps for cross-validation.
 
     Raises:
-        ValueError: if no stretch of labelled steps is long enough, or predictions are ten times worse than standing still.
+        ValueError: if no stretch of labelled steps is long enough, or predictions are ten times worse than standing
+            still.
     """
     steps, changes = labelled_steps(response, data)
     if not len(steps.row):

@@ -8,7 +8,8 @@ import pytest
 
 pq = pytest.importorskip("pyarrow.parquet")
 
-from torchrl_koap.data.formats.writers import LeRobotWriter  # noqa: E402
+from torchrl_koap.data import make_recordings, read_recordings  # noqa: E402
+from torchrl_koap.data.formats.writers import LeRobotWriter, write_lerobot  # noqa: E402
 
 
 def test_a_data_set_of_format_3(tmp_path):
@@ -34,3 +35,13 @@ def test_a_data_set_of_format_3(tmp_path):
         assert rows["index"][0] == listed["dataset_from_index"][number]
         assert rows["action"][-1] == rows["action"][-2]  # nothing was done behind the last frame
     assert rows["timestamp"][:3] == pytest.approx([0.0, 0.08, 0.16])
+
+
+@pytest.mark.parametrize(("offset", "dtype"), [(0.0, "float32"), (4e6, "float64")])
+def test_numbers_that_float32_rounds_coarsely_are_written_in_float64(tmp_path, offset, dtype):
+    states = [np.linspace(offset, offset + 1, 20).reshape(10, 2)]
+    recordings = make_recordings(states, [np.full((9, 1), 0.5)], control_hz=30.0)
+    write_lerobot(recordings, tmp_path / "arm")
+    info = json.loads((tmp_path / "arm/meta/info.json").read_text())
+    assert info["features"]["observation.state"]["dtype"] == dtype
+    np.testing.assert_allclose(read_recordings(tmp_path / "arm").states[0], states[0], rtol=0, atol=1e-6)

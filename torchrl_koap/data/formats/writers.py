@@ -17,6 +17,7 @@ from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, option, replacing_file
 
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_COARSE = 1e-5  # of the range of a column
 _CHUNK = 1000  # files per folder
 _INDEX = {  # LeRobot reads tasks by pandas and finds their descriptions in its index
     "index_columns": ["task"],
@@ -40,14 +41,27 @@ def write_npz(recordings: Recordings, out: Path) -> None:
 
 
 def write_lerobot(recordings: Recordings, out: Path) -> None:
-    """Writes a LeRobot data set; float64 becomes float32. The rate must be known."""
+    """Writes a LeRobot data set, in float64 if float32 resolves a column too coarsely. The rate must be known."""
     if recordings.control_hz is None:
         raise DataError(out, f"the rate is not known: pass {option('control_hz')}")
     states, actions = recordings.state_names, recordings.action_names
-    writer = LeRobotWriter(out, fps=recordings.control_hz, state_names=states, action_names=actions)
+    coarse = any(_is_coarse(np.concatenate(rows)) for rows in (recordings.states, recordings.actions))
+    dtype = "float64" if coarse else "float32"
+    writer = LeRobotWriter(out, fps=recordings.control_hz, state_names=states, action_names=actions, dtype=dtype)
     for frames, steps in zip(recordings.states, recordings.actions, strict=True):
         writer.add(frames, steps)
     writer.close()
+
+
+def _is_coarse(rows: np.ndarray) -> bool:
+    """Returns whether float32 rounds a column of ``[N, d]`` by more than 1e-5 of its range."""
+    known = rows[np.isfinite(rows).all(-1)]
+    if not len(known):
+        return False
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounding = np.spacing(np.abs(known).max(0).astype(np.float32))
+    span = np.ptp(known, axis=0)
+    return bool(((span > 0) & ~(rounding <= _COARSE * span)).any())
 
 
 class LeRobotWriter:
@@ -55,6 +69,7 @@ class LeRobotWriter:
 
     ``state_names`` are the columns of ``observation.state``, ``action_names`` those of ``action``, empty without
     actions. Frames become the feature ``camera``. ``embodiment`` names the demonstrator, ``task`` describes the task.
+    Numbers are stored as ``dtype``.
 
     Raises:
         FileExistsError: if the folder is not empty.
@@ -70,11 +85,12 @@ class LeRobotWriter:
         camera: str | None = None,
         embodiment: str | None = None,
         task: str = "task",
+        dtype: str = "float32",
     ):
         self._pyarrow, self._folder = import_pyarrow(), Path(folder)
         if self._folder.exists() and any(self._folder.iterdir()):
             raise FileExistsError(f"{self._folder} is not empty; choose another folder")
-        self._fps, self._camera, self._embodiment, self._task = float(fps), camera, embodiment, task
+        self._fps, self._camera, self._embodiment, self._task, self._dtype = float(fps), camera, embodiment, task, dtype
         self._names = {STATE: list(state_names)} | ({ACTION: list(action_names)} if action_names else {})
         self._shape: list[int] = []
         self._lengths: list[int] = []
@@ -122,7 +138,7 @@ class LeRobotWriter:
         self._write("meta/tasks.parquet", tasks, {"pandas": json.dumps(_INDEX)})
         single = {"shape": [1], "names": None}
         features: dict[str, Any] = {
-            name: {"dtype": "float32", "shape": [len(columns)], "names": columns}
+            name: {"dtype": self._dtype, "shape": [len(columns)], "names": columns}
             for name, columns in self._names.items()
         }
         if self._camera is not None:
@@ -146,7 +162,7 @@ class LeRobotWriter:
         return self._folder
 
     def _vectors(self, values: np.ndarray) -> Any:
-        flat = self._pyarrow.array(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
+        flat = self._pyarrow.array(np.ascontiguousarray(values, dtype=self._dtype).reshape(-1))
         return self._pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
     def _write(self, place: str, columns: dict[str, Any], about: dict[str, str] | None = None) -> None:
