@@ -61,9 +61,9 @@ _MANY = 6  # column names are rotated if there are more
     "losses.png",
     source="metrics.csv",
     title="Losses",
-    caption="Logarithmic scale. Pale: logged values; line: running mean; number: its last value. The dot"
-    " marks the weights that were kept. A planner's loss has no absolute scale: judge it by rollouts, or by the plan"
-    " score, which falls as plans approach recordings.",
+    caption="Logarithmic scale. Pale: logged values; line: running mean of their logarithms; number: its last value."
+    " The dot marks the weights that were kept. A planner's loss has no absolute scale: judge it by rollouts, or by the"
+    " plan score, which falls as plans approach recordings.",
     order=100,
 )
 def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
@@ -85,7 +85,7 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
         x, y = step[here], values[here]
         if (y > 0).any():
             y = np.where(y > 0, y, np.nan)
-            smooth = running_mean(y, max(1, len(y) // 40))
+            smooth = np.exp(running_mean(np.log(y), max(1, len(y) // 40)))
             note = f"{smooth[np.isfinite(smooth)][-1]:.3g}"
             if name == "held_out_score":
                 kept = int(np.searchsorted(x, _column(rows, "kept_update")[here][-1]))

@@ -106,7 +106,7 @@ def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
         bar.update(step - bar.n)
         if values and step % 50 == 0:
             shown = {key: value for key, value in values.items() if "loss" in key or key == "held_out_score"}
-            losses = {key.removeprefix("loss_"): f"{value:.4f}" for key, value in shown.items()}
+            losses = {key.removeprefix("loss_"): f"{value:.3g}" for key, value in shown.items()}
             bar.set_postfix(losses, refresh=False)  # the next drawing of the bar shows it
 
     return update
