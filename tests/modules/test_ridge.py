@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.modules.ridge import held_out_errors, ridge, shared_filter, thin_svd
+from torchrl_koap.modules.ridge import SharedFilter, held_out_errors, ridge, thin_svd
 
 PENALTIES = (1e-4, 1e-2, 1.0)
 
@@ -58,6 +58,15 @@ def test_input_noise_leaves_out_smaller_penalties_alone():
     assert all(floored.errors[penalty] == free.errors[penalty] for penalty in free.errors if penalty > 200e-6)
 
 
+def shared_filter() -> SharedFilter:
+    """A filter of three steps of two axes, in six columns, and axes of different sizes."""
+    basis = torch.zeros(3, 2, 6, dtype=torch.float64)
+    for step in range(3):
+        for axis in range(2):
+            basis[step, axis, 2 * step + axis] = 1 + step + axis / 2
+    return SharedFilter(basis, torch.tensor([1.0, 3.0], dtype=torch.float64))
+
+
 def brute_force(latent, action, groups, penalty, bias):
     """Refits without each group, at the penalty of the whole set, and predicts what was left out."""
     ridge = penalty * unit_of(latent, bias)
@@ -90,9 +99,9 @@ def test_held_out_errors_against_refits(sizes, bias, m):
 def test_many_rows_are_taken_some_at_a_time(monkeypatch, sizes):
     latent, action = make_data(400, 6)
     groups = None if sizes is None else torch.arange(80).repeat_interleave(5)
-    at_once = fit(latent, action, groups=groups, prior=torch.ones(2, 6))
+    at_once = fit(latent, action, groups=groups, prior=shared_filter())
     monkeypatch.setattr(sys.modules["torchrl_koap.modules.ridge"], "ROWS", 7)
-    in_parts = fit(latent, action, groups=groups, prior=torch.ones(2, 6))
+    in_parts = fit(latent, action, groups=groups, prior=shared_filter())
     torch.testing.assert_close(in_parts.weight, at_once.weight)
     assert in_parts.errors == pytest.approx(at_once.errors)
 
@@ -130,16 +139,43 @@ def test_constant_latent_actions_fit_the_mean():
     assert min(result.errors.values()) == pytest.approx(np.sqrt(((action - action.mean(0)) ** 2).mean()) * 40 / 39)
 
 
-def test_a_ridge_around_a_prior_is_a_ridge_around_zero_on_the_rest():
-    generator = torch.Generator().manual_seed(1)
-    latent, action = torch.randn(40, 5, generator=generator), torch.randn(40, 2, generator=generator)
-    prior = torch.randn(2, 5, generator=generator)
-    around = ridge(latent, action, prior=prior, bias=False)
-    rest = ridge(latent, action - latent @ prior.T, bias=False)
-    torch.testing.assert_close(around.weight, rest.weight + prior, rtol=1e-5, atol=1e-6)
-    assert around.penalty == rest.penalty
-    around = ridge(latent, action, prior=prior, bias=False, penalties=(1e9,))
-    torch.testing.assert_close(around.weight.float(), prior, rtol=1e-4, atol=1e-4)
+def test_a_ridge_around_a_shared_filter_is_a_ridge_around_zero_on_the_rest():
+    latent, action = map(torch.from_numpy, make_data())
+    shared = shared_filter()
+    steps = torch.einsum("nm,sam->nsa", latent, shared.basis)
+    weights = shared.fit(steps, action, torch.zeros(40, dtype=torch.int64))[0]
+    prior = torch.einsum("s,sam->am", weights, shared.basis)
+    around = ridge(latent, action, prior=shared, bias=False)
+    rest = ridge(latent, action - latent @ prior.T, bias=False, penalties=(around.penalty,))
+    torch.testing.assert_close(around.weight, rest.weight + prior)
+    around = ridge(latent, action, prior=shared, bias=False, penalties=(1e9,))
+    torch.testing.assert_close(around.weight, prior, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize("sizes", [None, [5] * 8, [20] * 2, [1, 3, 27, 9]])
+def test_rows_that_are_left_out_are_left_out_of_the_shared_filter_too(sizes, bias):
+    latent, action = make_data()
+    groups = np.arange(40) if sizes is None else np.repeat(np.arange(len(sizes)), sizes)
+    shared, penalty = shared_filter(), 0.3
+    found = fit(latent, action, groups=torch.from_numpy(groups), penalties=(penalty,), prior=shared, bias=bias)
+    steps = np.einsum("nm,sam->nsa", latent, shared.basis.numpy())
+    residual = np.empty_like(action)
+    for group in np.unique(groups):
+        out = groups == group
+        rows, target = (steps * shared.sizes.numpy()), (action * shared.sizes.numpy())
+        rows, target = rows[~out].transpose(0, 2, 1).reshape(-1, 3), target[~out].ravel()
+        ridge_of_filter = 0.02 * (rows**2).sum(1).mean() * np.eye(3)
+        weights = np.linalg.solve(rows.T @ rows + ridge_of_filter, rows.T @ target)
+        rest = action - np.einsum("nsa,s->na", steps, weights)
+        weight, constant = solve(latent[~out], rest[~out], penalty * unit_of(latent, bias), bias)
+        residual[out] = rest[out] - latent[out] @ weight - constant
+    assert found.error == pytest.approx(np.sqrt((residual**2).mean()))
+
+
+def test_a_shared_filter_of_axes_that_never_move_is_zero():
+    still = shared_filter().fit(torch.zeros(6, 3, 2), torch.ones(6, 2), torch.arange(6) % 3)
+    assert list(still.shape) == [4, 3] and not still.any()
 
 
 def test_targets_that_are_not_alike_have_a_penalty_each():
@@ -163,7 +199,7 @@ def test_targets_that_are_not_alike_have_a_penalty_each():
         ({"inputs": torch.full((40, 6), torch.nan)}, "a labelled input is not finite"),
         ({"targets": torch.zeros(39, 2)}, r"targets \[n, act\]"),
         ({"groups": torch.zeros(39, dtype=torch.int64)}, r"groups must be \[40\], got \[39\]"),
-        ({"prior": torch.zeros(2, 5)}, r"prior must be \[2, 6\] \[act, m\], got \[2, 5\]"),
+        ({"prior": SharedFilter(torch.zeros(3, 2, 5), torch.ones(2))}, r"basis must be \[S, 2, 6\], got \[3, 2, 5\]"),
         ({"penalties": (1.0, 0.0)}, "penalties must be positive and finite"),
         ({"penalties": ()}, "penalties must be positive and finite"),
         ({"default_penalty": -1.0}, "penalties must be positive and finite"),
@@ -173,20 +209,6 @@ def test_bad_input_is_explained(change, message):
     inputs, targets = (torch.from_numpy(value) for value in make_data())
     with pytest.raises(ValueError, match=message):
         ridge(**({"inputs": inputs, "targets": targets} | change))
-
-
-# a filter that all axes share
-
-
-def test_the_filter_solves_the_ridge_equations():
-    generator = torch.Generator().manual_seed(0)
-    steps = torch.randn(30, 4, 2, generator=generator).double()
-    action = torch.randn(30, 2, generator=generator).double()
-    rows = np.concatenate([steps[..., 0].numpy(), steps[..., 1].numpy()])
-    target = np.concatenate([action[:, 0].numpy(), action[:, 1].numpy()])
-    weight = 0.02 * (rows**2).sum(1).mean()
-    expected = np.linalg.solve(rows.T @ rows + weight * np.eye(4), rows.T @ target)
-    np.testing.assert_allclose(shared_filter(steps, action).numpy(), expected, rtol=1e-9)
 
 
 # held-out errors by themselves

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -67,7 +67,7 @@ def ridge(
     default_penalty: float | None = None,
     input_noise: float = 0.0,
     bias: bool = True,
-    prior: Tensor | None = None,
+    prior: SharedFilter | None = None,
     alike: bool = True,
 ) -> RidgeFit:
     r"""Fits ``targets ~ D inputs + b``, in float64.
@@ -87,8 +87,8 @@ def ridge(
         default_penalty (float, optional): used without any choice if there are fewer than three groups.
         input_noise (float): :math:`s^2`, in units of the mean square norm of the inputs. Defaults to 0.
         bias (bool): fit ``b``; otherwise it is 0. Defaults to ``True``.
-        prior (Tensor, optional): the penalty shrinks ``D`` towards it, ``[act, m]``. Defaults to 0. If it was fitted to
-            the targets, held-out errors are too low.
+        prior (SharedFilter, optional): the penalty shrinks ``D`` towards a filter that all targets share, fitted to
+            the rows that are not left out. Defaults to 0.
         alike (bool): all targets share one penalty; otherwise each has its own. Defaults to ``True``.
 
     Returns:
@@ -109,8 +109,8 @@ def ridge(
         raise ValueError(f"inputs must be [n, m] and targets [n, act], got {list(inputs.shape)}, {list(targets.shape)}")
     if groups is not None and groups.shape != inputs.shape[:1]:
         raise ValueError(f"groups must be [{len(inputs)}], got {list(groups.shape)}")
-    if prior is not None and prior.shape != (targets.shape[-1], inputs.shape[-1]):
-        raise ValueError(f"prior must be {[targets.shape[-1], inputs.shape[-1]]} [act, m], got {list(prior.shape)}")
+    if prior is not None and prior.basis.shape[1:] != (wanted := (targets.shape[-1], inputs.shape[-1])):
+        raise ValueError(f"the prior's basis must be [S, {wanted[0]}, {wanted[1]}], got {list(prior.basis.shape)}")
     candidates = tuple(penalties) if default_penalty is None else (*penalties, default_penalty)
     if not candidates or not all(0 < penalty < float("inf") for penalty in candidates):
         raise ValueError(f"penalties must be positive and finite, got {candidates}")
@@ -120,9 +120,6 @@ def ridge(
     for name, value in (("action", y), ("input", x)):
         if not value.isfinite().all():
             raise ValueError(f"a labelled {name} is not finite")
-    prior = y.new_zeros(y.shape[-1], x.shape[-1]) if prior is None else prior.to(y)
-    # shrinking towards the prior is shrinking towards 0 on the residuals of the prior
-    y = y - torch.cat([part.double() @ prior.mT for part in x.split(ROWS)])
     rows = torch.arange(len(x), device=x.device)
     groups = rows if groups is None else groups.unique(return_inverse=True)[1]
     num_groups = int(groups.max()) + 1
@@ -130,6 +127,14 @@ def ridge(
         penalties = (default_penalty,)
     if num_groups == 1:  # leaving out the only group would leave no rows: leave out single rows
         groups = rows
+    given, mean_weight, mix = y, y.new_zeros(y.shape[-1], x.shape[-1]), None
+    if prior is not None:
+        filtered = torch.cat([part.double() @ prior.basis.flatten(0, 1).mT for part in x.split(ROWS)])
+        mix = prior.fit(filtered.unflatten(-1, prior.basis.shape[:2]), y, groups)
+        mean_weight = (mix[0, :, None, None] * prior.basis).sum(0)
+        # shrinking towards the prior is shrinking towards 0 on the residuals of the prior
+        y = y - torch.cat([part.double() @ mean_weight.mT for part in x.split(ROWS)])
+        given = torch.cat([given, filtered], -1)
 
     mean_x, mean_y = (part.mean(0, dtype=torch.float64) * bias for part in (x, y))
     target = y - mean_y
@@ -141,29 +146,55 @@ def ridge(
     tried = sorted({max(float(penalty), smallest) for penalty in penalties})
     shrinks = torch.stack([singular.square() / (singular.square() + penalty * unit) for penalty in tried])
     projected = torch.stack([left(some).mT @ target[some] for some in rows.split(ROWS)]).sum(0)
-    squares = held_out_errors(left, shrinks, projected, target, groups, centred=bias)
+    if mix is None:
+        squares = held_out_errors(left, shrinks, projected, target, groups, centred=bias)
+    else:  # residuals are linear in the target: those of each group are combined with the filter fitted without it
+        parts = given - given.mean(0) * bias
+        along = torch.stack([left(some).mT @ parts[some] for some in rows.split(ROWS)]).sum(0)
+        without = torch.cat([torch.ones_like(mix[1:, :1]), -mix[1:]], -1)
+        squares = held_out_errors(left, shrinks, along, parts, groups, centred=bias, mix=without)
     errors = dict(zip(tried, squares.mean(-1).sqrt().tolist(), strict=True))
     best = squares.mean(-1).argmin()
     each = best.expand(y.shape[-1]) if alike else squares.argmin(0)
     own = singular.new_tensor(tried)[each]
     weight = right.mT @ (singular[:, None] / (singular.square()[:, None] + own * unit) * projected)  # [m, act]
     error = float(squares.gather(0, each[None]).mean().sqrt())
-    return RidgeFit(prior + weight.mT, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
+    return RidgeFit(mean_weight + weight.mT, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
 
 
-def shared_filter(steps: Tensor, action: Tensor) -> Tensor:
-    r"""Fits one filter ``w [S]`` that all axes share, the prior mean of a decoder with few labels.
+class SharedFilter(NamedTuple):
+    r"""A prior mean for decoders with few labels: one filter ``w [S]`` that all axes share.
 
     .. math::
         a_{t,i} \approx \sum_s w_s v_{t,s,i} \qquad \text{for every axis } i
 
     with steps ``v [N, S, act]`` along each axis and actions ``[N, act]``, both in raw units. A trajectory that hardly
     moves along an axis contains little information about it; all axes together determine the few numbers ``w`` well.
+
+    Args:
+        basis (Tensor): ``[S, act, m]``, float64; the decoder of each step, in the units of inputs and targets.
+        sizes (Tensor): raw size of one unit of every target ``[act]``.
     """
-    rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
-    unit = rows.square().sum(-1).mean()
-    gram = rows.mT @ rows + SHARED_PENALTY * unit * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
-    return torch.linalg.solve(gram, rows.mT @ target)
+
+    basis: Tensor
+    sizes: Tensor
+
+    def fit(self, steps: Tensor, action: Tensor, groups: Tensor) -> Tensor:
+        """Fits ``w`` to all rows, then to all but those of each group; returns ``[1 + G, S]``.
+
+        Steps ``[N, S, act]`` and actions ``[N, act]`` are in the units of the targets; groups are int64 ``[N]``.
+        """
+        steps, action = steps * self.sizes, action * self.sizes
+        own = torch.einsum("nsa,nta->nst", steps, steps), torch.einsum("nsa,na->ns", steps, action)
+        count = int(groups.max()) + 1
+        of_group = [part.new_zeros(count, *part.shape[1:]).index_add_(0, groups, part) for part in own]
+        gram, right = (
+            torch.cat([part.sum(0)[None], part.sum(0) - each]) for part, each in zip(own, of_group, strict=True)
+        )
+        rows = action.shape[-1] * torch.cat([groups.new_tensor([len(groups)]), len(groups) - groups.bincount()])
+        unit = gram.diagonal(dim1=-2, dim2=-1).sum(-1) / rows.clamp_min(1)
+        unit = torch.where(unit > 0, unit, 1.0)  # where nothing moves, w is 0
+        return torch.linalg.solve(gram + SHARED_PENALTY * torch.diag_embed(unit[:, None].expand_as(right)), right)
 
 
 def thin_svd(inputs: Tensor, mean: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor, Tensor]:
@@ -203,6 +234,7 @@ def held_out_errors(
     groups: Tensor,
     *,
     centred: bool,
+    mix: Tensor | None = None,
 ) -> Tensor:
     r"""Computes mean squared held-out errors ``[P, act]`` of ``P`` ridge regressions, leaving out one group at a time.
 
@@ -216,20 +248,27 @@ def held_out_errors(
         (I - V V^T)^{-1} E = E + V (I - V^T V)^{-1} V^T E
 
     If the mean is fitted too (``centred``), it is one more direction, without shrinkage, and already subtracted from
-    the target ``[N, act]``. ``groups`` are int64 ``[N]``. With a single row and a mean, errors are infinite.
+    the target ``[N, act]``. ``groups`` are int64 ``[N]``. With a single row and a mean, errors are infinite. With
+    ``mix [G, S]``, the target has ``S`` parts, ``[N, S * act]``, whose errors are summed with the weights of the group.
     """
     coefficients = shrinks.unsqueeze(-1) * projected  # [P, r, act]
+    weights = target.new_ones(int(groups.max()) + 1, 1) if mix is None else mix
+    wide = target.shape[1] // weights.shape[1]
     if centred and len(target) == 1:
-        return target.new_full((len(shrinks), target.shape[1]), torch.inf)
+        return target.new_full((len(shrinks), wide), torch.inf)
+
+    def mixed(error: Tensor, group: Tensor) -> Tensor:
+        return (error.unflatten(-1, (-1, wide)) * weights[group].unsqueeze(-1)).sum(-2)
+
     constant = len(target) ** -0.5 if centred else 0.0  # entry, in every row, of the mean's unit vector
-    total = target.new_zeros(len(shrinks), target.shape[1])
+    total = target.new_zeros(len(shrinks), wide)
     sizes = groups.bincount()
     if int(sizes.max()) == 1:  # for single rows the leverages suffice
         for rows in torch.arange(len(target), device=target.device).split(ROWS):
             part = left(rows)
             leverage = part.square() @ shrinks.mT + constant**2
             for fit, (c, h) in enumerate(zip(coefficients, leverage.unbind(-1), strict=True)):
-                total[fit] += ((target[rows] - part @ c) / (1 - h[:, None])).square().sum(0)
+                total[fit] += mixed((target[rows] - part @ c) / (1 - h[:, None]), groups[rows]).square().sum(0)
         return total / len(target)
     if centred:
         shrinks = torch.cat([shrinks, shrinks.new_ones(len(shrinks), 1)], -1)
@@ -244,7 +283,7 @@ def held_out_errors(
             error = error + part @ (roots * _solve(inner, roots * (part.mT @ error)))
         else:
             error = _solve((part * shrinks.unsqueeze(1)) @ part.mT, error)
-        total += error.square().sum(1)
+        total += mixed(error, groups[rows]).square().sum(1)
     return total / len(target)
 
 

@@ -15,7 +15,7 @@ from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule, LinearActionDecoder
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, RidgeFit, ridge, shared_filter
+from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, RidgeFit, SharedFilter, ridge
 from torchrl_koap.modules.windows import WindowReader
 
 
@@ -160,8 +160,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
 
         With ``axes``, and a latent action that contains the steps along them, the decoder is shrunk towards one filter
         of the steps that all axes share, instead of towards 0. Guessed axes are used only if they lower the held-out
-        error. The filter is fitted to all labels, so this error is too low if they are few. Wrong guesses may then be
-        used. The summary names the ``block`` if there were several.
+        error. The summary names the ``block`` if there were several.
         """
         network, normalizer = self.latent_action, self.action_normalizer
         options = {
@@ -196,24 +195,19 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
             return ridge(latent, action, **options)
         if len(axes) != action.shape[-1]:
             raise ValueError(f"axes must be one state column per action entry ({action.shape[-1]}), got {list(axes)}")
-        fit = ridge(latent, action, prior=self._shared_filter_prior(latent, action, axes, *features), **options)
+        fit = ridge(latent, action, prior=self._shared_filter(latent.shape[-1], axes, *features), **options)
         if not guessed:
             return fit
         plain = ridge(latent, action, **options)
         return plain if plain.error <= fit.error else fit
 
-    def _shared_filter_prior(
-        self, latent: Tensor, action: Tensor, axes: Sequence[int], entries: Tensor, factors: Tensor
-    ) -> Tensor:
-        """Returns the decoder ``[act, m]`` that applies the same filter to the steps ``[S, act]`` of every axis."""
+    def _shared_filter(self, latent_dim: int, axes: Sequence[int], entries: Tensor, factors: Tensor) -> SharedFilter:
+        """Returns the filter of the steps of every axis, with a decoder ``[act, m]`` for each of its ``S`` weights."""
         size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]
-        action_size = _unit(self.action_normalizer, action.shape[-1], factors)
-        per_unit = (factors * size).double()
-        shared = shared_filter(latent[:, entries].double() * per_unit, (action * action_size).double())
-        prior = torch.zeros(action.shape[-1], latent.shape[-1], dtype=torch.float64, device=latent.device)
-        rows = torch.arange(action.shape[-1], device=latent.device).expand_as(entries)
-        prior[rows, entries] = shared[:, None] * per_unit / action_size
-        return prior
+        action_size = _unit(self.action_normalizer, len(axes), factors).double()
+        basis = torch.zeros(*entries.shape, latent_dim, dtype=torch.float64, device=entries.device)
+        per_unit = (factors * size).double() / action_size
+        return SharedFilter(basis.scatter_(-1, entries[..., None], per_unit[..., None]), action_size)
 
 
 def _unit(normalizer: nn.Module | None, width: int, like: Tensor) -> Tensor:
