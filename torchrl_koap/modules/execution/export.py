@@ -140,12 +140,8 @@ def relative_gap(found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
 
 
 def _program(what: Exportable) -> torch.export.ExportedProgram:
-    return torch.export.export(what.module, what.batch(2), dynamic_shapes=_shapes(what, torch.export.Dim("batch")))
-
-
-def _shapes(what: Exportable, batch: Any) -> tuple[dict[int, Any], ...]:
-    """Marks the first axis of every input as dynamic."""
-    return tuple({0: batch} for _ in what.inputs)
+    dynamic = ({0: torch.export.Dim("batch")},) * len(what.inputs)
+    return torch.export.export(what.module, what.batch(2), dynamic_shapes=dynamic)
 
 
 def _write_torch(what: Exportable, file: Path) -> None:
@@ -160,7 +156,7 @@ def _write_onnx(what: Exportable, file: Path) -> None:
         _program(what),
         input_names=list(what.inputs),
         output_names=list(_OUTPUTS),
-        dynamic_shapes=_shapes(what, "batch"),
+        dynamic_shapes=({0: "batch"},) * len(what.inputs),
         dynamo=True,
         verbose=False,
     )
