@@ -87,7 +87,8 @@ def _read(
 ) -> tuple[list[Piece], float | None, list[str]]:
     """Returns demonstrations, the declared rate, and the entries that are not read."""
     aloha = isinstance(stream.get("observations"), Mapping)  # h5py groups are mappings
-    data = {file.stem: _aloha(stream)} if aloha else stream.get("data")
+    called = {"observations": "obs", "action": "actions"}  # ALOHA's names -> robomimic's
+    data = {file.stem: {called.get(name, name): part for name, part in stream.items()}} if aloha else stream.get("data")
     if not isinstance(data, Mapping):
         wanted = (
             "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions), or ALOHA's (observations, action)"
@@ -117,12 +118,6 @@ def _read(
     said = {"mask": "mask (every demonstration is read)"}
     skipped += [said.get(name, name) for name in stream if "data" in stream and name != "data"]
     return pieces, _control_frequency(getattr(data, "attrs", {}).get("env_args")), skipped
-
-
-def _aloha(stream: Any) -> dict[str, Any]:
-    """Converts the demonstration of a file in ALOHA's layout to robomimic's."""
-    called = {"observations": "obs", "action": "actions"}
-    return {called.get(name, name): part for name, part in stream.items()}
 
 
 def _entries(group: Mapping[str, Any], above: str = "") -> dict[str, Any]:
