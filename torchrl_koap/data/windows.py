@@ -63,13 +63,7 @@ class WindowTable:
 
     @classmethod
     def build(
-        cls,
-        data: TensorDictBase,
-        window: int,
-        *,
-        counted: range | None = None,
-        pad_before: int = 0,
-        pad_after: int = 0,
+        cls, data: TensorDictBase, window: int, *, counted: range | None = None, pad_before: int = 0, pad_after: int = 0
     ) -> WindowTable:
         """Tabulates the windows of ``window`` frames of flat data ``[N]``.
 

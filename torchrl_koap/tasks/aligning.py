@@ -51,11 +51,7 @@ register_task(
             ("measured_xyz", *_TARGET),
         ),
         goal="torchrl_koap.tasks.aligning:goal_reached",
-        modes=Modes(
-            (("pushed from", ("inside", "outside")),),
-            leaves=((0,), (1,)),
-            entropy="contexts",
-        ),
+        modes=Modes((("pushed from", ("inside", "outside")),), leaves=((0,), (1,)), entropy="contexts"),
         env="torchrl_koap.envs.aligning:AligningEnv",
         expert="torchrl_koap.envs.experts.aligning:AligningExpert",
         scene=Scene(

@@ -93,11 +93,7 @@ def _sorting(num_boxes: int) -> Task:
         relative_positions=tuple(("measured_xy", f"{box}_xy") for box in boxes),
         interchangeable=tuple(tuple(box for box in boxes if boxes[box] == colour) for colour in COLOURS),
         goal="torchrl_koap.tasks.sorting:goal_reached",
-        modes=Modes(
-            (("order of arrival", orders),),
-            leaves=arrival_orders(num_boxes),
-            entropy="solved_contexts",
-        ),
+        modes=Modes((("order of arrival", orders),), leaves=arrival_orders(num_boxes), entropy="solved_contexts"),
         env="torchrl_koap.envs.sorting:SortingEnv",
         env_options={"num_boxes": num_boxes},
         expert="torchrl_koap.envs.experts.sorting:SortingExpert",

@@ -135,9 +135,7 @@ register_task(
         actions=_JOINTS | {"gripper": Action("m", "gripper", column=3)},
         # the commanded joints are not observed, so commands are inferred from the scene
         defaults=replace(
-            _STACKING.defaults,
-            joint_recovery=0.0,
-            controller={"preset": "scene", "columns": "related", "steps": 3000},
+            _STACKING.defaults, joint_recovery=0.0, controller={"preset": "scene", "columns": "related", "steps": 3000}
         ),
     )
 )

@@ -5,11 +5,4 @@ from torchrl_koap.vision.backbones import Backbone, load_backbone
 from torchrl_koap.vision.encoder import FrozenImageEncoder, Projection, load_encoder
 from torchrl_koap.vision.observer import Observer
 
-__all__ = [
-    "Backbone",
-    "FrozenImageEncoder",
-    "Observer",
-    "Projection",
-    "load_backbone",
-    "load_encoder",
-]
+__all__ = ["Backbone", "FrozenImageEncoder", "Observer", "Projection", "load_backbone", "load_encoder"]

@@ -81,11 +81,7 @@ FORMATS = {
         read_minari,
         COMMON,
     ),
-    "ted": Format(
-        "a data set of this library",
-        lambda source: stored_folder(source) is not None,
-        _read_stored,
-    ),
+    "ted": Format("a data set of this library", lambda source: stored_folder(source) is not None, _read_stored),
     "robomimic": Format(
         "an HDF5 file in robomimic's layout or ALOHA's, or a folder of them (*.hdf5)",
         lambda source: bool(hdf5_files(source)) and not table_files(source),

@@ -184,13 +184,7 @@ def _shown(clip: Clip, container: Any, stream: Any) -> Iterator[np.ndarray]:
         yield frame.to_ndarray(format="rgb24")
 
 
-_READERS = {
-    "folder": _folder,
-    ".npy": _array,
-    ".hdf5": _hdf5,
-    ".h5": _hdf5,
-    ".parquet": _parquet,
-}
+_READERS = {"folder": _folder, ".npy": _array, ".hdf5": _hdf5, ".h5": _hdf5, ".parquet": _parquet}
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
