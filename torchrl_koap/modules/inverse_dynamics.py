@@ -206,8 +206,6 @@ class LatentInverseDynamics(InverseDynamics):
     are those of :class:`InverseDynamics`.
     """
 
-    samples_latents = False  # whether the latents have a distribution, of which a method sample() draws
-
     def __init__(self, reader: WindowReader | None, action_decoder: nn.Module, **kwargs):
         super().__init__(reader, **kwargs)
         self.out_keys = [LATENT_ACTION, *self.out_keys]
@@ -217,6 +215,10 @@ class LatentInverseDynamics(InverseDynamics):
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Infers the latents ``[*B, len(frames), m]`` of raw states ``[*B, T, d]``; subclasses define it."""
         raise NotImplementedError
+
+    def sample(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Samples the latents; without a distribution, these are the inferred ones."""
+        return self.infer(state, frames)
 
     def decode(self, latent: Tensor) -> Tensor:
         """Decodes latents ``[*B, T, m]`` to actions ``[*B, T, act]`` in normalised units."""

@@ -23,12 +23,12 @@ class ActionLoss(WindowLoss):
         network (InverseDynamics): the controller.
 
     Keyword Args:
-        freeze_latents (bool): train only the action decoder of a controller with latents. Defaults to ``False``.
-        sample (bool): decode samples of the latents instead of inferred ones. Defaults to ``False``.
+        freeze_latents (bool): train only the action decoder of a controller with latents, on samples of them
+            (:meth:`LatentInverseDynamics.sample`). Defaults to ``False``.
         reduction (str): as for :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Raises:
-        ValueError: for ``freeze_latents`` if the network has no latents, or ``sample`` if they have no distribution.
+        ValueError: for ``freeze_latents`` if the network has no latents.
 
     Examples:
         >>> import torch
@@ -48,16 +48,11 @@ class ActionLoss(WindowLoss):
     out_keys = ["loss_action"]
     required = ("state", "action", "has_action")
 
-    def __init__(
-        self, network: InverseDynamics, *, freeze_latents: bool = False, sample: bool = False, reduction: str = "mean"
-    ):
+    def __init__(self, network: InverseDynamics, *, freeze_latents: bool = False, reduction: str = "mean"):
         super().__init__(network, reduction=reduction)
-        latent, kind = isinstance(network, LatentInverseDynamics), type(network).__name__
-        if freeze_latents and not latent:
-            raise ValueError(f"freeze_latents was asked for, but {kind} has no latents")
-        if sample and not (latent and network.samples_latents):
-            raise ValueError(f"samples were asked for, but {kind} has no latents to sample")
-        self.freeze_latents, self.sample = freeze_latents, sample
+        if freeze_latents and not isinstance(network, LatentInverseDynamics):
+            raise ValueError(f"freeze_latents was asked for, but {type(network).__name__} has no latents")
+        self.freeze_latents = freeze_latents
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -66,9 +61,8 @@ class ActionLoss(WindowLoss):
         network, span = self.network, self.network.valid_frames(state.shape[-2])
         target, counts = self._targets(tensordict, state, recorded, span)
         with self.network_params.to_module(network, preserve_module_state=False):
-            if self.freeze_latents or self.sample:
-                latent = (network.sample if self.sample else network.infer)(state, span)
-                predicted = network.decode(latent.detach() if self.freeze_latents else latent)
+            if self.freeze_latents:
+                predicted = network.decode(network.sample(state, span).detach())
             else:
                 predicted = network.predict(state, span)
             error = self._action_error(predicted, target)

@@ -196,10 +196,7 @@ for _method in (
         "vae",
         "variational autoencoder of whole windows",
         partial(_network, kind=VariationalInverseDynamics),
-        (
-            Phase("controller", VariationalLoss, share=0.5),
-            replace(_DECODER, loss=partial(ActionLoss, freeze_latents=True, sample=True)),
-        ),
+        (Phase("controller", VariationalLoss, share=0.5), _DECODER),
         updates=1000,
         execution=_OPEN_LOOP,
     ),

@@ -213,24 +213,19 @@ def test_a_far_window_stays_finite():
 def test_each_stage_of_the_autoencoder_trains_what_it_should():
     network, batch = make_autoencoder(), noisy_windows(6)
     assert reached(network, sum(VariationalLoss(network)(batch).values())) == {"context", "encoder", "decoder"}
-    loss = ActionLoss(network, freeze_latents=True, sample=True)
+    loss = ActionLoss(network, freeze_latents=True)
     assert reached(network, loss(batch)["loss_action"]) == {"action_decoder"}
 
 
 def test_the_action_decoder_is_fitted_to_samples_and_acts_on_the_mean():
     network, batch = make_autoencoder(), noisy_windows(6)
-    loss = ActionLoss(network, freeze_latents=True, sample=True)
+    loss = ActionLoss(network, freeze_latents=True)
     assert loss(batch)["loss_action"] != loss(batch)["loss_action"]
     written = network(batch.select("state"))
     assert torch.equal(written["action"], network(batch.select("state"))["action"])
     assert torch.equal(written["latent_action"], network.posterior(batch["state"])[1])
 
 
-def test_samples_and_frozen_latents_need_a_network_that_has_them():
-    supervised = SupervisedInverseDynamics(2, 2)
-    for asked, message in (
-        ({"sample": True}, "samples were asked"),
-        ({"freeze_latents": True}, "freeze_latents was asked"),
-    ):
-        with pytest.raises(ValueError, match=f"{message} for, but SupervisedInverseDynamics has no latents"):
-            ActionLoss(supervised, **asked)
+def test_frozen_latents_need_a_network_that_has_them():
+    with pytest.raises(ValueError, match="freeze_latents was asked for, but SupervisedInverseDynamics has no latents"):
+        ActionLoss(SupervisedInverseDynamics(2, 2), freeze_latents=True)

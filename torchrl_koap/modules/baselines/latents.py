@@ -122,7 +122,7 @@ class VariationalInverseDynamics(LatentInverseDynamics):
     with ``s_t`` the present state and the steps to and from it (:class:`~torchrl_koap.modules.WindowReader`), and an
     LSTM that runs over the window in both directions. Trained in two stages, as in the paper:
     :class:`~torchrl_koap.objectives.VariationalLoss` on all windows, then :class:`~torchrl_koap.objectives.ActionLoss`
-    with ``freeze_latents`` and ``sample`` on the labelled frames. In a policy it decodes the mean. Args as for
+    with ``freeze_latents``, on samples, on the labelled frames. In a policy it decodes the mean. Args as for
     :class:`~torchrl_koap.modules.InverseDynamics`, without ``num_past`` and ``look_ahead``.
 
     Examples:
@@ -133,7 +133,6 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         torch.Size([1, 16, 16])
     """
 
-    samples_latents = True
     num_window_frames = WINDOW
 
     def __init__(self, state_dim: int, action_dim: int, **kwargs):
