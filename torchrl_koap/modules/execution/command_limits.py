@@ -76,16 +76,12 @@ class CommandLimits(nn.Module):
         Actions within the limits stay the same bit for bit, since a rounding error changes episodes with contacts. The
         second result, bool ``[*B]``, says whether any column of an action was outside its range.
         """
-        held = self._in_range(action)
+        held = action
+        if self.ends is not None:
+            if action.shape[-1] != len(self.ends):
+                raise ValueError(f"ranges has {len(self.ends)} columns, but actions have {action.shape[-1]}")
+            held = action.clamp(*self.ends.to(action.dtype).unbind(-1))
         return self._paced(observations, held), (held != action).any(-1)
-
-    def _in_range(self, action: Tensor) -> Tensor:
-        if self.ends is None:
-            return action
-        if action.shape[-1] != len(self.ends):
-            raise ValueError(f"ranges has {len(self.ends)} columns, but actions have {action.shape[-1]}")
-        low, high = self.ends.to(action.dtype).unbind(-1)
-        return action.clamp(low, high)
 
     def _paced(self, observations: Tensor, action: Tensor) -> Tensor:
         """Applies gain and lead to actions ``[*B, act]``."""
