@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from tensordict import NestedKey
@@ -34,7 +33,7 @@ class DiffusionPolicy(ConditionalSampler):
     Keyword Args:
         action_dim (int): number ``act`` of action entries.
         relative (bool): the condition holds displacements from the present state. Defaults to False.
-        out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]``. Defaults to ``["action_chunk"]``.
+        out_key (NestedKey): the entry of the actions ``[*B, H, act]``. Defaults to ``"action_chunk"``.
 
     Examples:
         >>> import torch
@@ -53,11 +52,10 @@ class DiffusionPolicy(ConditionalSampler):
         state_dim: int,
         action_dim: int,
         relative: bool = False,
-        out_keys: Sequence[NestedKey] = (ACTION_CHUNK,),
+        out_key: NestedKey = ACTION_CHUNK,
         **options: Any,
     ):
-        options |= {"relative": relative, "out_keys": out_keys}
-        super().__init__(denoiser, state_dim=state_dim, width=action_dim, **options)
+        super().__init__(denoiser, state_dim=state_dim, width=action_dim, relative=relative, out_key=out_key, **options)
         self.action_dim = action_dim
         self.action_normalizer = Normalizer(action_dim)
 

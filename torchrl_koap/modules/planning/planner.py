@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from tensordict import NestedKey
@@ -35,7 +34,7 @@ class StatePlanner(ConditionalSampler):
 
     Keyword Args:
         relative (bool): model displacements from the present state. Defaults to True.
-        out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]``. Defaults to ``["plan"]``.
+        out_key (NestedKey): the entry of the plan ``[*B, H, d]``. Defaults to ``"plan"``.
 
     Examples:
         >>> import torch
@@ -54,11 +53,10 @@ class StatePlanner(ConditionalSampler):
         *,
         state_dim: int,
         relative: bool = True,
-        out_keys: Sequence[NestedKey] = (keys.PLAN,),
+        out_key: NestedKey = keys.PLAN,
         **options: Any,
     ):
-        options |= {"relative": relative, "out_keys": out_keys}
-        super().__init__(denoiser, state_dim=state_dim, width=state_dim, **options)
+        super().__init__(denoiser, state_dim=state_dim, width=state_dim, relative=relative, out_key=out_key, **options)
         self.plan_normalizer = Normalizer(self.horizon * state_dim)
 
     def fit_normalizers(self, windows: Tensor) -> None:

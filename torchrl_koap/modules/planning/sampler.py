@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
@@ -30,9 +28,9 @@ class ConditionalSampler(TensorDictModuleBase):
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
         width (int): number of columns of a sequence.
-        out_keys (list of NestedKey): the entry of the sequence ``[*B, H, width]``, raw units.
+        out_key (NestedKey): the entry of the sequence ``[*B, H, width]``, raw units.
         relative (bool): the condition holds older frames as displacements from the present one.
-        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``, raw units. Defaults to ``["history"]``.
+        in_key (NestedKey): the entry of the history ``[*B, h, d]``, raw units. Defaults to ``"history"``.
         history (int): number ``h`` of observed frames, the present one included. Defaults to 2.
         horizon (int): number ``H`` of frames of a sequence. Defaults to 14.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
@@ -42,8 +40,7 @@ class ConditionalSampler(TensorDictModuleBase):
         noise_key (NestedKey, optional): entry of start noise ``[*B, H, width]``, read if present. Default: ``"noise"``.
 
     Raises:
-        ValueError: for sizes below 1, several in- or out-keys or an unknown solver; at a call for a history or noise of
-            the wrong shape.
+        ValueError: for sizes below 1 or an unknown solver; at a call for a history or noise of the wrong shape.
     """
 
     def __init__(
@@ -52,9 +49,9 @@ class ConditionalSampler(TensorDictModuleBase):
         *,
         state_dim: int,
         width: int,
-        out_keys: Sequence[NestedKey],
+        out_key: NestedKey,
         relative: bool,
-        in_keys: Sequence[NestedKey] = (HISTORY,),
+        in_key: NestedKey = HISTORY,
         history: int = 2,
         horizon: int = 14,
         features: nn.Module | None = None,
@@ -67,9 +64,7 @@ class ConditionalSampler(TensorDictModuleBase):
         for name, value in sizes.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
-        if len(in_keys) != 1 or len(out_keys) != 1:
-            raise ValueError(f"one in_key and one out_key are needed, got {in_keys} and {out_keys}")
-        self.in_keys, self.out_keys, self.noise_key = list(in_keys), list(out_keys), noise_key
+        self.in_keys, self.out_keys, self.noise_key = [in_key], [out_key], noise_key
         self.denoiser, self.schedule = denoiser, NoiseSchedule()
         lookup(SOLVERS, solver, "solver")
         self.schedule.noise_levels(num_steps)  # raises if num_steps is out of range
@@ -176,7 +171,7 @@ class ConditionalSampler(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the sampled sequence into the tensordict."""
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
-        history = read_entry(self, tensordict, self.in_keys[0], "in_keys=[...]")
+        history = read_entry(self, tensordict, self.in_keys[0])
         return tensordict.set(self.out_keys[0], self.sample(history, noise))
 
     def _encode_prefix(self, history: Tensor, prefix: Tensor) -> Tensor:
