@@ -203,42 +203,35 @@ def _value_problems(data: TensorDictBase, present: set, command: slice | None) -
     width, next_width = data.get(OBSERVATION).shape[-1], data.get(NEXT_OBSERVATION).shape[-1]
     if width != next_width:
         yield f"'observation' has {width} columns, {NEXT_OBSERVATION!r} has {next_width}"
+    wrong: dict[str, Tensor] = {}  # which steps have a fault, bool [N]
     for key in (OBSERVATION, STATE, NEXT_OBSERVATION):
         if key in present:
-            allowed = command if key != STATE else None
-            bad = torch.cat([_not_finite(values, allowed) for values in data.get(key).split(_PART)])
-            if bad.any():
-                yield f"{key!r} is NaN or infinite in {int(bad.sum())} steps, first at step {_first(bad)}"
+            allowed, parts = command if key != STATE else None, data.get(key).split(_PART)
+            wrong[f"{key!r} is NaN or infinite"] = torch.cat([_not_finite(values, allowed) for values in parts])
 
     action, has_action = data.get(ACTION), data.get(HAS_ACTION).squeeze(-1)
-    lost = has_action & ~action.isfinite().all(-1)
-    if lost.any():
-        yield f"'action' is not finite in {int(lost.sum())} labelled steps, first at step {_first(lost)}"
-    leaked = ~has_action & ~action.isnan().all(-1)
-    if leaked.any():
-        found = f"'action' holds numbers in {int(leaked.sum())} unlabelled steps, first at step {_first(leaked)}"
-        yield f"{found} (an action outside the label budget must be NaN)"
+    wrong["a labelled 'action' is not finite"] = has_action & ~action.isfinite().all(-1)
+    leaked = "an unlabelled 'action' holds numbers (an action outside the label budget must be NaN)"
+    wrong[leaked] = ~has_action & ~action.isnan().all(-1)
 
     episode, step_count = data.get(EPISODE), data.get(STEP_COUNT)
     same = episode[1:] == episode[:-1]
     edge = torch.ones(1, dtype=torch.bool, device=same.device)
-    starts = torch.cat([edge, ~same])
+    starts, ends = torch.cat([edge, ~same]), torch.cat([~same, edge])
     if int(starts.sum()) != episode[starts].unique().numel():
         yield "'episode': the steps of a trajectory must lie one after the other"
-    wrong = starts & (step_count != 0)
-    wrong[1:] |= same & (step_count[1:] != step_count[:-1] + 1)
-    if wrong.any():
-        yield f"'step_count' must count 0, 1, 2, ... in a trajectory, first fault at step {_first(wrong)}"
+    miscounted = starts & (step_count != 0)
+    miscounted[1:] |= same & (step_count[1:] != step_count[:-1] + 1)
+    wrong["'step_count' does not count 0, 1, 2, ... in its trajectory"] = miscounted
 
     done = data.get(NEXT_DONE).squeeze(-1)
-    ends = torch.cat([~same, edge])
-    if (ends & ~done).any():
-        yield f"('next', 'done') is False at the end of the trajectory at step {_first(ends & ~done)}"
-    if (done & ~ends).any():
-        yield f"('next', 'done') is True inside a trajectory at step {_first(done & ~ends)}"
+    wrong["('next', 'done') is False at the end of a trajectory"] = ends & ~done
+    wrong["('next', 'done') is True inside a trajectory"] = done & ~ends
     stopped = (data.get(NEXT_TERMINATED) | data.get(NEXT_TRUNCATED)).squeeze(-1)
-    if (done != stopped).any():
-        yield f"('next', 'done') must be 'terminated or truncated', first fault at step {_first(done != stopped)}"
+    wrong["('next', 'done') is not 'terminated or truncated'"] = done != stopped
+    for said, steps in wrong.items():
+        if steps.any():
+            yield f"{said} in {int(steps.sum())} steps, first at step {int(steps.nonzero()[0])}"
 
 
 def _not_finite(values: Tensor, allowed: slice | None) -> Tensor:
@@ -247,7 +240,3 @@ def _not_finite(values: Tensor, allowed: slice | None) -> Tensor:
     if allowed is not None:
         bad_entries[:, allowed] &= ~values[:, allowed].isnan().all(-1, keepdim=True)
     return bad_entries.any(-1)
-
-
-def _first(mask: Tensor) -> int:
-    return int(mask.nonzero()[0])

@@ -287,7 +287,7 @@ def test_a_budget_that_cannot_be_spent_is_named(data, options, message):
 def test_labels_that_are_no_numbers_are_named():
     data = demonstrations()
     data["action"][7] = math.nan
-    with pytest.raises(ValueError, match="'action' is not finite in 1 labelled steps, first at step 7"):
+    with pytest.raises(ValueError, match="a labelled 'action' is not finite in 1 steps, first at step 7"):
         LabelBudget(count=1).apply(data)
     found, report = LabelBudget(fraction=1.0).apply(data.exclude("has_action"))  # without the column NaN means no label
     assert report.available_transitions == 108 and not found["has_action"][7]

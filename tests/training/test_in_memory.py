@@ -194,7 +194,7 @@ def test_refusals():
         fit(select_state(data, (0, 1, 2)), task)
     wrong = data.clone()
     wrong["has_action"][-1] = True
-    with pytest.raises(DataError, match="'action' is not finite in 1 labelled steps"):
+    with pytest.raises(DataError, match="a labelled 'action' is not finite in 1 steps"):
         fit(wrong, task)
     planner = fit(data, task, method="linear", planner={"steps": 1, **SMALL}, progress=False).planner
     with pytest.raises(ValueError, match="method 'dp' samples actions and has no planner"):
