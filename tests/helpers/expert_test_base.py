@@ -7,6 +7,7 @@ import torch
 
 from torchrl_koap.envs import make_env
 from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
+from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.envs.experts.recording import play
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.tasks import get_task
@@ -16,7 +17,8 @@ def first_attempts(task, modes, contexts, seeds, max_steps=None):
     """Plays the first attempt at every mode; returns the attempts and the environment in its final state."""
     task = get_task(task)
     env = make_env(task, len(modes), max_steps=max_steps or task.max_steps, dtype=torch.float64)
-    return play(env, task, modes, contexts, seeds, lambda over: None), env
+    still = Disturbances(task, seeds, [False] * len(modes))
+    return play(env, task, modes, contexts, seeds, lambda over: None, still), env
 
 
 class ExpertTestBase:

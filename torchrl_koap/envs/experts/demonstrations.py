@@ -202,7 +202,7 @@ def _play_batches(
                 rows, kept = [row for row in batch if row not in takes], len(done) + begin + len(takes)
                 contexts = contexts_of(attempt - attempt % _PER_CONTEXT)
                 seeds = [(seed, row, attempt) for row in rows]
-                hand = Disturbances(task, seeds, disturbed[rows]) if disturbed[rows].any() else None
+                hand = Disturbances(task, seeds, disturbed[rows])
                 drawn = np.random.SeedSequence(seeds[0]).generate_state(1)
                 env.set_seed(int(drawn[0]))  # for the environment's own random numbers
                 results = play(
@@ -212,9 +212,9 @@ def _play_batches(
                     None if contexts is None else contexts[np.resize(rows, size)],  # the rest of the batch idles
                     seeds,
                     functools.partial(show, kept),
-                    disturbances=hand,
+                    hand,
                 )
-                for row, found, spells in zip(rows, results, hand.spells if hand else [[]] * len(rows), strict=True):
+                for row, found, spells in zip(rows, results, hand.spells, strict=True):
                     if found.fault:
                         failures[row][found.fault] += 1
                         last = row, found.fault

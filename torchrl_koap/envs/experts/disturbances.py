@@ -46,10 +46,7 @@ class Disturbances:
     """
 
     def __init__(self, task: Task, seeds: Sequence, disturbed: Sequence[bool]):
-        columns, height = disturbed_columns(task), height_column(task)
-        self._hands = [
-            _Hand(tuple(seed), columns, height) if each else None for seed, each in zip(seeds, disturbed, strict=True)
-        ]
+        self._hands = [_Hand(seed, task) if each else None for seed, each in zip(seeds, disturbed, strict=True)]
 
     def disturb(self, action: np.ndarray) -> np.ndarray:
         """Returns the actions ``[n, act]`` that are executed in place of the operators' ``action`` ``[n, act]``."""
@@ -87,8 +84,9 @@ def _spell(now: int, draw: np.random.Generator, kinds: Sequence[str]) -> tuple[i
 class _Hand:
     """Disturbances of one episode: sideways ones, and drifts of the height."""
 
-    def __init__(self, seed: tuple[int, ...], columns: np.ndarray, height: int | None):
-        self._columns, self._height, self._width = columns, height, len(columns)
+    def __init__(self, seed: tuple[int, ...], task: Task):
+        self._columns, self._height = disturbed_columns(task), height_column(task)
+        self._width = len(self._columns)
         self._sideways, self._upwards = (np.random.default_rng((*seed, own)) for own in (_STREAM, _HEIGHT_STREAM))
         self._time, self._pace = 0, 0.0
         self._held, self._last = np.zeros(self._width), np.zeros(self._width)

@@ -100,8 +100,7 @@ def play(
     contexts: np.ndarray | None,
     seeds: Sequence,
     progress: Callable[[int], None],
-    *,
-    disturbances: Disturbances | None = None,
+    disturbances: Disturbances,
 ) -> list[Attempt]:
     """Plays one attempt at as many episodes as there are modes, in the first environments of a batch; the others idle.
 
@@ -118,8 +117,7 @@ def play(
     success, reached = np.zeros(count, dtype=bool), np.full(count, -1)
     for _ in range(env.max_steps):
         action = np.zeros((count, task.action_dim))
-        wanted = expert.act(frames[-1][:playing])
-        action[:playing] = wanted if disturbances is None else disturbances.disturb(wanted)
+        action[:playing] = disturbances.disturb(expert.act(frames[-1][:playing]))
         # environments may skip finished episodes; what they return for them is not used
         step = data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
         data = env.step(step)["next"].clone()
