@@ -34,7 +34,6 @@ BATCHES = {
     "labelled": Batch(1.0),
     "short": Batch(0.75, 512, shortest=True),
 }
-SEES = ("all", "labelled")
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,7 @@ class Method:
     phases_by_preset: Mapping[str, tuple[Phase, ...]] = field(default_factory=dict)
 
     def __post_init__(self):
-        lookup(SEES, self.sees, "kind of windows")
+        lookup(("all", "labelled"), self.sees, "kind of windows")
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.]*", self.name):
             raise ValueError(f"the name of a method must be letters, digits, '_' and later '.', got {self.name!r}")
         names = [phase.name for phase in self.phases]

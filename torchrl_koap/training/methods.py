@@ -26,9 +26,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from torch import nn
-from torchrl.objectives import LossModule
-
 from torchrl_koap.lookup import entry_points_of, lookup
 from torchrl_koap.modules import (
     PRESETS,
@@ -46,7 +43,6 @@ from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.networks import build_sampler
 from torchrl_koap.training.response import fit_response, tracked_columns
 
-LOOK_AHEAD = (1, 2, 3, 4, 5)
 GROUP = "torchrl_koap.methods"  # of entry points
 
 
@@ -58,28 +54,16 @@ def _response(task, columns, normalizers, preset):
     return ResponseModel(**tracked_columns(task), action_dim=task.action_dim)
 
 
-def _fit_response(response, data, updates):
-    return fit_response(response, data)
-
-
 def _linear(task, columns, normalizers, preset):
     return LinearInverseDynamics(len(columns), task.action_dim)
 
 
-def _supervised(task, columns, normalizers, preset, *, look_ahead):
-    return SupervisedInverseDynamics(len(columns), task.action_dim, look_ahead=look_ahead, **normalizers)
+def _network(task, columns, normalizers, preset, *, kind, **options):
+    return kind(len(columns), task.action_dim, **normalizers, **options)
 
 
-def _network(task, columns, normalizers, preset, *, kind):
-    return kind(len(columns), task.action_dim, **normalizers)
-
-
-def without_actions(network: nn.Module) -> LossModule:
-    """Makes KOAP's loss on states alone."""
-    return KOAPLoss(network, action_coeff=0.0)
-
-
-_UNLABELLED = Phase("controller", without_actions)
+_next_state = partial(_network, kind=SupervisedInverseDynamics, look_ahead=1)
+_UNLABELLED = Phase("controller", partial(KOAPLoss, action_coeff=0.0))
 _LABELS = (Phase("controller", ActionLoss, "labelled"),)
 _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
 # fits the decoder afterwards, with a frozen encoder
@@ -87,7 +71,6 @@ _DECODER = Phase("decoder", partial(ActionLoss, freeze_latents=True), "labelled"
 _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
 
 _ANY_PRESET = tuple(PRESETS)
-_EVERY_STEP = {"strategy": "feedback", "gain": 1.0}  # mpc knows its last command and predicts the robot's response
 _OPEN_LOOP = {"strategy": "open_loop"}
 _AS_PLANNED = _OPEN_LOOP | {"blend": 0.0}
 
@@ -133,7 +116,13 @@ for _method in (
         presets=_ANY_PRESET,
         phases_by_preset={"scene": (replace(_JOINT[0], windows="short"),)},  # labels shape the latent action, too
     ),
-    Method("mpc", "MPC with an identified response", _response, fit=_fit_response, execution=_EVERY_STEP),
+    Method(
+        "mpc",
+        "MPC with an identified response",
+        _response,
+        fit=lambda response, data, updates: fit_response(response, data),
+        execution={"strategy": "feedback", "gain": 1.0},  # it knows its last command and predicts the robot's response
+    ),
     Method(
         "koap_sgd",
         "KOAP, decoder trained by gradients",
@@ -184,13 +173,17 @@ for _method in (
     Method(
         "dd",
         "supervised, next state (Decision Diffuser)",
-        partial(_supervised, look_ahead=1),
+        _next_state,
         _LABELS,
         updates=1000,
         execution=_OPEN_LOOP,
     ),
     Method(
-        "dd_lookahead", "supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS, updates=1000
+        "dd_lookahead",
+        "supervised, look-ahead",
+        partial(_network, kind=SupervisedInverseDynamics, look_ahead=(1, 2, 3, 4, 5)),
+        _LABELS,
+        updates=1000,
     ),
     Method(
         "vae",
@@ -214,7 +207,7 @@ for _method in (
     Method(
         "relabel",
         "Decision Diffuser on relabelled data",
-        partial(_supervised, look_ahead=1),
+        _next_state,
         _LABELS,
         teacher="dd_lookahead",
         updates=1000,
