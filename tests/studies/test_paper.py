@@ -7,8 +7,8 @@ from torchrl_koap.studies.paper import (
     above_the_paper,
     average_over_tasks,
     layout_rows,
-    paper_cell,
     paper_cells,
+    paper_cells_by_place,
     paper_entries,
     paper_points,
     write_paper_layout,
@@ -37,7 +37,7 @@ def test_both_tables_are_whole():
     ],
 )
 def test_single_cells(task, method, level, share, text):
-    cell = paper_cell(task, method, level)
+    cell = paper_cells_by_place()[task, method, level]
     assert (cell.label_share, cell.text) == (share, text)
 
 
@@ -81,7 +81,8 @@ def test_cells_stand_at_their_levels_beside_the_papers():
 def test_an_average_is_over_all_tasks_or_none():
     averages = average_over_tasks(paper_entries(ROWS))
     assert set(averages) == {"koap"}  # dp was not run on Sorting
-    ((level, mean, low, high),) = averages["koap"]  # nor anything at level 5 of it
+    ((level, mean, low, high, paper),) = averages["koap"]  # nor anything at level 5 of it
+    assert paper == pytest.approx((0.7803 + 0.6165) / 2)
     assert level == 1 and mean == pytest.approx((0.9 + 0.55) / 2)
     halves = [(0.9 - 0.79854, 0.95341 - 0.9), (0.55 - 0.46081, 0.63614 - 0.55)]  # of the cells' Wilson intervals
     assert low == pytest.approx(mean - (halves[0][0] ** 2 + halves[1][0] ** 2) ** 0.5 / 2, abs=1e-3)

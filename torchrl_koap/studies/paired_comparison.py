@@ -76,7 +76,7 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
     total, count = np.zeros((2, len(seeds), len(contexts)))
     for row, seed in enumerate(seeds):
         for key in shared[seed]:
-            total[row, place[key[0]]] += float(first[seed][key]) - float(second[seed][key])
+            total[row, place[key[0]]] += first[seed][key] - second[seed][key]
             count[row, place[key[0]]] += 1
     there = count > 0
     difference = np.where(there, total / np.maximum(count, 1), 0.0)  # [seeds, contexts]
@@ -149,19 +149,18 @@ def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outc
     """
     compared: list[dict[str, Any]] = []
     for place, methods in group_cells(rows).items():
-        found: dict[str, dict[int, Outcome]] = {method: {} for method in methods}
-        offline = False
-        for row in (row for cells in methods.values() for row in cells.values()):
-            if row["status"] == "done" and row.get("run") in outcomes:
-                found[row["method"]][row["seed"]] = outcomes[row["run"]]
-                offline = offline or row.get("kind") == KIND
-        for method in methods:
-            if REFERENCE in methods and method != REFERENCE:
-                result = compare(found[REFERENCE], found[method], errors=offline)
-                known = dict(zip(COMPARISON_COLUMNS, (*place, REFERENCE, method), strict=False))
-                known |= {"n": 0} if result is None else asdict(result)
-                values = {name: known.get(name) for name in COMPARISON_COLUMNS}
-                compared.append({name: None if value != value else value for name, value in values.items()})  # NaN
+        offline = any(row.get("kind") == KIND for cells in methods.values() for row in cells.values())
+        found: dict[str, dict[int, Outcome]] = {
+            method: {seed: outcomes[row["run"]] for seed, row in cells.items() if row.get("run") in outcomes}
+            for method, cells in methods.items()
+        }
+        reference = found.pop(REFERENCE, None)
+        for method in () if reference is None else found:
+            result = compare(reference, found[method], errors=offline)
+            known = dict(zip(COMPARISON_COLUMNS, (*place, REFERENCE, method), strict=False))
+            known |= {"n": 0} if result is None else asdict(result)
+            values = {name: known.get(name) for name in COMPARISON_COLUMNS}
+            compared.append({name: None if value != value else value for name, value in values.items()})  # NaN
     for row, adjusted in zip(compared, holm([row["p"] for row in compared]), strict=True):
         row["p_holm"] = adjusted
     return compared

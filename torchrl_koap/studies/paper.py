@@ -19,7 +19,7 @@ from typing import Any
 
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.pictures import FOLDER
-from torchrl_koap.studies.plots import plot_average
+from torchrl_koap.studies.plots import Average, plot_average
 from torchrl_koap.studies.table import Summary, as_markdown, percent, summarise
 from torchrl_koap.tasks import TASKS
 
@@ -43,38 +43,29 @@ class PaperCell:
         return f"{100 * self.success:.1f} +- {100 * self.spread:.1f}"
 
 
-@functools.cache
-def _content() -> dict[str, Any]:
-    return json.loads(files("torchrl_koap.studies").joinpath("paper_results.json").read_text(encoding="utf-8"))
-
-
 def paper_cells(table: int) -> list[PaperCell]:
     """Returns all cells of table 1 (methods) or 2 (variants), for every task that stands for one of the paper's."""
+    content = json.loads(files("torchrl_koap.studies").joinpath("paper_results.json").read_text(encoding="utf-8"))
     return [
         PaperCell(task, method, level, shares[level - 1] / 100, round(success / 100, 4), round(spread / 100, 4))
-        for name, methods in _content()["tables"][str(table)].items()
-        for task in _content()["tasks"][name]["tasks"]
+        for name, methods in content["tables"][str(table)].items()
+        for task in content["tasks"][name]["tasks"]
         for method, cells in methods.items()
-        for shares in (_content()["tasks"][name]["label_percent"],)
+        for shares in (content["tasks"][name]["label_percent"],)
         for level, (success, spread) in enumerate(cells, start=1)
     ]
 
 
-def paper_cell(task: str, method: str, level: int) -> PaperCell | None:
-    """Returns a cell of the paper's table 1, else 2, or None; level 1 has the fewest labels."""
-    return _by_place().get((task, method, level))
-
-
 @functools.cache
-def _by_place() -> dict[tuple[str, str, int], PaperCell]:
-    cells = [cell for table in (2, 1) for cell in paper_cells(table)]  # table 1 overrides table 2
-    return {(cell.task, cell.method, cell.level): cell for cell in cells}
+def paper_cells_by_place() -> dict[tuple[str, str, int], PaperCell]:
+    """Returns the cells of both tables by task, method and level; table 1 overrides table 2."""
+    return {(cell.task, cell.method, cell.level): cell for cell in [*paper_cells(2), *paper_cells(1)]}
 
 
 def paper_points(task: str) -> dict[str, list[tuple[float, float]]]:
     """Returns the cells of a task in both tables, each once: label shares and successes in 0..1 by method."""
     points: dict[str, list[tuple[float, float]]] = {}
-    for cell in _by_place().values():
+    for cell in paper_cells_by_place().values():
         if cell.task == task:
             points.setdefault(cell.method, []).append((cell.label_share, cell.success))
     return points
@@ -119,8 +110,9 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
         if item.labels in levels:
             found[item.task, levels.index(item.labels) + 1, item.method] = item
     tasks, methods = (list(dict.fromkeys(names)) for names in ([t for t, _, _ in found], [m for _, _, m in found]))
+    paper = paper_cells_by_place()
     return [
-        Entry(task, method, level, share, found.get((task, level, method)), paper_cell(task, method, level))
+        Entry(task, method, level, share, found.get((task, level, method)), paper.get((task, method, level)))
         for task in tasks
         for level, share in enumerate(TASKS[task].label_levels, start=1)
         if any(key[:2] == (task, level) for key in found)
@@ -132,10 +124,8 @@ def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
     """Returns the table as text: a row per task and level, a column per method."""
     lines: dict[tuple[str, int], dict[str, str]] = {}
     for entry in entries:
-        line = lines.setdefault(
-            (entry.task, entry.level), {"task": entry.task, "level": f"{entry.level} ({percent(entry.label_share)})"}
-        )
-        line[entry.method] = entry.text
+        head = {"task": entry.task, "level": f"{entry.level} ({percent(entry.label_share)})"}
+        lines.setdefault((entry.task, entry.level), head)[entry.method] = entry.text
     return list(lines.values())
 
 
@@ -145,13 +135,13 @@ def above_the_paper(entries: Sequence[Entry]) -> tuple[int, int]:
     return sum(entry.success > entry.paper.success for entry in both), len(both)
 
 
-def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, float, float, float]]]:
-    """Averages success over the tasks at every level, by method: level, mean and the ends of its 95 % interval.
+def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[Average]]:
+    """Averages success over the tasks at every level, by method.
 
     A method has a point only if its cell is done for every task, so that all points average the same tasks. The
     interval combines the Wilson intervals of the cells: squares of their halves add up (Newcombe's method).
     """
-    lines: dict[str, list[tuple[int, float, float, float]]] = {}
+    lines: dict[str, list[Average]] = {}
     number = len({entry.task for entry in entries})
     for method in dict.fromkeys(entry.method for entry in entries):
         for level in sorted({entry.level for entry in entries}):
@@ -162,20 +152,15 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
             ends = [entry.measured.measures["success"] for entry in cells]
             below = math.sqrt(sum((end.mean - end.low) ** 2 for end in ends)) / len(cells)
             above = math.sqrt(sum((end.high - end.mean) ** 2 for end in ends)) / len(cells)
-            lines.setdefault(method, []).append((level, mean, mean - below, mean + above))
+            paper = [entry.paper.success for entry in cells if entry.paper]
+            theirs = sum(paper) / len(paper) if len(paper) == len(cells) else None
+            lines.setdefault(method, []).append((level, mean, mean - below, mean + above, theirs))
     return lines
 
 
 def draw_average(entries: Sequence[Entry], path: str | Path) -> None:
     """Draws success averaged over tasks against the label level, measured and of the paper."""
-    averages = average_over_tasks(entries)
-    paper: dict[str, list[tuple[int, float]]] = {}
-    for method, points in averages.items():
-        for level, *_ in points:
-            cells = [entry.paper for entry in entries if (entry.method, entry.level) == (method, level)]
-            if all(cells):
-                paper.setdefault(method, []).append((level, sum(cell.success for cell in cells) / len(cells)))
-    plot_average(averages, paper, len({entry.task for entry in entries}), path)
+    plot_average(average_over_tasks(entries), len({entry.task for entry in entries}), path)
 
 
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -36,6 +36,8 @@ MEASURES = {  # label of the vertical axis, title, factor
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 _DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
+Average = tuple[int, float, float, float, float | None]
+"""Label level, mean success in 0..1 with the ends of its 95 % interval, and the paper's mean, if it has one."""
 _HOLLOW = "\nhollow, dashed: the paper, with its own demonstrations"  # in titles
 _BANDS = 3  # more lines have whiskers, as more bands hide each other
 _ASIDE = 0.025  # inches between the whiskers of two methods
@@ -112,20 +114,12 @@ def plot_measure(
     save_figure(figure, path)
 
 
-def plot_average(
-    averages: Mapping[str, Sequence[tuple[int, float, float, float]]],
-    paper: Mapping[str, Sequence[tuple[int, float]]],
-    number: int,
-    path: str | Path,
-) -> None:
-    """Draws success averaged over a ``number`` of tasks against the label level; the paper's hollow and dashed.
-
-    By method, ``averages`` has level, mean and the ends of its interval, ``paper`` level and mean; successes in 0..1.
-    """
+def plot_average(averages: Mapping[str, Sequence[Average]], number: int, path: str | Path) -> None:
+    """Draws success by method, averaged over a ``number`` of tasks, against the label level; the paper's is hollow."""
     lines, styles = [], method_styles(list(averages))
     for method, points in averages.items():
-        shown = [(level, *(100 * value for value in values)) for level, *values in points]
-        beside = [(level, 100 * mean) for level, mean in paper.get(method, ())]
+        shown = [(level, *(100 * value for value in values)) for level, *values, _ in points]
+        beside = [(level, 100 * mean) for level, *_, mean in points if mean is not None]
         lines.append(_Line(method, styles[method], shown, beside))
     figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     axes = figure.add_subplot()

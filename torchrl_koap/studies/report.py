@@ -160,11 +160,12 @@ def _figure(folder: Path, kind: str, items: Sequence[Summary], more: str = "", *
 
 def _comparison_rows(compared: Sequence[Mapping[str, Any]], offline: Collection[str]) -> list[dict[str, str]]:
     """Returns the comparisons as text: of errors for ``offline`` tasks, else of success, in points."""
-    several = [name for name in ("task", "demonstrations") if len({row[name] for row in compared}) > 1]
-    return [_comparison_row(row, several, errors=row["task"] in offline) for row in compared]
+    rows = [_comparison_row(row, errors=row["task"] in offline) for row in compared]
+    alike = [name for name in ("task", "demonstrations used") if len({row[name] for row in rows}) == 1]
+    return [{name: text for name, text in row.items() if name not in alike} for row in rows]
 
 
-def _comparison_row(row: Mapping[str, Any], several: Sequence[str], *, errors: bool) -> dict[str, str]:
+def _comparison_row(row: Mapping[str, Any], *, errors: bool) -> dict[str, str]:
     factor, digits, head, unit = 100, 1, "difference (points)", "contexts"
     if errors:
         factor, digits, head, unit = 1, 3, "difference of the relative action error", "trajectories"
@@ -172,21 +173,19 @@ def _comparison_row(row: Mapping[str, Any], several: Sequence[str], *, errors: b
     def text(difference: float) -> str:
         return f"{round(factor * difference, digits) + 0.0:+.{digits}f}"  # the sum turns -0.0 into 0.0
 
-    return (
-        ({"task": row["task"]} if "task" in several else {})
-        | ({"demonstrations used": percent(row["demonstrations"])} if "demonstrations" in several else {})
-        | {
-            "labels": percent(row["labels"]),
-            f"{REFERENCE} against": row["method"],
-            head: "no common rollouts" if row["difference"] is None else text(row["difference"]),
-            "95 % interval": "–" if row["low"] is None else f"{text(row['low'])} to {text(row['high'])}",
-            "p": _p_text(row["p"]),
-            "p (Holm)": _p_text(row["p_holm"]),
-            unit: str(row["contexts"] or 0),
-            "seeds": str(row["seeds"] or 0),
-            "n (pairs)": str(row["n"]),
-        }
-    )
+    return {
+        "task": row["task"],
+        "demonstrations used": percent(row["demonstrations"]),
+        "labels": percent(row["labels"]),
+        f"{REFERENCE} against": row["method"],
+        head: "no common rollouts" if row["difference"] is None else text(row["difference"]),
+        "95 % interval": "–" if row["low"] is None else f"{text(row['low'])} to {text(row['high'])}",
+        "p": _p_text(row["p"]),
+        "p (Holm)": _p_text(row["p_holm"]),
+        unit: str(row["contexts"] or 0),
+        "seeds": str(row["seeds"] or 0),
+        "n (pairs)": str(row["n"]),
+    }
 
 
 def _p_text(p: float | None) -> str:

@@ -7,6 +7,7 @@ import csv
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -103,16 +104,11 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
 def group_cells(rows: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, dict[int, Mapping[str, Any]]]]:
     """Groups cells by place, method and seed, in the order of :func:`summarise`; a ValueError for a repeated cell."""
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
-
-    def setting_of(row: Mapping[str, Any]) -> Place:
-        return row["task"], row["label_unit"], row["demonstrations"], row["labels"]
-
-    def order(row: Mapping[str, Any]) -> tuple:
-        return tasks.index(row["task"]), *setting_of(row)[1:], methods.index(row["method"])
-
+    place = itemgetter("task", "label_unit", "demonstrations", "labels")
+    order = sorted(rows, key=lambda row: (tasks.index(row["task"]), *place(row)[1:], methods.index(row["method"])))
     places: dict[Place, dict[str, dict[int, Mapping[str, Any]]]] = {}
-    for row in sorted(rows, key=order):
-        cells = places.setdefault(setting_of(row), {}).setdefault(row["method"], {})
+    for row in order:
+        cells = places.setdefault(place(row), {}).setdefault(row["method"], {})
         if row["seed"] in cells:
             raise ValueError(f"the cell {cell_name(row)} occurs twice")
         cells[row["seed"]] = row
@@ -120,30 +116,21 @@ def group_cells(rows: Sequence[Mapping[str, Any]]) -> dict[Place, dict[str, dict
 
 
 def _summary(task: str, unit: str, demonstrations: float, labels: float, method: str, cells: Mapping) -> Summary:
-    seeds = {status: tuple(sorted(s for s, row in cells.items() if row["status"] == status)) for status in STATUSES}
-    done = [cells[seed] for seed in seeds["done"]]
-    rolled_out = [row for row in done if row.get("episodes")]
+    done, failed, missing = (
+        tuple(sorted(seed for seed, row in cells.items() if row["status"] == status)) for status in STATUSES
+    )
+    found = [cells[seed] for seed in done]
+    rolled_out = [row for row in found if row.get("episodes")]
     successes, episodes = (sum(row[name] for row in rolled_out) for name in ("successes", "episodes"))
-    values = {name: [row[name] for row in done if row.get(name) is not None] for name in _MEASURES}
+    values = {name: [row[name] for row in found if row.get(name) is not None] for name in _MEASURES}
     measures = {name: Measure(statistics.fmean(v), min(v), max(v)) for name, v in values.items() if v}
     if episodes:
         rates = [row["successes"] / row["episodes"] for row in rolled_out]
         measures["success"] = Measure(successes / episodes, *wilson_interval(successes, episodes))
         measures["seed_success"] = Measure(successes / episodes, min(rates), max(rates))
     names = ("action_errors_on", "action_error_unit")
-    compared, error_units = (tuple(sorted({row[name] for row in done if row.get(name)})) for name in names)
-    return Summary(
-        task,
-        method,
-        labels,
-        demonstrations,
-        unit,
-        **seeds,
-        episodes=episodes,
-        measures=measures,
-        action_errors_on=compared,
-        action_error_units=error_units,
-    )
+    on, units = (tuple(sorted({row[name] for row in found if row.get(name)})) for name in names)
+    return Summary(task, method, labels, demonstrations, unit, done, failed, missing, episodes, measures, on, units)
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
