@@ -149,11 +149,12 @@ def compare_cells(rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outc
     """
     compared: list[dict[str, Any]] = []
     for place, methods in group_cells(rows).items():
-        offline = any(row.get("kind") == KIND for cells in methods.values() for row in cells.values())
-        found: dict[str, dict[int, Outcome]] = {
-            method: {seed: outcomes[row["run"]] for seed, row in cells.items() if row.get("run") in outcomes}
-            for method, cells in methods.items()
-        }
+        done = [row for cells in methods.values() for row in cells.values() if row["status"] == "done"]
+        offline = any(row.get("kind") == KIND for row in done)
+        found: dict[str, dict[int, Outcome]] = {method: {} for method in methods}
+        for row in done:
+            if row.get("run") in outcomes:
+                found[row["method"]][row["seed"]] = outcomes[row["run"]]
         reference = found.pop(REFERENCE, None)
         for method in () if reference is None else found:
             result = compare(reference, found[method], errors=offline)
