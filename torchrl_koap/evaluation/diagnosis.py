@@ -148,17 +148,14 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
     return {name: torch.cat(parts).mean(0).sqrt().tolist() for name, parts in errors.items() if parts}
 
 
-def _columns_by_unit(task: Task) -> dict[str, slice | list[int]]:
+def _columns_by_unit(task: Task) -> dict[str, list[int]]:
     """Returns the state columns of each part; a part with several units has an entry per unit."""
-    found: dict[str, slice | list[int]] = {}
-    for name, columns in task.state_slices.items():
-        units = unit_groups(task.state_units[columns])
-        if len(units) == 1:
-            found[name] = columns
-        else:
-            for unit, places in units.items():
-                found[f"{name} ({unit or 'no unit'})"] = [columns.start + place for place in places]
-    return found
+    return {
+        f"{name} ({unit or 'no unit'})" if len(units) > 1 else name: [columns.start + place for place in places]
+        for name, columns in task.state_slices.items()
+        for units in (unit_groups(task.state_units[columns]),)
+        for unit, places in units.items()
+    }
 
 
 def of_position(task: Task, errors: Mapping[str, list[float]]) -> list[float] | None:

@@ -124,10 +124,8 @@ def train_phase(
             group["lr"] = device_rate.fill_(rate) if replay else rate
         with _interrupts_let_through():
             terms = update(sample())
-
-        done += 1
-        scored = best is not None and (done % best.every == 0 or done == num_steps)
-        with _interrupts_let_through():
+            done += 1
+            scored = best is not None and (done % best.every == 0 or done == num_steps)
             if target_update is not None and (done % AVERAGE_EVERY == 0 or done == num_steps):
                 target_update.step()
             scores = {} if best is None else best.check(done) if scored else best.kept()

@@ -6,10 +6,10 @@ A ridge regression of single steps comes first, then nonlinear least squares of 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data.trajectories import begins
@@ -51,7 +51,7 @@ def tracked_columns(task: Task) -> dict[str, Any]:
     raise ValueError(f"task {task.name!r} cannot follow plans by prediction: {lacks}")
 
 
-class LabelledSteps(NamedTuple):
+class LabelledSteps(TensorClass):
     """Labelled steps, in the order of time."""
 
     coordinates: Tensor  # inputs of the model [n, J, f]
@@ -61,7 +61,7 @@ class LabelledSteps(NamedTuple):
     row: Tensor  # its row in the data [n]
 
 
-class Stretches(NamedTuple):
+class Stretches(TensorClass):
     """Stretches of labelled steps of equal length ``N``, whose measured positions are predicted."""
 
     positions: Tensor  # measured before the stretch [n, memory + 1, J], the present one last
@@ -70,14 +70,6 @@ class Stretches(NamedTuple):
     future: Tensor  # future changes of the command [n, N, J]
     measured: Tensor  # future positions [n, N, J]
     known: Tensor  # whether the command itself is known, not only up to a constant [n]
-
-
-Rows = TypeVar("Rows", LabelledSteps, Stretches)
-
-
-def take(rows: Rows, chosen: Tensor) -> Rows:
-    """Selects steps, or stretches."""
-    return type(rows)(*(field[chosen] for field in rows))
 
 
 def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any]:
@@ -105,8 +97,8 @@ def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any
         errors = []
         for fold in range(_FOLDS):
             out = folds == fold
-            _fit(response, data, take(steps, ~out), changes, coupled=coupled)
-            errors.append(prediction_errors(response, _stretches(response, data, take(steps, out), changes)).flatten())
+            _fit(response, data, steps[~out], changes, coupled=coupled)
+            errors.append(prediction_errors(response, _stretches(response, data, steps[out], changes)).flatten())
         found[coupled] = torch.cat(errors).pow(2).mean().sqrt().item()
     coupled = min(found, key=found.__getitem__, default=False)
     _fit(response, data, steps, changes, coupled=coupled)
@@ -156,7 +148,7 @@ def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[Label
     history, past = _around(positions, row, -memory, 0), _around(changes, row, -memory, -1)
     read = response.coordinates(history, command - positions[row], past)
     steps = (positions[row + 1] - positions[row]).reshape(-1, axes)
-    return LabelledSteps(read, steps, segment, known, row), changes
+    return LabelledSteps(read, steps, segment, known, row, batch_size=[len(row)]), changes
 
 
 def _fit(
@@ -192,8 +184,7 @@ def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSte
     length = min(AHEAD, int(steps.segment.bincount().max()))
     enough = torch.zeros_like(row, dtype=torch.bool)
     enough[: len(row) - length + 1] = row[length - 1 :] - row[: len(row) - length + 1] == length - 1
-    start = take(steps, enough)
-    start = take(start, torch.arange(0, len(start.row), 2, device=row.device))
+    start = steps[enough][::2]
     row = start.row
     positions = data[STATE][:, response.states].double()
     return Stretches(
@@ -203,6 +194,7 @@ def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSte
         _around(changes, row, 0, length - 1).nan_to_num(0.0),  # the last change has no effect
         _around(positions, row, 1, length),
         start.known,
+        batch_size=[len(row)],
     )
 
 
@@ -232,10 +224,10 @@ def fit_predictions(response: ResponseModel, stretches: Stretches, *, coupled: b
     with every predicted step. Coefficients that the stretches determine poorly stay near their present values
     (:data:`STAY`); without stretches nothing changes. Coupled axes have cross-axis terms.
     """
-    if not len(stretches.known):
+    if not len(stretches):
         return
-    if len(stretches.known) > MOST:
-        stretches = take(stretches, torch.arange(MOST, device=stretches.known.device) * len(stretches.known) // MOST)
+    if len(stretches) > MOST:
+        stretches = stretches[torch.arange(MOST, device=stretches.known.device) * len(stretches) // MOST]
     now, axes = stretches.positions[:, -1], response.num_axes
     read = response.coordinates(stretches.positions, stretches.command - now, stretches.changes)
     size = read.square().mean(0).sqrt().clamp_min(1e-12)
