@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from torchrl_koap.lookup import entry_points_of, lookup
 from torchrl_koap.modules import (
@@ -63,9 +64,11 @@ def _network(task, columns, normalizers, preset, *, kind, **options):
 
 
 _next_state = partial(_network, kind=SupervisedInverseDynamics, look_ahead=1)
+_frames_ahead = partial(_network, kind=SupervisedInverseDynamics, look_ahead=(1, 2, 3, 4, 5))
 _UNLABELLED = Phase("controller", partial(KOAPLoss, action_coeff=0.0))
 _LABELS = (Phase("controller", ActionLoss, "labelled"),)
 _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
+_TWO_STAGES = (replace(_UNLABELLED, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5))
 # fits the decoder afterwards, with a frozen encoder
 _DECODER = Phase("decoder", partial(ActionLoss, freeze_latents=True), "labelled", share=0.5)
 _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
@@ -73,6 +76,8 @@ _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
 _ANY_PRESET = tuple(PRESETS)
 _OPEN_LOOP = {"strategy": "open_loop"}
 _AS_PLANNED = _OPEN_LOOP | {"blend": 0.0}
+_BY_GRADIENTS: dict[str, Any] = {"presets": _ANY_PRESET, "updates": 1000, "execution": _AS_PLANNED}
+_TAUGHT: dict[str, Any] = {"teacher": "dd_lookahead", "updates": 1000}
 
 METHODS: dict[str, Method] = {}
 
@@ -123,15 +128,7 @@ for _method in (
         fit=lambda response, data, updates: fit_response(response, data),
         execution={"strategy": "feedback", "gain": 1.0},  # it knows its last command and predicts the robot's response
     ),
-    Method(
-        "koap_sgd",
-        "KOAP, decoder trained by gradients",
-        _koap,
-        _JOINT,
-        presets=_ANY_PRESET,
-        updates=1000,
-        execution=_AS_PLANNED,
-    ),
+    Method("koap_sgd", "KOAP, decoder trained by gradients", _koap, _JOINT, **_BY_GRADIENTS),
     Method(
         "koap_paper",
         "KOAP as in the paper",
@@ -152,15 +149,7 @@ for _method in (
         presets=_ANY_PRESET,
     ),
     Method("koap_untrained", "KOAP, nothing trained but the decoder", _koap, closed_form=True, presets=_ANY_PRESET),
-    Method(
-        "pretrain",
-        "KOAP, pre-trained and fine-tuned",
-        _koap,
-        (replace(_UNLABELLED, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
-        presets=_ANY_PRESET,
-        updates=1000,
-        execution=_AS_PLANNED,
-    ),
+    Method("pretrain", "KOAP, pre-trained and fine-tuned", _koap, _TWO_STAGES, **_BY_GRADIENTS),
     Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
     Method(
         "pca",
@@ -171,20 +160,9 @@ for _method in (
     ),
     Method("linear", "ridge on raw frames", _linear, closed_form=True, execution=_OPEN_LOOP),
     Method(
-        "dd",
-        "supervised, next state (Decision Diffuser)",
-        _next_state,
-        _LABELS,
-        updates=1000,
-        execution=_OPEN_LOOP,
+        "dd", "supervised, next state (Decision Diffuser)", _next_state, _LABELS, updates=1000, execution=_OPEN_LOOP
     ),
-    Method(
-        "dd_lookahead",
-        "supervised, look-ahead",
-        partial(_network, kind=SupervisedInverseDynamics, look_ahead=(1, 2, 3, 4, 5)),
-        _LABELS,
-        updates=1000,
-    ),
+    Method("dd_lookahead", "supervised, look-ahead", _frames_ahead, _LABELS, updates=1000),
     Method(
         "vae",
         "variational autoencoder of whole windows",
@@ -204,24 +182,8 @@ for _method in (
         "nonlinear", "KOAP with nonlinear maps", partial(_network, kind=NonlinearInverseDynamics), _JOINT, updates=1000
     ),
     Method("dp", "Diffusion Policy", build_sampler, _POLICY, plans=False),
-    Method(
-        "relabel",
-        "Decision Diffuser on relabelled data",
-        _next_state,
-        _LABELS,
-        teacher="dd_lookahead",
-        updates=1000,
-        execution=_OPEN_LOOP,
-    ),
-    Method(
-        "vpt",
-        "Diffusion Policy on relabelled data",
-        build_sampler,
-        _POLICY,
-        plans=False,
-        teacher="dd_lookahead",
-        updates=1000,
-    ),
+    Method("relabel", "Decision Diffuser on relabelled data", _next_state, _LABELS, execution=_OPEN_LOOP, **_TAUGHT),
+    Method("vpt", "Diffusion Policy on relabelled data", build_sampler, _POLICY, plans=False, **_TAUGHT),
 ):
     register_method(_method)
 
