@@ -81,6 +81,28 @@ def option(name: str) -> str:
     return f"{name} (--{name.replace('_', '-')})"
 
 
+def option_words(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
+    """Yields options, also of sections, as words of a command; leaves out None, False and what is empty.
+
+    Examples:
+        >>> from torchrl_koap.files import option_words
+        >>> " ".join(option_words({"seed": 1, "resume": True, "labels": {"episodes": [0, 4], "count": None}}))
+        '--seed 1 --resume --labels.episodes 0 4'
+    """
+    for name, value in options.items():
+        word = prefix + name.replace("_", "-")
+        if isinstance(value, Mapping):
+            yield from option_words(value, f"{word}.")
+        elif name == "plugins":
+            yield from (each for plugin in value for each in (f"{prefix}plugin", plugin))
+        elif isinstance(value, bool):
+            yield from [word] if value else ()
+        elif isinstance(value, (list, tuple)):
+            yield from (word, *map(str, value)) if value else ()
+        elif value is not None:
+            yield from (word, str(value))
+
+
 def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
     """Raises an OSError, with the reason, for files above ``largest`` bytes and for anything but plain files.
 

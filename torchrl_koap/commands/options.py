@@ -8,7 +8,7 @@ import io
 import math
 import re
 import shlex
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from tyro.constructors import (
 )
 
 from torchrl_koap.evaluation.config import EvalConfig
-from torchrl_koap.files import check_folder, read_json
+from torchrl_koap.files import check_folder, option_words, read_json
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.runs.config import TrainConfig
@@ -137,23 +137,7 @@ def _words_of(path: Path, amounts: Sequence[str]) -> list[str]:
         replaced = [*AMOUNTS, "--labels.unit"] if "--labels" in amounts else AMOUNTS  # --labels 5: 5 trajectories
         options["labels"] = {name: value for name, value in labels.items() if f"--labels.{name}" not in replaced}
     from_json(TrainConfig, {"out": ""} | options, path)
-    return list(_flat(options))
-
-
-def _flat(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
-    for name, value in options.items():
-        name = name.replace("_", "-")
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        elif isinstance(value, bool):
-            yield from (f"{prefix}{name}",) if value else ()
-        elif isinstance(value, list):
-            if name == "plugins":
-                yield from (word for plugin in value for word in (f"{prefix}plugin", plugin))
-            elif value:
-                yield from (f"{prefix}{name}", *map(str, value))
-        elif value is not None:
-            yield from (f"{prefix}{name}", str(value))
+    return list(option_words(options))
 
 
 def parse(kind: Any, arguments: Sequence[str], **how: Any) -> Any:
@@ -207,18 +191,13 @@ def check_call(kind: Any, arguments: Sequence[str]) -> None:
             if name not in known and inside:
                 raise ValueError(f"unknown {what} {name!r}; did you mean {' or '.join(map(repr, inside))}?")
             option = lookup(known, name, what)
-        if equals or not name.startswith("--"):
-            _check_number(option, value if equals else word, wanted.get(option, ""))
-
-
-def _check_number(option: str, value: str, wanted: str) -> None:
-    kinds = {"N": (int, "a whole number"), "NUMBER": (float, "a number")}
-    if wanted in kinds:
-        number, words = kinds[wanted]
-        try:
-            number(value)
-        except ValueError:
-            raise ValueError(f"{option} must be {words}, got {value!r}") from None
+        if wanted.get(option) and (equals or not name.startswith("--")):
+            given = value if equals else word
+            number, words = {"N": (int, "a whole number"), "NUMBER": (float, "a number")}[wanted[option]]
+            try:
+                number(given)
+            except ValueError:
+                raise ValueError(f"{option} must be {words}, got {given!r}") from None
 
 
 def _first_page() -> type:

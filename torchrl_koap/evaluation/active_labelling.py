@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchrl_koap.data.trajectories import labelled_episodes
 from torchrl_koap.evaluation.latent_space import infer_steps
-from torchrl_koap.files import some
+from torchrl_koap.files import option_words, some
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.config import given_options
@@ -227,18 +227,20 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> dict[str, A
     which = some([names[episode] for episode in without] if names else without)
     counted = "" if names else " (counted from 0; files in the order of their names, run_10 before run_2)"
     first = f"add actions to recordings {which}{counted} and {converted}, then " if without else ""
-    again = ["koap", "train", "--config", str(trained.folder / "config.json")]
-    dataset = "DATA" if without else config.dataset
-    again += [] if dataset is None else ["--dataset", str(dataset)]
-    for plugin in config.plugins:
-        again += ["--plugin", plugin]
-    again += [] if trained.config.labels.unit == "trajectory" else ["--labels.unit", "trajectory"]
-    again += [] if trained.config.labels.trajectories == 1 else ["--labels.trajectories", "1"]  # a share may be too few
-    again += ["--planner.source", str(trained.folder)]  # the planner uses no labels
+    again = {
+        "config": trained.folder / "config.json",
+        "dataset": "DATA" if without else config.dataset,
+        "plugins": config.plugins,
+        "labels.unit": None if trained.config.labels.unit == "trajectory" else "trajectory",
+        # a share may be too few
+        "labels.trajectories": None if trained.config.labels.trajectories == 1 else 1,
+        "planner.source": trained.folder,  # the planner uses no labels
+        "labels.episodes": every,
+    }
     return {
         "penalty": penalty,
         "labelled_steps": report.labelled_transitions,
         "labelled_episodes": labelled,
         "suggestions": rows,
-        "next": f"{first}{shlex.join([*again, '--labels.episodes', *map(str, every)])} --out NEW",
+        "next": f"{first}{shlex.join(['koap', 'train', *option_words(again)])} --out NEW",
     }

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.files import option_words
 from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, draw_pictures
@@ -103,16 +104,7 @@ def _eval_command(run: RunFacts) -> str:
     if "episode" in evaluation:  # rolled out, not evaluated on recorded data
         options = {"episodes": evaluation["episodes"], "seed": evaluation["episode"][0]["seed"]}
     options |= evaluation.get("execution", {}) | {key: evaluation.get(key) for key in _ABOUT_ENV}
-    return shlex.join(["koap", "eval", str(run.folder), *_words(options)])
-
-
-def _words(options: Mapping[str, Any]) -> list[str]:
-    """Returns the given options as words of a command."""
-    words = []
-    for key, value in options.items():
-        if value not in (None, []):
-            words += [f"--{key.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
-    return words
+    return shlex.join(["koap", "eval", str(run.folder), *option_words(options)])
 
 
 def _filled(command: str, run: RunFacts) -> str:
@@ -120,7 +112,7 @@ def _filled(command: str, run: RunFacts) -> str:
     places = {"run": run.folder, "data": run.config.get("dataset")}
     line = command.format(**{name: shlex.quote(str(place)) for name, place in places.items()})
     rolls_out = "--episodes" in command or command.startswith("koap inspect")
-    words = _words({key: run.evaluation.get(key) for key in _ABOUT_ENV}) if rolls_out else []
+    words = option_words({key: run.evaluation.get(key) for key in _ABOUT_ENV}) if rolls_out else ()
     return " ".join([line, *map(shlex.quote, words)])
 
 
