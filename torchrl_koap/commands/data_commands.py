@@ -81,27 +81,17 @@ class Demos(Command):
         embodiments = expert_of(task).embodiments
         if self.embodiment is not None and not embodiments:
             raise ValueError(f"--embodiment was given, but task {task.name!r} has only one embodiment")
-        if embodiments:
-            return self._film(task, episodes, embodiments)
-        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # no bar before an error
-            return record_to_folder(
-                self.out,
-                task,
-                episodes,
-                self.seed,
-                progress=count_up_to(bar),
-                num_threads=self.threads,
-                disturbance=self.disturbance,
-            )
-
-    def _film(self, task: Task, episodes: int, embodiments: Sequence[str]) -> VideoReport:
-        if self.embodiment is None:
+        if self.embodiment is None and embodiments:
             raise ValueError(f"task {task.name!r} needs --embodiment {' or '.join(embodiments)}")
-        lookup(embodiments, self.embodiment, "embodiment")
-        if self.disturbance:
-            raise ValueError("--disturbance was given, but demonstrations with a camera cannot be disturbed")
-        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:
-            return record_videos(self.out, self.embodiment, episodes, self.seed, count_up_to(bar), task=task)
+        if embodiments:
+            lookup(embodiments, self.embodiment, "embodiment")
+            if self.disturbance:
+                raise ValueError("--disturbance was given, but demonstrations with a camera cannot be disturbed")
+        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # no bar before an error
+            if self.embodiment is not None:
+                return record_videos(self.out, self.embodiment, episodes, self.seed, count_up_to(bar), task=task)
+            options = {"num_threads": self.threads, "disturbance": self.disturbance}
+            return record_to_folder(self.out, task, episodes, self.seed, progress=count_up_to(bar), **options)
 
 
 @dataclass(kw_only=True)

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_koap.evaluation.config import EvalConfig
 from torchrl_koap.evaluation.data_errors import errors_left_out, errors_of_chunks, errors_outside_budget, plan_errors
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.loop_on_labels import check_loop
@@ -17,10 +18,7 @@ from torchrl_koap.keys import ACTION, HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.training.datasets import split_held_out
 from torchrl_koap.training.policy_facts import constant_actions
-
-if TYPE_CHECKING:
-    from torchrl_koap.evaluation.config import EvalConfig
-    from torchrl_koap.training.trained import Trained
+from torchrl_koap.training.trained import Trained
 
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
