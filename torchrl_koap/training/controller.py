@@ -12,9 +12,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import cut_windows, make_window_buffer
-from torchrl_koap.data.trajectories import labelled_episodes, trajectory_lengths
+from torchrl_koap.data.trajectories import extrapolate_ends, labelled_episodes, trajectory_lengths
 from torchrl_koap.data.windows import WindowTable, spread_evenly
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
+from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.runs.progress import count_up_to, progress_bar
@@ -27,11 +28,11 @@ from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
 from torchrl_koap.training.planner import augmentation, planned_windows
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, state_reader, with_commands
-from torchrl_koap.training.pseudo_labels import relabel
 
 LEARNING_RATE = 1e-3
 FEW_VALUES = 5  # an action with more distinct values is neither a switch nor a mode
 FITTED = 50_000  # windows at most that statistics without labels are fitted to
+_BATCH = 4096  # windows per forward pass in relabelling
 _KEYS = [STATE, ACTION, HAS_ACTION]
 
 
@@ -133,11 +134,11 @@ def _train_network(
     windows = cut_windows(data, window, select=_KEYS, pad_before=history, most=FITTED if everything else None)
     if not everything:
         windows = spread_evenly(windows[windows[HAS_ACTION].any(dim=(1, 2))], FITTED)
-    states = windows[STATE]
-    losses: dict[str, float] = {}
+    states, losses = windows[STATE], dict[str, float]()
     with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most controllers prepare nothing
         controller.prepare(states, updates=budget if method.phases else 0, progress=count_up_to(bar))
-    for phase in method.phases_of(config.controller.preset) if budget else ():
+    phases = method.phases_by_preset.get(config.controller.preset, method.phases)
+    for phase in phases if budget else ():
         batch = BATCHES[phase.windows]
         buffer = make_window_buffer(
             data,
@@ -157,13 +158,11 @@ def _train_network(
             weight_decay=1e-3,
         )
     controller.eval()
-    fit: dict[str, Any] = {}
     controller.finish(states)
-    if method.closed_form:
-        fit = fit_closed_form(
-            controller, data, **action_facts(task, task.controller_columns(config.controller.columns))
-        )
-    return controller, fit, losses
+    if not method.closed_form:
+        return controller, {}, losses
+    facts = action_facts(task, task.controller_columns(config.controller.columns))
+    return controller, fit_closed_form(controller, data, **facts), losses
 
 
 def _train_sampler(
@@ -211,3 +210,30 @@ def _relabelled(task: Task, config: TrainConfig, teacher: Method, data: TensorDi
     if task.distances:
         labelled[ACTION] = shift_actions(labelled[ACTION], data[STATE], task.distances)
     return data.copy().update(labelled.select(ACTION, HAS_ACTION))
+
+
+@torch.no_grad()
+def relabel(controller: InverseDynamics, data: TensorDictBase, *, window: int) -> TensorDictBase:
+    """Gives every unlabelled step the action that a controller in evaluation mode infers from recorded states.
+
+    The action is that of frame ``controller.num_past`` of a window. Beyond the ends of a trajectory, the first state
+    is repeated and the last ones continue at their velocity (:func:`~torchrl_koap.data.extrapolate_ends`)::
+
+        frame            0      1      2      ...    window - 1         (history = 1)
+        action of step 0 x_0    x_0    x_1    ...
+        action of step t x_t-1  x_t    x_t+1  ...
+
+    Flat data ``[N]`` have ``state`` as the controller sees it, and are not changed. Returns a shallow copy in which
+    every step has an action; labelled steps keep theirs bit for bit.
+    """
+    hidden, now = ~data[HAS_ACTION].squeeze(-1), controller.num_past
+    action = data[ACTION].clone()
+    continued = extrapolate_ends(data, window - 1 - now)
+    # one window per hidden step, with the step at frame `now`, in the order of the data
+    frames, _ = WindowTable.build(continued, window, counted=range(now, window - 1), pad_before=now).frames(hidden)
+    rows = hidden.nonzero().squeeze(-1)
+    for first in range(0, len(rows), _BATCH):
+        part = slice(first, first + _BATCH)
+        windows = TensorDict({controller.in_key: continued[STATE][frames[part]]}, frames[part].shape)
+        action[rows[part]] = controller(windows)[controller.out_key][:, now]
+    return data.copy().update({ACTION: action, HAS_ACTION: torch.ones_like(data[HAS_ACTION])})

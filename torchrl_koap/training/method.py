@@ -146,10 +146,6 @@ class Method:
         ControllerConfig(steps=self.updates, columns=self.columns)
         Execution().replaced(**self.execution)
 
-    def phases_of(self, preset: str) -> tuple[Phase, ...]:
-        """Returns the training phases of a preset."""
-        return self.phases_by_preset.get(preset, self.phases)
-
     def check_execution(self, asked: Execution | ExecutionConfig, usual: Execution) -> None:
         """Raises a ValueError if a method without plans is given plan options other than the usual ones."""
         for name in () if self.plans else ("strategy", "blend"):

@@ -128,7 +128,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             loop, planner, losses = Phases(run, logger, config.run.resume), None, dict[str, float]()
             torch.manual_seed(config.run.seed)
             if get_method(config.method).plans:
-                planner, losses = _planner(run, task, config, for_planner, unseen, loop)
+                planner, losses = _planner(task, config, for_planner, unseen, loop)
             planned = time.perf_counter()
             if planner_only:
                 found = {"planner": losses}
@@ -225,19 +225,14 @@ def _report_data(task: Task, data: TensorDictBase) -> dict[str, Tensor]:
 
 
 def _planner(
-    run: RunDirectory,
-    task: Task,
-    config: TrainConfig,
-    data: TensorDictBase,
-    held_out: TensorDictBase | None,
-    loop: Phases,
+    task: Task, config: TrainConfig, data: TensorDictBase, held_out: TensorDictBase | None, loop: Phases
 ) -> tuple[StatePlanner, dict[str, float]]:
     """Returns the planner and its last losses: trained, taken from another run, or loaded if it is finished."""
-    path, facts = run.path / "planner.safetensors", facts_of("planner", task, config)
+    path, facts = config.out / "planner.safetensors", facts_of("planner", task, config)
     if path.exists() and config.run.resume:  # weights are written once, at the end of their phase
         planner = build_planner(task, config.planner).to(config.run.device)
         load_weights(path, planner, facts)
-        return planner, run.last_metrics("planner")
+        return planner, RunDirectory(config.out).last_metrics("planner")
     if config.planner.source is not None:
         planner, losses = planner_of_source(task, config).to(config.run.device), dict[str, float]()
     else:
