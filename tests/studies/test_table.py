@@ -5,6 +5,7 @@ import pytest
 from tiny_runs import read_csv
 
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.runs.run_directory import write_csv
 from torchrl_koap.studies.table import (
     CELL_COLUMNS,
     Measure,
@@ -12,7 +13,6 @@ from torchrl_koap.studies.table import (
     result_rows,
     summarise,
     table_rows,
-    write_csv,
 )
 
 

@@ -33,7 +33,17 @@ def load_plugins(names: Sequence[str]) -> None:
         sys.path.append(here)
         importlib.invalidate_caches()
     for name in names:
-        _load(name)
+        if name.endswith(".py") and not os.path.isfile(name):
+            raise PluginError(f"there is no plugin file {name!r}; give its present path with --plugin")
+        try:
+            import_code(name)
+        except Exception as error:
+            absent = error.name if isinstance(error, ModuleNotFoundError) else None
+            if absent is not None and (name == absent or name.startswith(f"{absent}.")):
+                places = dict.fromkeys(path or here for path in [here, *sys.path])
+                raise PluginError(f"there is no plugin {name!r}; looked for it in {', '.join(places)}") from error
+            said = f"plugin {name!r} failed when it was imported: {type(error).__name__}: {error}"
+            raise PluginError(said) from error
 
 
 def absolute_files(names: Sequence[str]) -> tuple[str, ...]:
@@ -41,16 +51,3 @@ def absolute_files(names: Sequence[str]) -> tuple[str, ...]:
     if isinstance(names, str):
         raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")
     return tuple(absolute(str(name)) for name in names)
-
-
-def _load(name: str) -> None:
-    if name.endswith(".py") and not os.path.isfile(name):
-        raise PluginError(f"there is no plugin file {name!r}; give its present path with --plugin")
-    try:
-        import_code(name)
-    except Exception as error:
-        absent = error.name if isinstance(error, ModuleNotFoundError) else None
-        if absent is not None and (name == absent or name.startswith(f"{absent}.")):
-            places = dict.fromkeys(path or os.getcwd() for path in [os.getcwd(), *sys.path])
-            raise PluginError(f"there is no plugin {name!r}; looked for it in {', '.join(places)}") from error
-        raise PluginError(f"plugin {name!r} failed when it was imported: {type(error).__name__}: {error}") from error

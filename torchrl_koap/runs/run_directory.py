@@ -30,6 +30,14 @@ _NETWORKS = ("planner.safetensors", "controller.safetensors")
 FILES = ("config.json", "summary.json", "metrics.csv", "demonstrations.safetensors", *_NETWORKS)
 
 
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes rows as csv, atomically; values that are missing stay empty."""
+    with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 class RunDirectoryError(ValueError):
     """A folder that cannot be used as asked: it holds another run, or is incomplete."""
 
@@ -77,7 +85,7 @@ class RunDirectory:
         columns = self._columns()
         new = [name for name in row if name not in columns]
         if new:
-            self._write_metrics([*columns, *new], self.read_metrics())
+            write_csv(path, [*columns, *new], self.read_metrics())
             columns += new
         try:
             with path.open("a", newline="") as file:
@@ -92,12 +100,6 @@ class RunDirectory:
         with path.open(newline="") as file:
             head = file.readline()
         return next(csv.reader([head]), []) if head.endswith("\n") else []
-
-    def _write_metrics(self, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-        with replacing_file(self.path / "metrics.csv") as aside, aside.open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns, restval="")
-            writer.writeheader()
-            writer.writerows(rows)
 
     def read_metrics(self) -> list[dict[str, str]]:
         """Returns all complete rows of ``metrics.csv``; none if there is no such file.
@@ -143,8 +145,8 @@ class RunDirectory:
     def rewind_metrics(self, phase: str, step: int) -> None:
         """Drops the rows of ``phase`` after ``step``, and those of later phases, before a run resumes from there."""
         kept = takewhile(lambda row: row["phase"] != phase or int(row["step"]) <= step, self.read_metrics())
-        if (self.path / "metrics.csv").exists():
-            self._write_metrics(self._columns(), list(kept))
+        if (path := self.path / "metrics.csv").exists():
+            write_csv(path, self._columns(), list(kept))
 
     @contextlib.contextmanager
     def locked(self, what: str, name: str = ".lock") -> Iterator[None]:

@@ -21,7 +21,6 @@ from torchrl_koap.lookup import lookup
 
 _LONGEST = 500  # characters of a reason at most
 _PATIENCE = 3  # seconds in which a process may release system resources, such as semaphores
-LAUNCHERS = ("local", "ray")
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Machines:
     address: str | None = None
 
     def __post_init__(self):
-        lookup(LAUNCHERS, self.launcher, "launcher")
+        lookup(("local", "ray"), self.launcher, "launcher")
         if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be >= 1, got {self.workers}")
         if self.launcher == "local" and self.address is not None:

@@ -12,6 +12,7 @@ from torchrl_koap.data.label_budget import plural_of
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import FOLDER
+from torchrl_koap.runs.run_directory import write_csv
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, REFERENCE, Outcome, compare_cells
 from torchrl_koap.studies.paper import paper_points, write_paper_layout
 from torchrl_koap.studies.plots import plot_measure
@@ -23,7 +24,6 @@ from torchrl_koap.studies.table import (
     percent,
     summarise,
     table_rows,
-    write_csv,
 )
 from torchrl_koap.training.methods import METHODS
 

@@ -20,12 +20,12 @@ from torchrl_koap.runs.config import given_options
 from torchrl_koap.runs.config_files import changed_options, from_json, to_json, versions
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.resume import check_data
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError, write_csv
 from torchrl_koap.studies.cells import FOUND, Cell, Result, cell_row, prepare_cell, read_result, run_cell
 from torchrl_koap.studies.launchers import Job, Machines, launch
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.study import Study, check_study, complete, union
-from torchrl_koap.studies.table import CELL_COLUMNS, STATUSES, write_csv
+from torchrl_koap.studies.table import CELL_COLUMNS, STATUSES
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import fingerprint
 

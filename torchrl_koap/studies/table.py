@@ -3,17 +3,14 @@
 
 from __future__ import annotations
 
-import csv
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 from torchrl_koap.data.label_budget import plural_of
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.files import replacing_file
 
 STATUSES = ("done", "failed", "missing")
 CELL_COLUMNS = (
@@ -78,14 +75,6 @@ class Summary:
         if name in ("labels", "demonstrations"):
             return self.labels if name == "labels" else self.demonstrations
         return self.measures[name].mean if name in self.measures else None
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes rows as csv, atomically; values that are missing stay empty."""
-    with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
