@@ -22,10 +22,10 @@ from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.training.closed_form import UnusableLabelsError, action_facts, fit_closed_form
-from torchrl_koap.training.loop import Phases, moving_average
+from torchrl_koap.training.loop import Phases
 from torchrl_koap.training.method import BATCHES, Method
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.networks import WEIGHT_DECAY, build_controller
+from torchrl_koap.training.networks import build_controller
 from torchrl_koap.training.planner import augmentation, planned_windows
 from torchrl_koap.training.policy_facts import command_ranges, controller_data, state_reader, with_commands
 
@@ -186,17 +186,8 @@ def _train_sampler(
     )
     loss = phase.loss(sampler, dtype=DTYPES[config.run.precision])
     augment = augmentation(task, states, actions=True)
-    num_steps = max(round(section.steps * phase.share), 1)
-    losses = loop(
-        phase.name,
-        loss,
-        lambda: augment(buffer.sample()),
-        num_steps=num_steps,
-        learning_rate=section.learning_rate,
-        weight_decay=WEIGHT_DECAY,
-        target_update=moving_average(loss, num_steps),
-        replay=True,
-    )
+    section = replace(section, steps=max(round(section.steps * phase.share), 1))
+    losses = loop.denoise(phase.name, loss, lambda: augment(buffer.sample()), section)
     loss.target_network_params.to_module(sampler)
     return sampler, losses
 

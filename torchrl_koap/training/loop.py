@@ -17,6 +17,7 @@ from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
+from torchrl_koap.runs.config import PlannerConfig
 from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError
@@ -27,6 +28,7 @@ CHECKPOINT_EVERY = 500  # updates
 WARMUP = 100  # updates until the learning rate reaches its peak
 TIMES = 5.0  # of the root mean square length; mini-batch gradients vary by about a factor of two
 SETTLED = 100  # updates until the mean square is reliable
+WEIGHT_DECAY = 1e-4  # decoupled; of all denoisers
 AVERAGE_EVERY = 4  # updates between two steps of the average, which reads and writes every weight
 
 
@@ -177,6 +179,14 @@ class Phases:
         shared = {"run": self.run, "logger": self.logger, "resume": self.resume}
         with progress_bar(num_steps, name, smoothing=0.05, mininterval=0.5) as bar:
             return train_phase(name, loss, sample, num_steps=num_steps, progress=show_losses(bar), **shared, **options)
+
+    def denoise(
+        self, name: str, loss: nn.Module, sample: Callable, section: PlannerConfig, *, best: BestWeights | None = None
+    ) -> dict[str, float]:
+        """Trains a denoiser with a planner's options; the loss has the averaged parameters at the end."""
+        steps, average = section.steps, moving_average(loss, section.steps)
+        options = {"learning_rate": section.learning_rate, "weight_decay": WEIGHT_DECAY, "replay": True}
+        return self(name, loss, sample, num_steps=steps, target_update=average, best=best, **options)
 
 
 @contextlib.contextmanager

@@ -27,8 +27,6 @@ from torchrl_koap.tasks import HORIZON, Task
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.policy_facts import state_reader
 
-WEIGHT_DECAY = 1e-4  # decoupled; of all denoisers
-
 
 def _unet(columns: int, condition_dim: int, *, width: int, frequencies: int, horizon: int) -> nn.Module:
     return TemporalUnet(columns, condition_dim, channels=(width, 2 * width), frequencies=frequencies)

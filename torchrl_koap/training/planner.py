@@ -32,8 +32,8 @@ from torchrl_koap.runs.device import DTYPES
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.tasks.columns import unit_groups
 from torchrl_koap.training.best_weights import BestWeights
-from torchrl_koap.training.loop import Phases, moving_average
-from torchrl_koap.training.networks import WEIGHT_DECAY, build_planner
+from torchrl_koap.training.loop import Phases
+from torchrl_koap.training.networks import build_planner
 
 SITUATIONS, SAMPLES = 64, 4  # held-out situations, and plans in each, by which weights are chosen
 MOST_WINDOWS = 400_000  # windows for statistics at most; fewer would miss rare steps, which set the scale of plans
@@ -76,17 +76,7 @@ def learn_planner(
     weights = column_weights(task)
     loss = PlannerLoss(planner, dtype=DTYPES[config.run.precision], weights=weights).to(config.run.device)
     best = None if score is None else BestWeights(loss, score, check_interval(section, planner.num_steps))
-    values = loop(
-        "planner",
-        loss,
-        lambda: augment(buffer.sample())[:, unseen:],
-        num_steps=section.steps,
-        learning_rate=section.learning_rate,
-        weight_decay=WEIGHT_DECAY,
-        target_update=moving_average(loss, section.steps),
-        best=best,
-        replay=True,
-    )
+    values = loop.denoise("planner", loss, lambda: augment(buffer.sample())[:, unseen:], section, best=best)
     loss.target_network_params.to_module(planner)
     if best is not None:
         planner.load_state_dict(best.network.state_dict())
