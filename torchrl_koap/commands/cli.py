@@ -16,18 +16,7 @@ from contextlib import nullcontext
 from typing import Any
 
 from torchrl_koap import __version__
-from torchrl_koap.commands.shell import (
-    ReadEnough,
-    describe_interrupt,
-    discard_output,
-    handling_signals,
-    interrupt,
-    leave,
-    one_line_warnings,
-    open_closed_streams,
-    widen_terminal,
-    written_output,
-)
+from torchrl_koap.commands import shell
 
 # errors whose messages suffice; any other is a bug of this package and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
@@ -44,15 +33,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ``arguments`` default to those of the process.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    open_closed_streams()
+    shell.open_closed_streams()
     try:
-        with handling_signals(interrupt), one_line_warnings():
+        with shell.handling_signals(shell.interrupt), shell.one_line_warnings():
             return _run(arguments)
-    except ReadEnough:  # `koap ... | head`
-        discard_output()
+    except shell.ReadEnough:  # `koap ... | head`
+        shell.discard_output()
         return 141
     except KeyboardInterrupt as error:
-        message, status = describe_interrupt(error, *arguments[:1])
+        message, status = shell.describe_interrupt(error, *arguments[:1])
         _complain(message)
         return status
     except Exception as error:
@@ -66,13 +55,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     if arguments == ["--version"]:
-        with written_output():
+        with shell.written_output():
             print(f"koap {__version__}")
         return 0
     _check_words(arguments)
     options, subcommands, without_progress_bars = _commands()
-    widen_terminal()
-    with written_output():
+    shell.widen_terminal()
+    with shell.written_output():
         if not arguments or arguments[0] in ("-h", "--help"):
             print(subcommands.overview(), file=sys.stdout if arguments else sys.stderr)
             return 0 if arguments else 2
@@ -82,7 +71,7 @@ def _run(arguments: Sequence[str]) -> int:
         result = command()
     failed = result.pop("failed", "") if isinstance(result, dict) else ""  # printed once, even with --quiet
     if not command.quiet:
-        with written_output():
+        with shell.written_output():
             _show(result)
     if failed:
         _complain(failed)
@@ -125,7 +114,7 @@ def _check_words(arguments: Sequence[str]) -> None:
 
 def _commands() -> tuple[Any, ...]:
     """Imports and returns the modules that take seconds to import."""
-    with handling_signals(leave):
+    with shell.handling_signals(shell.leave):
         try:
             from torchrl_koap.commands import options, subcommands
             from torchrl_koap.runs.progress import without_progress_bars

@@ -28,11 +28,7 @@ def outcome_of(episode: TensorDict) -> str:
 
 
 def score(
-    episodes: Sequence[TensorDict],
-    seeds: Sequence[int],
-    modes: Modes,
-    *,
-    contexts: Sequence[int] | None = None,
+    episodes: Sequence[TensorDict], seeds: Sequence[int], modes: Modes, *, contexts: Sequence[int] | None = None
 ) -> dict[str, Any]:
     """Returns success (``rates``) with its 95 % interval, entropy of the modes of successes, and a row per episode.
 

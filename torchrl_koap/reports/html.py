@@ -6,7 +6,6 @@ A page is one file next to its pictures, with style and script inside; it loads 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -29,11 +28,7 @@ def show(value: Any, key: str = "") -> str:
         return "yes" if value else "no"
     if isinstance(value, int):
         return str(value) if key in _PLAIN else f"{value:,}"
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return "not a number" if math.isnan(value) else "infinite"
-        return f"{value:.4g}"
-    return str(value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def label(key: Any) -> str:
