@@ -8,7 +8,7 @@ from torchrl_koap.studies.paper import (
     average_over_tasks,
     layout_rows,
     paper_cells,
-    paper_cells_by_place,
+    all_paper_cells,
     paper_entries,
     paper_points,
     write_paper_layout,
@@ -37,7 +37,7 @@ def test_both_tables_are_whole():
     ],
 )
 def test_single_cells(task, method, level, share, text):
-    cell = paper_cells_by_place()[task, method, level]
+    cell = all_paper_cells()[task, method, level]
     assert (cell.label_share, cell.text) == (share, text)
 
 

@@ -57,7 +57,7 @@ def paper_cells(table: int) -> list[PaperCell]:
 
 
 @functools.cache
-def paper_cells_by_place() -> dict[tuple[str, str, int], PaperCell]:
+def all_paper_cells() -> dict[tuple[str, str, int], PaperCell]:
     """Returns the cells of both tables by task, method and level; table 1 overrides table 2."""
     return {(cell.task, cell.method, cell.level): cell for cell in [*paper_cells(2), *paper_cells(1)]}
 
@@ -65,7 +65,7 @@ def paper_cells_by_place() -> dict[tuple[str, str, int], PaperCell]:
 def paper_points(task: str) -> dict[str, list[tuple[float, float]]]:
     """Returns the cells of a task in both tables, each once: label shares and successes in 0..1 by method."""
     points: dict[str, list[tuple[float, float]]] = {}
-    for cell in paper_cells_by_place().values():
+    for cell in all_paper_cells().values():
         if cell.task == task:
             points.setdefault(cell.method, []).append((cell.label_share, cell.success))
     return points
@@ -110,7 +110,7 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
         if item.labels in levels:
             found[item.task, levels.index(item.labels) + 1, item.method] = item
     tasks, methods = (list(dict.fromkeys(names)) for names in ([t for t, _, _ in found], [m for _, _, m in found]))
-    paper = paper_cells_by_place()
+    paper = all_paper_cells()
     return [
         Entry(task, method, level, share, found.get((task, level, method)), paper.get((task, method, level)))
         for task in tasks
