@@ -5,10 +5,10 @@ import pytest
 
 from torchrl_koap.studies.paper import (
     above_the_paper,
+    all_paper_cells,
     average_over_tasks,
     layout_rows,
     paper_cells,
-    all_paper_cells,
     paper_entries,
     paper_points,
     write_paper_layout,
