@@ -109,14 +109,16 @@ class TestCompactLifting:
         error = lifting.reconstruction_error(lifting.encode(windows), windows).mean()
         assert error < 0.3 * lifting.components(windows).square().mul(lifting.components.weights).mean()
 
-    def test_what_is_learned_before_the_losses_depends_on_the_data_alone(self):
-        windows = embedded(turning(100).sin())
+    def test_what_is_learned_before_the_losses_depends_on_the_data_alone(self, monkeypatch):
+        windows, told = embedded(turning(100).sin()), []
         lifting = CompactLifting(24, 2)
         lifting.prepare(windows)
         same = copy.deepcopy(lifting)
         for seed, each in enumerate((lifting, same)):
             torch.manual_seed(seed)
-            each.pretrain(windows, 3)
+            monkeypatch.setattr("torchrl_koap.modules.koopman.compact_lifting.PRETRAINING_UPDATES", 3)
+            each.pretrain(windows, 99, lambda *counts: told.append(counts))
+        assert told[-1] == (6, 6) and all(weight.grad is None for weight in lifting.parameters())
         assert all(torch.equal(value, same.state_dict()[name]) for name, value in lifting.state_dict().items())
 
     def test_the_reconstruction_error_weights_components(self):
@@ -131,6 +133,9 @@ class TestCompactLifting:
             for made in (lifting.small.decode(lifted[..., :2]), lifting.large.decode(lifted[..., 2:]))
         ]
         torch.testing.assert_close(lifting.reconstruction_error(lifted, windows), sum(errors) / 2)
+        # the first components initialise the linear part
+        torch.testing.assert_close(lifting.small.encoder_skip.weight.abs(), torch.eye(2, 24), rtol=0, atol=0.05)
+        torch.testing.assert_close(lifting.small.decoder_skip.weight.abs(), torch.eye(24, 2), rtol=0, atol=0.05)
 
     def test_coordinates_left_out_do_not_shrink_the_others(self):
         windows = embedded(turning(bodies=2).sin())

@@ -74,6 +74,16 @@ def test_parts_with_other_keys_in_a_model_with_other_keys():
 # fitting
 
 
+def test_parts_are_fitted_to_normalised_states(monkeypatch):
+    model, state, seen = make_model(), windows(4), []
+    for part in (model.lifting, model.latent_action):
+        for name in ("prepare", "finish"):
+            monkeypatch.setattr(part, name, seen.append)
+    model.prepare(state)
+    model.finish(state)
+    assert len(seen) == 4 and all(torch.equal(each, model.normalize_state(state)) for each in seen)
+
+
 def labelled(*batch, share=0.5):
     generator = torch.Generator().manual_seed(3)
     mask = torch.rand(*batch, 9, generator=generator) < share
@@ -233,6 +243,7 @@ def test_guessed_axes_are_used_only_where_held_out_labels_agree():
             model.fit_labels(data, mask, **({"axes": (0, 1)} | options))
             found[name] = model.action_decoder.linear.weight
         assert torch.equal(found["guessed"], found["known" if agrees else "none"])
+        assert not torch.equal(found["known"], found["none"])
 
 
 def test_axes_must_be_one_per_action_and_are_left_out_where_steps_are_not_held():

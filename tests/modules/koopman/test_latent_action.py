@@ -72,6 +72,7 @@ def test_a_chosen_kernel_is_that_of_a_network_with_no_other():
     loaded.load_state_dict(both.state_dict())
     assert torch.equal(loaded.infer(read), found["smooth"])  # the weights tell which kernel was chosen
     assert "kernel" not in alone[0].state_dict()
+    assert LatentActionFourier(2, 0, kernels=kernels).blocks == ("",)  # without features kernels do not differ
     with pytest.raises(ValueError, match="kernels: at least one"):
         LatentActionFourier(2, 64, kernels={})
 

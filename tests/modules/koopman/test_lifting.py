@@ -38,7 +38,7 @@ def test_a_decoded_state_of_fewer_columns_is_not_broadcast():
 
 def test_linear_maps_are_the_principal_components_at_unit_spread():
     generator = torch.Generator().manual_seed(0)
-    states = torch.randn(50, 16, 2, generator=generator) @ torch.randn(2, 6, generator=generator)
+    states = (3 + torch.randn(50, 16, 2, generator=generator)) @ torch.randn(2, 6, generator=generator)
     lifting = KoopmanLifting(6, 2, hidden_dims=(8,), linear_skip=True)
     lifting.prepare(states)
     made = states @ lifting.encoder_skip.weight.mT
