@@ -173,10 +173,11 @@ def test_commands_hide_with_the_actions():
 
 @pytest.mark.parametrize("told", [True, False])
 def test_a_smaller_budget_takes_the_commands_of_labels_away_too(told):
-    whole, _ = LabelBudget(fraction=1.0).apply(demonstrations(), command=COMMAND, tell_commands=True)
-    assert not whole["label_command"].isnan().any()
-    less, _ = LabelBudget(count=3, unit="transition").apply(whole, command=COMMAND, tell_commands=told)
+    whole, report = LabelBudget(fraction=1.0).apply(demonstrations(), command=COMMAND, tell_commands=True)
+    assert not whole["label_command"].isnan().any() and report.commands_told == 0  # the observation holds them
+    less, report = LabelBudget(count=3, unit="transition").apply(whole, command=COMMAND, tell_commands=told)
     assert ("label_command" in less.keys()) == told
+    assert report.commands_told == (3 if told else 0)
     if told:
         assert torch.equal(~less["label_command"].isnan().any(-1), less["has_action"].squeeze(-1))
         again, _ = LabelBudget(fraction=1.0).apply(less, command=COMMAND, tell_commands=True)

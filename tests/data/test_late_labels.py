@@ -74,18 +74,21 @@ def test_a_delay_of_the_robot_hides_as_many_frames():
     assert frames_late(*recordings(3, delay=1)) == 2
 
 
+@pytest.mark.parametrize(("kind", "noise"), [("delta", 0.0003), ("absolute", 0.003)])
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_script_that_reacts_to_noisy_states_is_on_time():
+def test_a_script_that_reacts_to_noisy_states_is_on_time(kind, noise):
     generator, states, actions = np.random.default_rng(0), [], []
     for _ in range(6):
         place, goal = generator.uniform(-1, 1, (2, 2))
         seen, given = [], []
         for _ in range(FRAMES):
-            seen.append(np.r_[place + 0.0003 * generator.normal(size=2), goal])
-            given.append(0.1 * (goal - seen[-1][:2]))
-            place = place + given[-1]
+            seen.append(np.r_[place + noise * generator.normal(size=2), goal])
+            step = 0.1 * (goal - seen[-1][:2])
+            given.append(step if kind == "delta" else seen[-1][:2] + step)
+            place = place + step if kind == "delta" else given[-1]
         states.append(np.array(seen)), actions.append(np.array(given))
-    assert frames_late(*make_demonstrations(states, actions, control_hz=30, robot=[0, 1])) == 0
+    data, task = make_demonstrations(states, actions, control_hz=30, robot=[0, 1], action_kind=kind)
+    assert frames_late(data, task) == 0
 
 
 @pytest.mark.parametrize("kind", ["velocity", "absolute"])
@@ -129,8 +132,14 @@ def test_differences_of_smooth_paths_are_on_time_beside_a_quaternion_of_another_
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_few_or_constant_labels_say_nothing():
     data, task = recordings(2)
-    data["has_action"][16:] = False
-    assert frames_late(data, task) == 0
+    for number in (16, 0):
+        data["has_action"][number:] = False
+        assert frames_late(data, task) == 0
+    data, task = recordings(labelled=1)
+    data["has_action"][42:] = False  # 36 rows for 33 inputs, which fit anything
+    for seed in range(12):
+        data["action"] = torch.randn(data["action"].shape, generator=torch.Generator().manual_seed(seed)).double()
+        assert frames_late(data, task) == 0
     data, task = recordings(2)
     data["action"] = torch.ones_like(data["action"])
     assert frames_late(data, task) == 0

@@ -61,6 +61,22 @@ def test_columns_without_a_unit_are_not_looked_at():
     assert len(warnings([PATH * 1e6, PATH], units=["", "rad"])) == 1
 
 
+def test_a_last_frame_that_moves_is_a_movement_and_no_repetition():
+    moved = PATH.clone()
+    moved[-1] += 5
+    at_last = torch.zeros(20, 2)
+    at_last[-1] = 1
+    assert not any("repeats" in said or "nothing moves" in said for said in warnings([PATH, moved, at_last]))
+
+
+@pytest.mark.parametrize("little", [1, 2])
+def test_a_fifth_of_the_columns_must_move_less_and_those_that_rest_do_not_count(little):
+    sizes = torch.cat([torch.full((little,), 0.01), torch.ones(10 - little), torch.full((2,), 1e-7)])
+    wave = torch.sin(PATH[:, :1] + torch.arange(12.0))
+    said = warnings([wave * sizes, 2 * wave * sizes], columns="abcdefghijkl", units=())
+    assert len(said) == little - 1 and all("'a', 'b' at most 0.0" in warning for warning in said)
+
+
 @pytest.mark.parametrize(("units", "number"), [(("", ""), 1), (("px", ""), 0), (("px", "px"), 0)])
 def test_columns_that_errors_hardly_show_need_units(units, number):
     said = warnings([MOVED * torch.tensor([1.0, 3000]), MOVED * torch.tensor([2.0, 2000])], units=units)
@@ -78,7 +94,7 @@ def test_constant_and_duplicate_columns_are_named():
 
 
 def test_short_trajectories_are_named():
-    (warning,) = warnings([PATH, PATH[:6], PATH[:9]])
+    (warning,) = warnings([PATH[:17], PATH[:6], PATH[:9]])
     assert "2 of 3 trajectories have fewer steps than a window of 16" in warning
     assert "trajectory 1 (5), trajectory 2 (8); remove them, in Python or with `koap convert --drop-short`" in warning
 
@@ -88,6 +104,7 @@ def test_actions_that_never_change_are_named():
         "action 'grip' is 1 in all labels: controllers command this value, method dp a value near it"
     ]
     assert constant_columns(np.array([[1.0, np.nan], [2.0, 5.0], [2.0, 5.0]])) == [2.0, 5.0]
+    assert constant_columns(np.array([[3.0], [np.nan]])) == [None]  # a single label
 
 
 def test_clocks_and_rates_are_told():
@@ -101,7 +118,8 @@ def test_clocks_and_rates_are_told():
 
 def test_isolated_labels():
     alone = torch.where(torch.arange(19)[:, None] % 4 == 1, STEPS, torch.nan)
-    (warning,) = warnings([MOVED, MOVED + 1], [alone, STEPS])
+    single = torch.where(torch.arange(19)[:, None] == 5, STEPS, torch.nan)
+    (warning,) = warnings([MOVED, MOVED + 1, MOVED + 2], [alone, STEPS, single])
     assert warning.startswith("most labels are isolated in 1 trajectories: trajectory 0 (5 of 19 steps)")
 
 
@@ -133,8 +151,15 @@ def test_columns_that_differ_between_trajectories_alone_are_goals():
 def test_goals_that_change_within_recordings_are_not_the_robot():
     """As in Minari's mazes, where first frames hold the goal of the recording before; grippers have few values."""
     paths = np.random.default_rng(0).normal(size=(6, 60, 1)).cumsum(1)
-    behind = np.arange(60)[:, None] > 0
-    for goal, told in ((lambda i: np.where(behind, i + 1.5, i + 0.5), 1), (lambda i: 1.0 * (behind * i % 2), 0)):
+    rows = np.arange(60)[:, None]
+    behind = rows > 0
+    kinds = [
+        (lambda i: np.where(behind, i + 1.5, i + 0.5), 1),
+        (lambda i: 1.0 * (behind * i % 2), 0),
+        (lambda i: (rows - 20).clip(0, 2) * (i + 1.0), 0),  # moves for two steps, as a joint does
+        (lambda i: rows // 10 + 6.0 * i, 0),  # changes in one step of ten
+    ]
+    for goal, told in kinds:
         found = warnings([np.hstack([path, goal(i)]) for i, path in enumerate(paths)], robot=(0, 1))
         assert sum("the controller reads 'y', which keep" in each for each in found) == told
 
@@ -152,8 +177,8 @@ def test_a_gait_of_many_minutes_needs_no_other_rate():
     for period in (14, 25, 40):  # frames; a plan has 14
         gait = torch.sin(2 * torch.pi * (time / period + torch.rand(4)))
         assert plan_coverage(flatten_trajectories([gait] * 2, None, action_dim=1), 50.0)[1] is None
-    slow = torch.sin(time / 300 + torch.rand(4))
-    assert plan_coverage(flatten_trajectories([slow] * 2, None, action_dim=1), 50.0)[1] is not None
+    for slow in (torch.sin(time / period + torch.rand(4)) for period in (16, 300)):
+        assert plan_coverage(flatten_trajectories([slow] * 2, None, action_dim=1), 50.0)[1] is not None
 
 
 def test_stillness_is_told():
@@ -187,6 +212,7 @@ def test_noise_of_sensors_is_no_movement():
     frames = [np.concatenate([np.zeros((40, 3)), ramp]) + generator.normal(size=(60, 3)) / 100 for _ in range(6)]
     starts, ends = still_ends(frames).T
     assert (38 <= starts).all() and (starts <= 41).all() and (ends <= 2).all()
+    assert (still_ends([*frames, frames[0][:2]])[:-1, 0] == starts).all()  # two frames show no noise
     walks = [generator.normal(size=(60, 3)).cumsum(0) for _ in range(6)]
     assert not still_ends(walks).any()
 

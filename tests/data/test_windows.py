@@ -4,7 +4,7 @@
 import pytest
 import torch
 from counted_windows import LENGTHS, demonstrations, seen
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torchrl.data import TensorDictReplayBuffer
 
@@ -74,7 +74,8 @@ def test_samples_are_the_stored_rows(options):
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 8), st.integers(1, 10), st.integers(0, 3), st.integers(0, 5), st.sampled_from((0, 1, 3)))
+@example(0, 30, 5, 0, 3)  # windows whose counted frames all lie before the data
+@given(st.integers(0, 8), st.integers(1, 10), st.integers(0, 5), st.integers(0, 5), st.sampled_from((0, 1, 3)))
 def test_labelled_windows_by_the_definition(seed, number, before, after, counted):
     lengths, window = (9, 14, 7), 6
     data, _ = LabelBudget(count=number, unit="transition", seed=seed).apply(demonstrations(lengths))
@@ -148,7 +149,7 @@ def test_steps_of_one_trajectory_must_be_consecutive():
 
 def test_rows_are_taken_evenly_from_the_first_to_the_last():
     rows = torch.arange(10)
-    assert spread_evenly(rows, 4).tolist() == [0, 3, 6, 9]
+    assert spread_evenly(rows, 4).tolist() == [0, 3, 6, 9] and spread_evenly(rows[:9], 4).tolist() == [0, 3, 5, 8]
     assert spread_evenly(rows, 10) is rows and len(spread_evenly(rows[:0], 4)) == 0
     assert len(spread_evenly(rows[:1].expand(2**24 + 4), 4)) == 4  # float32 does not hold the last row's number
 
