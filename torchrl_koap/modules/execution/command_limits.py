@@ -56,7 +56,7 @@ class CommandLimits(nn.Module):
         state_of: Callable[[Tensor], Tensor] | None = None,
     ):
         super().__init__()
-        if not len(actions) and (ranges is None or gain != 1 or lead):
+        if not len(actions) and (gain != 1 or lead):
             raise ValueError(f"gain {gain:g} and lead {lead:g} were given, but no action is a change of a command")
         if lead and not (commands or positions):
             raise ValueError(f"lead {lead:g} was given, but the observation repeats no command that actions change")
