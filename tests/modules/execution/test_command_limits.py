@@ -21,7 +21,8 @@ COLUMNS = {"commands": [0, 1], "positions": [2, 3]}
 
 
 def seen(command, position, batch=()):
-    return torch.tensor([*command, *position]).expand(*batch, 3, 4)
+    frames = torch.tensor([[7.0], [3.0], [1.0]]) * torch.tensor([*command, *position])  # the present one is the last
+    return frames.expand(*batch, 3, 4)
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
@@ -70,16 +71,16 @@ def test_commands_stay_in_the_demonstrated_range_and_those_outside_are_counted(k
     td = observed()
     free = plain(td.clone())["action"]
     low, high = float(free[..., 2].min()), float(free[..., 2].max())
-    ranges = [None, None, (0.0, 0.5 * low), None]
+    ranges = [None, None, (0.1 * low, 0.5 * low), None]
     held, wide, off = (
-        policy_of(kind, ranges=ranges, limits=margin, gain=2.0) for margin in (0.5, 2 * high / low, float("inf"))
+        policy_of(kind, ranges=ranges, limits=margin, gain=2.0) for margin in (0.5, 3 * high / low, float("inf"))
     )
-    kept = torch.stack([free[..., 0], free[..., 1], torch.full_like(free[..., 2], 2 * 0.75 * low), free[..., 3]], -1)
+    kept = torch.stack([free[..., 0], free[..., 1], torch.full_like(free[..., 2], 2 * 0.7 * low), free[..., 3]], -1)
     torch.testing.assert_close(held(td.clone())["action"], kept)  # the gain comes after it
     torch.testing.assert_close(wide(td.clone())["action"], off(td.clone())["action"], rtol=0, atol=0)
     assert (held.limited.tolist(), wide.limited.tolist(), plain.limited.tolist()) == ([3, 3], [0, 3], [0, 0])
     exported, outside = held.decode_ahead(td["observation_history"], torch.zeros(3, *plain.noise_shape))
-    assert exported[..., 2].max() <= 2 * 0.75 * low and held.limited.tolist() == [3, 3]
+    assert exported[..., 2].max() <= 2 * 0.7 * low and held.limited.tolist() == [3, 3]
     assert outside.shape == (3, 2) and outside[:, 0].all()
     assert not plain.decode_ahead(td["observation_history"], torch.zeros(3, *plain.noise_shape))[1].any()
 

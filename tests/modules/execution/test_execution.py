@@ -13,6 +13,7 @@ def test_given_values_replace_and_none_does_not():
     assert own.replaced(strategy="open_loop", blend=0.0, lead=None) == Execution("open_loop", blend=0.0, lead=0.1)
     assert own.replaced() == own
     assert Execution(**dataclasses.asdict(own)) == own
+    assert own.replaced(lead=0.0, temperature=0.0, limits=0.0) == Execution(blend=0.5, temperature=0.0, limits=0.0)
 
 
 def test_missing_values_are_the_defaults():

@@ -6,7 +6,7 @@ import torch
 from small_networks import a_system
 from tensordict import TensorDict
 
-from torchrl_koap.modules import MPC, Execution, MLPDenoiser, ResponseModel, StatePlanner, make_policy
+from torchrl_koap.modules import MPC, Execution, MLPDenoiser, ResponseModel, StatePlanner, blend_plan, make_policy
 
 AXES = 2
 
@@ -37,6 +37,17 @@ def test_uncoupled_axes_have_no_cross_weights():
     )
     assert not fitted.weight[0, 1].any() and not fitted.weight[1, 0].any()
     torch.testing.assert_close(fitted.weight[0, 0], coupled_system().weight[0, 0], atol=1e-2, rtol=0)
+
+
+def test_a_penalty_is_relative_to_the_number_of_steps_and_a_still_coordinate_has_no_weight():
+    read, steps = steps_of(coupled_system(), count=50)
+    read[:, 0, 3] = 0.0
+    fits = [
+        ResponseModel([0, 1], [0, 1], [0, 1]).double().fit_ridge(read.repeat(n, 1, 1), steps.repeat(n, 1), penalty=0.5)
+        for n in (1, 2)
+    ]
+    torch.testing.assert_close(fits[1].weight, fits[0].weight)
+    assert fits[0].weight[:, 0, 2].abs().min() > 0 and not fits[0].weight[:, 0, 3].any()
 
 
 def test_impulses_add_up_to_the_prediction():
@@ -97,6 +108,14 @@ def test_chunks_for_export_begin_with_the_action_of_the_step():
     plan = policy.planner.sample(states[:, -policy.planner.history :], noise)
     torch.testing.assert_close(chunk, policy.follower.track(observed, states, plan)[:, :4])
     assert not torch.allclose(chunk[:, 0], chunk[:, 1])
+
+
+def test_the_plan_is_blended_into_the_present_state_first():
+    observed, plan = torch.randn(3, 5, 4), torch.randn(3, 14, 2)
+    states = observed[..., 2:]
+    found = mpc_of(blend=0.5).track(observed, states, plan)
+    torch.testing.assert_close(found, mpc_of(blend=0.0).track(observed, states, blend_plan(states, plan, 0.5)))
+    assert not torch.allclose(found, mpc_of(blend=0.0).track(observed, states, plan))
 
 
 @pytest.mark.parametrize("absolute", [False, True])

@@ -182,6 +182,13 @@ def test_planned_states_are_not_executed_nor_sampled_actions_decoded():
         make_policy(actions, make_koopman_inverse_dynamics(2, 2), state_of=(2, 3))
 
 
+def test_an_inverse_dynamics_reads_what_it_is_told_to_and_a_new_policy_is_in_evaluation_mode():
+    options = {"state_of": (0, 1, 2, 3), "reads": lambda states: states[..., 2:]}
+    policy = make_policy(small_planner(4), make_koopman_inverse_dynamics(2, 2), **options)
+    assert policy.follower.reads is options["reads"] and not policy.training
+    assert policy.act(torch.zeros(3, policy.history, 4), torch.zeros(3, 14, 4), 0).shape == (3, 2)
+
+
 def test_decoded_commands_become_changes_of_the_last_one():
     decoded = {"actions": [1], "commands": [2]}
     options = {"state_of": (0, 1), "decoded": decoded, "execution": Execution(blend=0.0, replan_interval=3)}
