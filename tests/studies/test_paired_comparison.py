@@ -40,6 +40,16 @@ def test_identical_outcomes_differ_by_nothing():
     assert (result.contexts, result.seeds, result.n) == (60, 3, 180)
 
 
+@pytest.mark.parametrize(("contexts", "low"), [(1, 0.0), (2, 0.0), (60, 0.95)])
+def test_an_interval_without_spread_stays_within_what_is_possible(contexts, low):
+    always, never = ({0: dict.fromkeys([(context, 0) for context in range(contexts)], each)} for each in (1.0, 0.0))
+    found, turned = compare(always, never), compare(never, always)
+    assert (found.low, found.high) == pytest.approx((low, 1.0)) and found.n == contexts
+    assert (turned.low, turned.high) == pytest.approx((-1.0, -low))
+    errors = compare(always, never, errors=True)  # errors have no bound, and one trajectory no interval
+    assert np.isnan(errors.low) if contexts == 1 else (errors.low, errors.high) == (1.0, 1.0)
+
+
 def test_swapping_the_methods_swaps_the_signs():
     first, second = outcomes(0.8, 0), outcomes(0.4, 1)
     forth, back = compare(first, second), compare(second, first)

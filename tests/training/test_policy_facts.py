@@ -2,13 +2,14 @@
 """Tests what labels are learned as: changes of a command, or the command itself if the task requires it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from torchrl_koap import ControllerConfig, fit
 from torchrl_koap.data import LabelBudget, flatten_trajectories, make_demonstrations, select_state
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, get_task
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.policy_facts import (
     command_ranges,
@@ -74,6 +75,24 @@ def test_relative_positions_are_read_beside_the_columns_where_asked():
     read = reader(states)
     assert read.shape == (2, 3, reader.width) and torch.equal(read[..., : task.state_dim], states)
     torch.testing.assert_close(read[..., task.state_dim :][..., :3], states[..., :3] - states[..., 4:7])
+
+
+def test_ranges_of_commands_by_hand():
+    kinds = [Action("m"), Action("m"), Action("rad", "absolute", 0), Action("", "raw"), Action("", "gripper")]
+    actions = dict(zip("xyqrg", kinds, strict=True))
+    task = SimpleNamespace(actions=actions, action_units=tuple(kind.unit for kind in kinds))
+    labels = torch.tensor([[-0.4, 0.1, 2.0, 7.0, 1.0], [0.3, -0.2, 3.0, 7.0, 1.0], [torch.nan] * 5])
+    data = {"action": labels, "has_action": torch.tensor([[True], [True], [False]]), "state": torch.tensor([[1.5]] * 3)}
+    largest = [pytest.approx(-0.4), pytest.approx(0.4)]  # of both axes, in both directions
+    assert command_ranges(task, data) == [largest, largest, [1.5, 3.0], [7.0, 7.0], None]
+    data["has_action"][1] = False
+    assert command_ranges(task, data)[3:] == [None, None]
+
+
+def test_a_lead_is_for_changes_of_commands_and_not_for_targets():
+    targets = {name: Action("m", "absolute", column) for column, name in enumerate(CHANGES.actions)}
+    assert policy_facts(CHANGES)["commanded"] == {"states": [0, 1], "commands": [0, 1], "actions": [0, 1]}
+    assert policy_facts(replace(CHANGES, actions=targets))["commanded"] is None
 
 
 @pytest.mark.parametrize("kind", ["delta", "raw", "absolute"])
