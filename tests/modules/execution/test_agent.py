@@ -12,6 +12,7 @@ from toy_gym import reach
 
 from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.modules import Agent, Execution, PolicyEnv, make_koopman_inverse_dynamics, make_policy
+from torchrl_koap.modules.execution.agent import percentiles
 
 STEPS = 13
 
@@ -173,6 +174,9 @@ def test_latencies_do_not_grow_for_ever(monkeypatch):
     for _ in range(5):
         agent.act(np.zeros(2))
     assert agent.latency()["steps"] == 3
+    assert percentiles([step / 1000 for step in range(101)]) == pytest.approx(
+        {"p50": 50, "p99": 99, "max": 100, "steps": 101}
+    )
 
 
 def test_episodes_of_an_agent_differ_and_are_drawn_again_by_its_seed():

@@ -133,8 +133,8 @@ def test_commands_are_limited_as_in_the_policy():
 def test_another_rate_than_that_of_the_data_is_warned_of(recwarn):
     networks = make_agent().policy
     policy = make_policy(networks.planner, networks.follower.controller, state_of=(0, 1), control_hz=20.0)
-    with pytest.warns(UserWarning, match="control_hz is 500, the policy was trained on data of 20 Hz"):
-        AsynchronousAgent(policy, control_hz=500).close()
+    with pytest.warns(UserWarning, match="control_hz is 26, the policy was trained on data of 20 Hz"):
+        AsynchronousAgent(policy, control_hz=26).close()
     recwarn.clear()
     AsynchronousAgent(policy, control_hz=24).close()
     assert not recwarn.list

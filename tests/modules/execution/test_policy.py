@@ -174,6 +174,15 @@ def test_a_plan_that_is_lost_is_that_of_another_environment_if_the_policy_acted_
     assert [act(2, 2, False), act(2, 3, False)] == [2, 2]
 
 
+@pytest.mark.parametrize(("entry", "planned"), [("is_init", [[101.0]]), ("_step", [])])
+def test_a_row_that_begins_or_waits_does_not_make_the_others_plan_anew(entry, planned):
+    policy, frames = policy_of(), torch.arange(2.0)[:, None, None].expand(2, 2, 3)
+    policy(step_input(frames).set("is_init", torch.ones(2, 1, dtype=torch.bool)))
+    later = step_input(torch.stack([frames[0], frames[1] + 100])).set("is_init", torch.zeros(2, 1, dtype=torch.bool))
+    policy(later.set(entry, torch.tensor([[entry == "_step"], [entry == "is_init"]])))
+    assert policy.planner.calls[1:] == planned
+
+
 def test_planned_states_are_not_executed_nor_sampled_actions_decoded():
     with pytest.raises(ValueError, match="StatePlanner samples states: a controller must decode them"):
         make_policy(small_planner(), state_of=(2, 3))
