@@ -53,7 +53,11 @@ def test_moved_folders_and_other_thread_counts_can_be_resumed(run, tmp_path):
     check_resume(run, replace(SAVED, dataset="/scratch/copy", run=replace(SAVED.run, resume=True)))
     built_on = replace(SAVED, planner=PlannerConfig(source="/no/longer/there"))  # as where a curve's folder was moved
     run.write_json("config.json", to_json(built_on))
-    check_resume(run, replace(built_on, planner=PlannerConfig(source="/moved"), run=replace(SAVED.run, resume=True)))
+    moved = replace(built_on, planner=PlannerConfig(source="/moved"), run=replace(SAVED.run, resume=True))
+    check_resume(run, moved)
+    run.write_json("config.json", to_json(replace(SAVED, planner=PlannerConfig(source=tmp_path))))  # it is still there
+    with pytest.raises(RunDirectoryError, match=r"started with another planner.source: it cannot be resumed"):
+        check_resume(run, moved)
 
 
 def test_checkpoints_without_options_raise_errors(tmp_path):

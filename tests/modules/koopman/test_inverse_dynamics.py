@@ -153,7 +153,7 @@ def test_labels_choose_the_kernel_of_their_function_and_its_decoder(kept):
 @pytest.mark.parametrize(("trajectories", "fitted"), [(2, ["sharp"]), (3, ["sharp", "smooth"])])
 def test_fewer_than_three_labelled_trajectories_fit_only_the_first_kernel(trajectories, fitted, monkeypatch):
     kernels = {"sharp": FourierKernel(), "smooth": FourierKernel(0.3, 3.0, 4.0)}
-    model = make_koopman_inverse_dynamics(3, 2, num_past=0, look_ahead=2, kernels=kernels)
+    model = make_koopman_inverse_dynamics(3, 2, num_past=0, look_ahead=2, kernels=kernels, penalty=0.3)
     compared = []
 
     def last(errors):
@@ -162,8 +162,9 @@ def test_fewer_than_three_labelled_trajectories_fit_only_the_first_kernel(trajec
 
     monkeypatch.setattr(model.latent_action, "best_block", last)
     data, mask = labelled(6)
-    assert model.fit_labels(data.set("episode", torch.arange(6) % trajectories), mask)["block"] == fitted[-1]
-    assert compared == fitted
+    fit = model.fit_labels(data.set("episode", torch.arange(6) % trajectories), mask)
+    assert fit["block"] == fitted[-1] and compared == fitted
+    assert (fit["penalty"] == 0.3) == (trajectories == 2)
 
 
 def test_selected_entries_are_written_under_their_names():
@@ -207,7 +208,8 @@ def one_axis_still(num: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_an_axis_with_too_few_labels_is_decoded_like_the_other():
-    spread = torch.randn(500, 16, 2, generator=torch.Generator().manual_seed(3)).cumsum(1) * 0.01
+    sizes = torch.tensor([0.01, 0.04])
+    spread = torch.randn(500, 16, 2, generator=torch.Generator().manual_seed(3)).cumsum(1) * sizes
     answers = {}
     for axes in ((), (0, 1)):
         torch.manual_seed(0)
