@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
 from torchrl_koap.data.formats.kinds import kind_of
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each, wrong_rate
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each, resolves_coarsely, wrong_rate
 from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
 from torchrl_koap.data.planner_choices import observed_frames, planner_updates
 from torchrl_koap.data.quality import find_warnings
@@ -29,7 +29,6 @@ from torchrl_koap.tasks.action_rules import ActionKind
 
 # the kind of an action as a user names it -> as stored, once resampling is done
 ACTION_KINDS: dict[str, ActionKind] = {**dict.fromkeys(ADDS_UP, "delta"), "absolute": "absolute", "raw": "raw"}
-_COARSE = 1e-5  # float32 must resolve a column to this share of its range
 _SMALLEST, _LARGEST = 1e-18, 1e18  # range that a column may span: float32 can hold the squares
 _SLACK = 1.5  # episodes may last this many times the longest demonstration
 
@@ -334,12 +333,10 @@ def _origin(rows: np.ndarray, names: Sequence[str], kind: str, problems: list[st
         return np.zeros(rows.shape[1])
     low, high = known.min(0), known.max(0)
     top, span = np.maximum(np.abs(low), np.abs(high)), np.minimum(high, _LARGEST) - np.maximum(low, -_LARGEST)
-    moves = high > low
-    lost = (top > _LARGEST) | (moves & ((span < _SMALLEST) | (np.spacing(top) > _COARSE * span)))
+    lost = (top > _LARGEST) | ((high > low) & (span < _SMALLEST)) | resolves_coarsely(low, high, np.float64)
     problems += [
         f"{kind} column {names[column]!r} lies in {low[column]:.3g} to {high[column]:.3g}, which"
         f" {'float64' if top[column] > 1 else 'float32'} resolves too coarsely: change its unit, or subtract an offset"
         for column in np.flatnonzero(lost)
     ]
-    kept = np.spacing(np.minimum(top, _LARGEST).astype(np.float32))
-    return np.where((kept > _COARSE * span) & moves & ~lost, low + span / 2, 0.0)
+    return np.where(resolves_coarsely(low, high, np.float32) & ~lost, low + span / 2, 0.0)

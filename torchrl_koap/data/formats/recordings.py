@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 
+_COARSE = 1e-5  # of the range of a column
 FRAMES, STEPS = "[T, d]", "[T, a] or [T - 1, a]"
 
 
@@ -207,6 +208,13 @@ def wrong_rate(value: Any, name: str) -> list[str]:
     if real and 0 < value < math.inf:
         return []
     return [f"{option(name)} must be a positive number of frames per second, got {value!r}"]
+
+
+def resolves_coarsely(low: np.ndarray, high: np.ndarray, dtype: type[np.floating]) -> np.ndarray:
+    """Returns which columns, from ``low`` to ``high`` ``[d]``, a dtype rounds by more than 1e-5 of their range."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounding = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(dtype))
+        return (high > low) & ~(rounding <= _COARSE * (high - low))
 
 
 def one_each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:

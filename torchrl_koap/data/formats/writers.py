@@ -13,11 +13,10 @@ import numpy as np
 
 from torchrl_koap.data.formats.lerobot import ACTION, EPISODE, FRAME, STATE
 from torchrl_koap.data.formats.parquet import import_pyarrow
-from torchrl_koap.data.formats.recordings import Recordings
+from torchrl_koap.data.formats.recordings import Recordings, resolves_coarsely
 from torchrl_koap.files import DataError, option, replacing_file
 
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_COARSE = 1e-5  # of the range of a column
 _CHUNK = 1000  # files per folder
 _INDEX = {  # LeRobot reads tasks by pandas and finds their descriptions in its index
     "index_columns": ["task"],
@@ -58,10 +57,7 @@ def _is_coarse(rows: np.ndarray) -> bool:
     known = rows[np.isfinite(rows).all(-1)]
     if not len(known):
         return False
-    with np.errstate(over="ignore", invalid="ignore"):
-        rounding = np.spacing(np.abs(known).max(0).astype(np.float32))
-    span = np.ptp(known, axis=0)
-    return bool(((span > 0) & ~(rounding <= _COARSE * span)).any())
+    return bool(resolves_coarsely(known.min(0), known.max(0), np.float32).any())
 
 
 class LeRobotWriter:
