@@ -108,6 +108,15 @@ def test_quaternions_of_targets_are_one_target_whose_sign_is_that_of_the_state()
     assert "absolute" not in {each.kind for each in others.values()}
 
 
+def test_the_nearest_quaternion_is_the_target_not_a_goal_where_the_robot_rests():
+    reached = np.linspace(0, 3, 60).clip(0, 1)
+    halves = [0.3 * number + reached for number in range(4)]
+    turns = [np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], 1) for half in halves]
+    states = [np.hstack([turn, turn[-1:].repeat(60, 0)]) for turn in turns]
+    said = warnings(states, [turn[1:] for turn in turns], names=[*"wxyzWXYZ"], acting=[*"abcd"])
+    assert said[0].endswith("again with --action-kind absolute --targets w x y z")
+
+
 @pytest.mark.parametrize("scale", [1, 10], ids=["change", "velocity"])
 def test_changes(scale):
     steps = [scale * step for step in DELTAS]

@@ -156,13 +156,18 @@ def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
     before, after, level = (task.state_of(torch.from_numpy(seen)).numpy() for seen in (before, after, after + origin))
     actions, turns, names = actions + added, [], list(task.state_names)
     for start in quaternion_starts([actions]):
+        turn, near = actions[:, start : start + 4], dict[int, tuple[float, np.ndarray]]()
         for column in quaternion_starts([level]):
-            turn, there = actions[:, start : start + 4], level[:, column : column + 4]
+            there = level[:, column : column + 4]
             products = (turn * there).sum(1)
             other = np.abs((turn * np.roll(there, len(there) // 2, axis=0)).sum(1))  # the product by chance
-            if (1 - np.abs(products)).mean() < NEAR * (1 - other).mean():
-                turns.append((start, column, int((products < 0).sum())))
-                turn *= np.where(products < 0, -1, 1)[:, None]
+            apart = float((1 - np.abs(products)).mean())
+            if apart < NEAR * (1 - other).mean():
+                near[column] = apart, products
+        if near:
+            column = min(near, key=lambda column: near[column][0])  # a goal may be near as well
+            turns.append((start, column, int((near[column][1] < 0).sum())))
+            turn *= np.where(near[column][1] < 0, -1, 1)[:, None]
     return _Labels(actions, level, after - before, names, turns, episodes)
 
 
