@@ -60,6 +60,12 @@ def test_a_sudden_push_is_not_a_wrapped_counter():
     assert "a switch, or" in warning and "where the robot was reset, mark the end of an episode" in warning
 
 
+def test_a_gripper_with_a_noisy_width_is_not_a_wrapped_counter():
+    width = np.where(np.linspace(0, 1, 60) < 0.5, 0.08, 0.02)[:, None] + 1e-4 * np.sin(40 * TIME)
+    (warning,) = seen(width)
+    assert "a switch, or" in warning and "grippers and scans may leap" in warning
+
+
 @pytest.mark.parametrize("axis", [(0.9, 0.43589, 0), (0, 0.6, 0.8)])
 def test_a_rotation_vector_turns_over_at_pi(axis):
     vector = ((3 * TIME + np.pi) % (2 * np.pi) - np.pi) * np.array(axis)

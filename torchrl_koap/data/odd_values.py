@@ -11,7 +11,7 @@ from torchrl_koap.data.formats.resampling import UNUSUAL, leap_bounds, quaternio
 from torchrl_koap.files import some
 
 MARK_DISTANCE, MARK_COUNT = 10.0, 3  # a mark: this many ranges of the other values away, and at least this frequent
-FILLS = 0.1  # a wrapped counter's standard deviation is at least this share of its range
+FILLS = 0.1  # a wrapped counter has at least this share of its values in the middle half of its range
 OTHER = 20.0  # times as far as in most trajectories
 AFAR = 0.1  # warn above this share of unlabelled trajectories that differ from the labelled ones
 LESS = 10.0  # at rest: this many times less motion than with labels, not none, because of sensor noise
@@ -23,7 +23,9 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
     The warnings name a likely cause and a remedy. Sign changes of quaternions are left to :func:`quaternion_warnings`.
     """
     bound, usual = leap_bounds(trajectories)
-    low, high, spread = (end(np.concatenate(trajectories), axis=0) for end in (np.min, np.max, np.std))
+    rows = np.concatenate(trajectories)
+    low, high = rows.min(0), rows.max(0)
+    fills = (np.abs(rows - (low + high) / 2) < (high - low) / 4).mean(0) > FILLS  # not a spike, nor two levels
     found: dict[str, list[str]] = {}
     starts = quaternion_starts(trajectories)
     leaps = [(np.abs(np.diff(frames, axis=0)) > bound) & ~sign_flips(frames, starts) for frames in trajectories]
@@ -41,7 +43,7 @@ def leap_warnings(trajectories: Sequence[np.ndarray], called: Sequence[str], nam
         flipped = (np.abs(after + before) < UNUSUAL * usual) & (np.abs(after - before) > UNUSUAL * usual)
         ends = np.sort(frames[at : at + 2, column]) - [low[column], high[column]]
         reach = (high - low)[column]
-        wraps = bool((np.abs(ends) < 0.05 * reach).all()) and spread[column] > FILLS * reach  # not a spike
+        wraps = bool((np.abs(ends) < 0.05 * reach).all() and fills[column])
         near = UNUSUAL * usual[column]
         start, end = (np.stack([path[step + late] for path, _, step in steps]) for late in (0, 1))
         if _turns_over(start, end, column):
