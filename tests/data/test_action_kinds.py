@@ -218,6 +218,16 @@ def test_raw_actions_that_match_another_kind_are_named():
     assert not warnings(PATHS, TARGETS, action_kind=["delta", "raw"])[1:]
 
 
+def test_torques_follow_the_change_of_a_speed_and_are_no_changes():
+    """With ``delta``, the decoder has no offset, so it cannot hold a joint against gravity."""
+    speeds = [0.1 * path[:, :2] for path in PATHS]
+    states = [np.hstack([speed.cumsum(0) / 10, speed]) for speed in speeds]
+    torques = [
+        6 * np.diff(speed, axis=0) + 0.5 * np.sin(frames[1:, :2]) for speed, frames in zip(speeds, states, strict=True)
+    ]
+    assert not warnings(states, torques, names=["q0", "q1", "v0", "v1"], action_kind="raw")
+
+
 def test_targets_that_are_the_robots_columns_need_not_be_named():
     assert warnings(PATHS, TARGETS, robot=[0, 1])[0].endswith("convert again with --action-kind absolute")
 

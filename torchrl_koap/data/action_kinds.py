@@ -173,11 +173,13 @@ def _labels(data: TensorDictBase, task: Task) -> _Labels | None:
 
 def _likely(labels: _Labels, task: Task) -> dict[str, LikelyKind]:
     found: dict[str, LikelyKind] = {}
-    spread = labels.level.std(0)
+    spread, rates = labels.level.std(0), labels.change * task.control_hz
+    speeds = [np.abs(column[:, None] - rates).mean(0).min() for column in labels.level.T] <= NEAR * spread
     for name, steps in zip(task.actions, labels.actions.T, strict=True):
         if not np.ptp(steps):
             continue
         level, change = (_correlation(steps, columns) for columns in (labels.level, labels.change))
+        change = np.where(speeds, 0.0, change)  # torques change the speed
         distance, *others = (np.abs(steps[:, None] - there).mean(0) for there in _readings(labels, task))
         room = np.where([column == name for column in labels.names], NAMED, NEAR) * spread
         moves = min(map(np.min, others)) <= NEAR * steps.std()
