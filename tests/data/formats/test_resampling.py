@@ -27,6 +27,12 @@ def test_states_are_interpolated(rate):
     assert len(found.actions[0]) == len(found.states[0]) - 1
 
 
+def test_a_clock_in_whole_milliseconds_keeps_the_last_frame():
+    times = [np.round(np.arange(length) / 30, 3) for length in (74, 75, 76)]
+    rows = make_recordings([np.arange(float(len(at)))[:, None] for at in times], action_dim=1)
+    assert [len(frames) for frames in resampled(rows, 30.0, times=times).states] == [74, 75, 76]
+
+
 def test_irregular_frames():
     times = np.sort(np.random.default_rng(0).uniform(0, 2, 80))
     times = times - times[0]

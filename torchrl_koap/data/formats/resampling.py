@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchrl_koap.data.formats.clocks import UNEVEN
+from torchrl_koap.data.formats.clocks import ROUNDED, UNEVEN
 from torchrl_koap.data.formats.recordings import Recordings, one_each, wrong_rate
 from torchrl_koap.files import DataError, option, refuse, some
 from torchrl_koap.lookup import lookup
@@ -90,7 +90,7 @@ def resampled(
         edges = [0, *(breaks + 1), len(at)]
         for part, (start, end) in enumerate(zip(edges, edges[1:], strict=False)):
             called, span = f"{name}[{part}]" if len(breaks) else name, slice(start, end)
-            new = at[start] + np.arange(int((at[end - 1] - at[start]) * control_hz + _SAME) + 1) / control_hz
+            new = at[start] + np.arange(int((at[end - 1] - at[start]) * control_hz + ROUNDED) + 1) / control_hz
             if len(new) < 2:
                 short.append(called)
                 continue
