@@ -155,7 +155,9 @@ def test_all_clocks_are_looked_at():
     found = read(control_hz=None, time=ticks / 20, ros_time=ticks / 4)
     assert found.control_hz == pytest.approx(20) and found.skipped == ("time", "ros_time (it says 4 frames per second)")
     parted = {"stamp.secs": 7 + ticks // 4, "stamp.nsecs": ticks % 4 * 0.25e9}  # ROS: seconds, and nanoseconds beside
-    assert read(control_hz=None, **parted).control_hz == pytest.approx(4)
+    for ordered in (parted, dict(reversed(parted.items()))):
+        found = read(control_hz=None, **ordered)
+        assert found.control_hz == pytest.approx(4) and len(found.states) == 1
 
 
 @pytest.mark.parametrize(

@@ -49,13 +49,18 @@ def clocks_of(columns: Sequence[Mapping[str, np.ndarray]], sources: Sequence[str
     found: dict[str, list[np.ndarray]] = {}
     for name in columns[0]:
         times = [clocks[name] for clocks in columns]
-        whole = (other for other, seconds in found.items() if all((part == part.round()).all() for part in seconds))
-        seconds = next(whole, None)
-        if seconds is not None and all(((part >= 0) & (part < 1)).all() for part in times):  # ROS: s and ns apart
-            found[seconds] = [part + rest for part, rest in zip(found[seconds], times, strict=True)]
-        else:
+        other = next((other for other, held in found.items() if _parted(held, times) or _parted(times, held)), None)
+        if other is None:
             found[name] = times
+        else:
+            found[other] = [part + rest for part, rest in zip(found[other], times, strict=True)]
     return [Clock(name, [part - part[:1] for part in times], sources) for name, times in found.items()]
+
+
+def _parted(seconds: Sequence[np.ndarray], rest: Sequence[np.ndarray]) -> bool:
+    """Checks whether two clocks are whole seconds and the rest of each, as in ROS."""
+    whole = all((part == part.round()).all() for part in seconds)
+    return whole and all(((part >= 0) & (part < 1)).all() for part in rest)
 
 
 def declared_rate(value: Any) -> float | None:
