@@ -259,6 +259,12 @@ def test_columns_that_are_not_described_are_listed(tmp_path):
     assert list(read_lerobot(write(tmp_path, change=added)).skipped)[-2:] == said
 
 
+def test_several_tasks_are_told(tmp_path):
+    info = write(tmp_path) / "meta/info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"total_tasks": 3}))
+    assert read_lerobot(tmp_path).skipped[-1].startswith("task_index (3 tasks become one: name the episodes")
+
+
 def test_flags_inside_an_episode_end_it(tmp_path):
     flagged = {"next.done": pa.array(np.arange(12) % 3 == 2)}
     root = write(tmp_path, change=flagged, features=FEATURES | {"next.done": {"dtype": "bool", "shape": [1]}})

@@ -106,6 +106,8 @@ def read_lerobot(
         absent += [f"{ACTION} (info.json lists it, no file has it)"] if ACTION in known else []
     read = (*chosen, *images, *flags, ACTION, TIME, EPISODE, FRAME, "index", "task_index")
     unread = [name for name in known if name not in read]
+    if isinstance(tasks := info.get("total_tasks"), int) and tasks > 1:
+        unread.append(f"task_index ({tasks} tasks become one: name the {option('episodes')} of one)")
     unread += [f"{name} (info.json does not list it)" for name in undescribed if name not in (*read, *known)]
     return assemble(
         pieces,
