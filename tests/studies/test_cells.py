@@ -92,6 +92,9 @@ DAMAGES = {
     "empty": lambda file: file.write_bytes(b""),
     "a list": lambda file: file.write_text("[1, 2]"),
     "binary": lambda file: file.write_bytes(b"\xff\xfe\x00" * 30),
+    "without a row": lambda file: file.write_text('{"outcomes": []}'),
+    "a number as row": lambda file: file.write_text('{"row": 5, "outcomes": []}'),
+    "a number as outcomes": lambda file: file.write_text('{"row": {}, "outcomes": 7}'),
 }
 
 
@@ -153,6 +156,16 @@ def test_a_cell_of_which_something_else_was_asked_is_refused(root, planner, demo
     prepare_cell(folder, replace(config, run=RunConfig(plugins=("json",))), evaluation)  # plugins may grow
     with pytest.raises(RunDirectoryError, match="was started with another controller.steps"):
         prepare_cell(folder, replace(config, controller=ControllerConfig(steps=7)), evaluation)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"train": {}}', '{"train": 5, "evaluation": null}'])
+def test_a_damaged_request_is_named_and_written_again(content, tmp_path):
+    config, evaluation = planner_config(tmp_path, tmp_path), EvalConfig(episodes=1)
+    (tmp_path / "cell.json").write_text(content)
+    with pytest.raises(RunDirectoryError, match="cell.json"):
+        cells_file.read_asked(tmp_path)
+    prepare_cell(tmp_path, config, evaluation)
+    assert cells_file.read_asked(tmp_path) == (config, evaluation)
 
 
 OFFLINE = [Cell("arm", method, 1.0, 1.0, 0) for method in ("koap", "linear", "dp")]

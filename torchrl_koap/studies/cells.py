@@ -56,18 +56,21 @@ class Cell:
 
 def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | None) -> None:
     """Writes the request of a cell, or of a shared planner, before it begins; refuses a different earlier request."""
-    run = RunDirectory(folder)
-    if (folder / ASKED).exists():
-        changed = changed_options(read_asked(folder)[0], config)
-        if changed := [name for name in changed if name not in _MAY_CHANGE]:
-            raise RunDirectoryError(f"{folder} was started with another {', '.join(changed)}")
+    try:
+        earlier = read_asked(folder)[0]
+    except RunDirectoryError:  # missing or damaged; ``config.json`` also names the options of a run
+        earlier = config
+    if changed := [name for name in changed_options(earlier, config) if name not in _MAY_CHANGE]:
+        raise RunDirectoryError(f"{folder} was started with another {', '.join(changed)}")
     content = {"train": to_json(config), "evaluation": None if evaluation is None else to_json(evaluation)}
-    run.write_json(ASKED, content)
+    RunDirectory(folder).write_json(ASKED, content)
 
 
 def read_asked(folder: Path) -> tuple[TrainConfig, EvalConfig | None]:
     """Reads the request of a cell; a RunDirectoryError names a ``cell.json`` that is missing or damaged."""
     content, path = RunDirectory(folder).read_json(ASKED), folder / ASKED
+    if content.keys() != {"train", "evaluation"}:
+        raise RunDirectoryError(f"{path} is damaged: wanted the entries train and evaluation")
     evaluation = content["evaluation"]
     config = from_json(TrainConfig, content["train"], path)
     return config, None if evaluation is None else from_json(EvalConfig, evaluation, path)
@@ -99,7 +102,11 @@ def read_result(folder: str | Path) -> Result | None:
     if not (Path(folder) / FOUND).exists():
         return None
     content = RunDirectory(folder).read_json(FOUND)
-    return content["row"], {(context, seed): float(value) for context, seed, value in content["outcomes"]}
+    try:
+        outcomes = {(context, seed): float(value) for context, seed, value in content["outcomes"]}
+        return dict(content["row"]), outcomes
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunDirectoryError(f"{Path(folder) / FOUND} is damaged: {type(error).__name__}: {error}") from error
 
 
 def cell_row(root: Path, cell: Cell, *, label_unit: str, reason: str | None = None) -> Result:
