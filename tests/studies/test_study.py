@@ -90,6 +90,14 @@ def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations
     assert named.planners == (f"avoiding={pretrained_folders()['avoiding'].absolute()}",)
 
 
+def test_a_number_to_record_is_refused_where_nothing_is_recorded(demonstrations, tmp_path):
+    given = {"out": tmp_path / "study", "datasets": (f"avoiding={demonstrations}",)}
+    with pytest.raises(ValueError, match="record 24 has no effect: all demonstrations are given with --datasets"):
+        complete(Study(record=24, **given))
+    assert complete(Study(preset="quick", tasks=("avoiding",), **given)).record == 48  # not asked for
+    assert complete(Study(record=24, tasks=("avoiding", "sorting"), **given)).record == 24
+
+
 def test_data_are_needed_where_there_is_no_environment(tmp_path, monkeypatch):
     arm = Task(name="bare_arm", observation_parts={"q": 2}, actions={"dq": Action("rad")}, position="q")
     monkeypatch.setitem(TASKS, "bare_arm", arm)

@@ -240,7 +240,7 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     usual = USUAL | ({} if study.preset is None else lookup(PRESETS, study.preset, "preset"))
     if study.labels or study.levels:  # given ones replace the usual ones of both kinds
         usual |= {"labels": (), "levels": ()}
-    asked, study = study.planner, fill_in(study, usual)
+    record, asked, study = study.record, study.planner, fill_in(study, usual)
     study = replace(
         study,
         out=study.out.absolute(),
@@ -253,6 +253,8 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     study = replace(study, datasets=tuple(datasets), planners=tuple(runs))
     for name in study.tasks:
         study.task(name)  # raises for an unknown task
+    if record is not None and all(map(study.given_dataset, study.tasks)):
+        raise ValueError(f"record {record} has no effect: all demonstrations are given with --datasets")
     trains = any(study.given_planner(task) is None for task in study.tasks)
     if asked != PlannerConfig() and not trains and all(get_method(name).plans for name in study.methods):
         raise ValueError("planner options have no effect: all planners are given with --planners, none is trained")
