@@ -108,7 +108,8 @@ class Study:
         levels: label levels of the paper for every task (1: fewest labels), instead of or with labels.
         first_seed_only: levels that are trained with seed 0 only (default: those of the preset).
         label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
-        demonstrations: shares of the demonstrations that planner and controller use at all (default: 1).
+        demonstrations: shares of the demonstrations that planner and controller each use (default: 1). The controller's
+            include all with labels, the planner's are the same for every draw of labels.
         seeds: number of seeds of label choice and training (default: 3).
         planners: finished run, or pretrained:NAME, whose planner all cells of a task share, or TASK=RUN for each
             (default: one is trained for each seed). It must be trained on the same data; this is not checked.
