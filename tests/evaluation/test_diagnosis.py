@@ -94,15 +94,15 @@ def episode(offset, steps=8):
 
 def test_distance_from_plan_to_execution_by_hand():
     errors = tracking_errors(AVOIDING, [episode(0.3), episode(0.4)], 4)
-    assert list(errors) == ["measured_xy"]
-    assert errors["measured_xy"] == pytest.approx([math.sqrt((0.09 + 0.16) / 2)] * 4)
+    assert list(errors) == ["measured_xy (m)"]
+    assert errors["measured_xy (m)"] == pytest.approx([math.sqrt((0.09 + 0.16) / 2)] * 4)
     assert tracking_errors(AVOIDING, [episode(0.3).exclude("plan")], 4) == {}
     stands = episode(0.3, steps=16)
     stands["plan"][8:] += 9.0
     stands["recorded"] = torch.arange(16)[:, None] < 8  # what comes after the recording's end is not held against it
-    assert tracking_errors(AVOIDING, [stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
+    assert tracking_errors(AVOIDING, [stands], 4)["measured_xy (m)"] == pytest.approx([0.3] * 4)
     brief = episode(9.0, steps=2)  # shorter than the interval between plans: there is nothing to judge
-    assert tracking_errors(AVOIDING, [brief, stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
+    assert tracking_errors(AVOIDING, [brief, stands], 4)["measured_xy (m)"] == pytest.approx([0.3] * 4)
     episodes = [brief, stands, episode(0.4), episode(0.5)]
     assert [left_recordings(AVOIDING, episodes, 4, beyond=limit) for limit in (0.2, 0.35, 0.6)] == [3, 2, 0]
 
@@ -115,7 +115,7 @@ def test_units_of_a_part_are_not_pooled():
     plan = torch.tensor([0.3, 0.4, 2.0, 1.0]).expand(8, 14, 4)
     follows = TensorDict({"observation": steps, "next": {"observation": steps}, "plan": plan}, [8])
     errors = tracking_errors(arm, [follows], 4)
-    wanted = {"tool (m)": 0.5, "tool (rad)": 2.0, "q": 1.0}
+    wanted = {"tool (m)": 0.5, "tool (rad)": 2.0, "q (rad)": 1.0}
     assert errors == {name: pytest.approx([value] * 4) for name, value in wanted.items()}
     assert [left_recordings(arm, [follows], 4, beyond=limit) for limit in (0.4, 0.6)] == [1, 0]
 

@@ -33,7 +33,7 @@ def test_latent_space(outside, panels, said):
 
 def test_experiments():
     result = {name: {"rate": 0.5, "low": 0.2, "high": 0.8, "episodes": 9} for name in EXPERIMENTS}
-    result |= {"plan_to_execution": {"measured_xy": [0.001, 0.002]}, "recording_to_execution": {}}
+    result |= {"plan_to_execution": {"measured_xy (m)": [0.001, 0.002]}, "recording_to_execution": {}}
     left, right = draw_experiments(result, RUN).axes
     assert [bar.get_height() for bar in left.patches] == [50.0] * 3
     assert right.patches[0].get_width() == 0.002

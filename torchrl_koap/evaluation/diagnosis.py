@@ -24,6 +24,7 @@ from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import unit_groups
 
+_WITH_UNITS = ("plain", "plane")  # features that keep the units of their columns
 _MOST_STATES = 4000  # largest number of states whose distances are measured
 RECORDED_FUTURE = "recorded_future"
 RECORDED = "recorded"  # marks steps whose next state is recorded; after the end, its last state is repeated
@@ -126,11 +127,10 @@ def follow_recordings(
 
 
 def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
-    """Measures how far executed states lie from the current plan, per part of the state, in its units.
+    """Measures how far executed states lie from the current plan, per part of the state and unit.
 
-    Returns root mean square distances per step ``1 .. interval`` after a plan; none if rollouts ``[T]`` lack the entry
-    ``plan``. A part whose columns have several units has an entry for each, such as ``"arm (rad)"``. In rollouts that
-    follow a recording, only steps before its end count.
+    Returns root mean square distances per step ``1 .. interval`` after a plan, with names such as ``"arm (rad)"``; none
+    if rollouts ``[T]`` lack the entry ``plan``. In rollouts that follow a recording, only steps before its end count.
     """
     columns_of = _columns_by_unit(task)
     errors: dict[str, list[Tensor]] = {name: [] for name in columns_of}
@@ -149,18 +149,18 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
 
 
 def _columns_by_unit(task: Task) -> dict[str, list[int]]:
-    """Returns the state columns of each part; a part with several units has an entry per unit."""
+    """Returns the state columns of each part with the same unit, by the names of both; features of angles have none."""
     return {
-        f"{name} ({unit or 'no unit'})" if len(units) > 1 else name: [columns.start + place for place in places]
+        f"{name} ({unit or 'no unit'})": [columns.start + place for place in places]
         for name, columns in task.state_slices.items()
-        for units in (unit_groups(task.state_units[columns]),)
-        for unit, places in units.items()
+        for units in (task.known_units[task.observation[name]] if task.state_parts[name] in _WITH_UNITS else ("", ""),)
+        for unit, places in unit_groups(units[: columns.stop - columns.start]).items()
     }
 
 
 def of_position(task: Task, errors: Mapping[str, list[float]]) -> list[float] | None:
-    """Returns the :func:`tracking_errors` of the tool's position; None if the state does not hold it."""
-    return errors.get(task.position, errors.get(f"{task.position} (m)"))
+    """Returns the :func:`tracking_errors` of the tool's position; None if the state does not hold it in m."""
+    return errors.get(f"{task.position} (m)")
 
 
 def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *, beyond: float) -> int:

@@ -110,7 +110,7 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     names = list(result["plan_to_execution"])
     right.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     right.invert_yaxis()
-    right.set_xlabel("root mean square distance after the last step of a plan\n(units of the states)")
+    right.set_xlabel("root mean square distance after the last step of a plan")
     if names:
         put_legend(right, below=0.24)
     tidy(right, "Distance of execution")
