@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, select_state
-from torchrl_koap.data.ted import load_ted, read_about
+from torchrl_koap.data.ted import load_ted, read_about, source_names
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
 
@@ -89,6 +89,15 @@ def test_damage_is_named(damage, message, tmp_path):
     damage(path)
     with pytest.raises(DataError, match=message):
         load_ted(path)
+
+
+@pytest.mark.parametrize("sources", [5, None, "run_0.npz", [1, 2], {"a": 1}])
+def test_damaged_names_of_sources_are_refused(sources, tmp_path):
+    path = save_ted(recorded(), tmp_path / "demos", AVOIDING, notes={"sources": ["a", "b"]})
+    assert source_names(path) == ["a", "b"]
+    change(path, notes={"sources": sources})
+    with pytest.raises(DataError, match="about.json cannot be used: notes.sources must be a list of names"):
+        source_names(path)
 
 
 def test_a_forged_checksum_does_not_let_anything_in(tmp_path):

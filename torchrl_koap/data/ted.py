@@ -118,9 +118,15 @@ def read_about(folder: str | Path) -> dict[str, Any]:
 
 
 def source_names(folder: str | Path) -> list[str]:
-    """Returns the source of each trajectory of a data set, such as its file; an empty list if none is stored."""
+    """Returns the source of each trajectory of a data set, such as its file; an empty list if none is stored.
+
+    Raises a DataError if the notes of the data set hold anything else.
+    """
     stored = stored_folder(folder)
-    return [] if stored is None else read_about(stored)["notes"].get("sources", [])
+    names = [] if stored is None else read_about(stored)["notes"].get("sources", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DataError(stored / _ABOUT, "notes.sources must be a list of names")
+    return names
 
 
 def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:

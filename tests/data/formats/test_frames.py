@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from camera_sets import episode, write_camera_set
 from PIL import Image
 
-from torchrl_koap.data import read_recordings
+from torchrl_koap.data import read_recordings, save_demonstrations
 from torchrl_koap.data.formats.frames import Clip, fault_of
 from torchrl_koap.data.formats.writers import LeRobotWriter
 from torchrl_koap.data.quality import drop_short, trim_still
@@ -266,6 +266,17 @@ def test_videos_need_an_extra(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(RuntimeError, match=r"pip install 'torchrl_koap\[video\]'"):
         next(clip.read())
+
+
+@pytest.mark.parametrize("cameras", [5, {"top": 5}, {"top": [{"file": "a"}]}, {"top": [{"file": "a", "numbers": 1}]}])
+def test_damaged_references_of_a_data_set_are_named(cameras, tmp_path):
+    folder = save_demonstrations(tmp_path / "arm", read_recordings(write_tables(tmp_path / "recordings")))
+    assert list(read_recordings(folder).cameras) == ["top", "wrist"]
+    about = json.loads((folder / "ted" / "about.json").read_text())
+    about["notes"]["cameras"] = cameras
+    (folder / "ted" / "about.json").write_text(json.dumps(about))
+    with pytest.raises(DataError, match="arm/ted cannot be used: the notes in its about.json are damaged: .*cameras"):
+        read_recordings(folder)
 
 
 def test_what_is_missing_is_named(tmp_path):

@@ -20,7 +20,7 @@ from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.robomimic import hdf5_files, read_robomimic
 from torchrl_koap.data.formats.tables import read_tables, table_files
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
-from torchrl_koap.data.ted import load_ted, read_about, source_names, stored_folder
+from torchrl_koap.data.ted import load_ted, source_names, stored_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import DataError, option, read_json
 from torchrl_koap.lookup import lookup
@@ -55,7 +55,7 @@ def _read_stored(source: str) -> Recordings:
         action_names=task.action_names,
         sources=source_names(folder) or np.arange(len(lengths)).astype(str),
         control_hz=task.control_hz,
-        cameras=stored_clips(read_about(folder)["notes"]),
+        cameras=stored_clips(folder),
         source=source,
     )
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ import numpy as np
 
 from torchrl_koap.data.formats.clocks import declared_rate
 from torchrl_koap.data.formats.parquet import import_pyarrow
-from torchrl_koap.files import DataError, read_bytes, some
+from torchrl_koap.data.ted import read_about
+from torchrl_koap.files import DataError, dataclass_from_json, read_bytes, some
 from torchrl_koap.lookup import import_extra
 
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -72,12 +73,19 @@ class Clip:
             yield frame
 
 
-def stored_clips(notes: Mapping[str, Any]) -> dict[str, list[Clip]]:
-    """Reads the references in the notes of a data set, by camera for every trajectory."""
-    return {
-        name: [Clip(**clip | {"numbers": tuple(clip["numbers"])}) for clip in clips]
-        for name, clips in notes.get("cameras", {}).items()
-    }
+@dataclass(frozen=True)
+class _Notes:
+    """What the notes of a data set say about frames."""
+
+    cameras: dict[str, tuple[Clip, ...]] = field(default_factory=dict)
+
+
+def stored_clips(folder: Path) -> dict[str, tuple[Clip, ...]]:
+    """Reads the references in the notes of a data set, by camera for every trajectory; a DataError names a fault."""
+    try:
+        return dataclass_from_json(_Notes, {"cameras": read_about(folder)["notes"].get("cameras", {})}).cameras
+    except ValueError as error:
+        raise DataError(folder, f"the notes in its about.json are damaged: {error}") from error
 
 
 def fault_of(frame: np.ndarray, size: Sequence[int] | None = None) -> str | None:
