@@ -175,7 +175,10 @@ def test_a_method_declares_columns_and_labels_stay_as_asked():
     assert resolved("sorting", "koap_paper").controller.columns == "all"
     assert resolved("sorting").controller.columns == "robot" and resolved("sorting").controller.steps == 500
     closed = ("linear", "linear_steps", "pca", "koap_untrained")
-    assert {resolved(method=method).controller.steps for method in closed} == {0}, "config.json names no updates then"
+    none = "config.json names no updates then"
+    assert {resolved(method=method).controller.steps for method in (*closed, "dp")} == {0}, none
+    asked = ControllerConfig(steps=7)
+    assert {resolved(method=method, controller=asked).controller.steps for method in (*closed, "dp")} == {0}, none
     assert resolved(labels=LabelConfig(count=3)).labels == LabelConfig(count=3)
 
 

@@ -109,8 +109,9 @@ def _controller(asked: ControllerConfig, method: Method, task: Task) -> Controll
         presets += (PLACES, FOLLOWED)
         usual = PLACES if places else FOLLOWED if task.targets else usual
     declared = {"columns": method.columns, "steps": method.updates}
-    if not (method.phases or method.phases_by_preset or method.fit):
-        declared["steps"] = 0  # only a closed form is fitted
+    phases = method.plans and (method.phases or method.phases_by_preset)
+    if not (phases or method.fit or method.teacher):
+        asked = replace(asked, steps=0)  # it has no controller, or only a closed form is fitted
     library = {"preset": usual, "steps": CONTROLLER_UPDATES, "columns": "robot"}
     section = reduce(fill_in, [declared, own, library], asked)
     lookup(PRESETS, section.preset, "preset")
