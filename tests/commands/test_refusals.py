@@ -36,12 +36,16 @@ def test_a_training_that_cannot_be_done_leaves_nothing_behind(options, message, 
 @pytest.mark.parametrize(
     "words", [("train", "--dataset", "DATA", *TINY), ("eval", "RUN"), ("inspect", "RUN"), ("export", "RUN")]
 )
-def test_a_run_is_not_written_into_a_data_set(words, copied_run, demonstrations, tmp_path, capsys):
+def test_a_run_is_not_written_into_data(words, copied_run, demonstrations, tmp_path, capsys):
     arm = save_demonstrations(tmp_path / "arm", [np.eye(20)], control_hz=30, action_dim=2)
-    before, places = contents(arm), {"RUN": copied_run, "DATA": demonstrations}
-    line = fails(capsys, *(places.get(word, word) for word in words), "--out", arm)
-    assert f"{arm / 'ted'} holds a data set, which needs a folder of its own" in line
-    assert contents(arm) == before
+    (raw := tmp_path / "recordings").mkdir()
+    np.savez(raw / "run_0.npz", states=np.eye(20))
+    places = {"RUN": copied_run, "DATA": demonstrations}
+    for folder, named in ((arm, arm / "ted"), (raw, raw)):
+        before = contents(folder)
+        line = fails(capsys, *(places.get(word, word) for word in words), "--out", folder)
+        assert f"{named} holds data, which need a folder of their own; choose another --out" in line
+        assert contents(folder) == before
 
 
 @pytest.mark.parametrize("words", [("convert", "nowhere"), ("embed", "nowhere"), ("demos",)])

@@ -12,6 +12,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.data.formats import find_format
 from torchrl_koap.data.ted import CAMERAS, stored_folder
 from torchrl_koap.files import (
     DataError,
@@ -71,9 +72,12 @@ class RunDirectory:
             raise RunDirectoryError(f"{path} is damaged: {error.problems[0]}") from error
 
     def refuse_data(self) -> None:
-        """Raises a RunDirectoryError if the folder holds a data set."""
-        if (stored := stored_folder(self.path)) is not None:
-            raise RunDirectoryError(f"{stored} holds a data set, which needs a folder of its own; choose another --out")
+        """Raises a RunDirectoryError if the folder holds a data set or, without a run, recordings."""
+        held = stored_folder(self.path)
+        if held is None and not (self.path / "config.json").exists() and find_format(self.path) is not None:
+            held = self.path
+        if held is not None:
+            raise RunDirectoryError(f"{held} holds data, which need a folder of their own; choose another --out")
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``: the values (losses, learning rate, speed) after a step of a phase.
