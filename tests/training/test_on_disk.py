@@ -1,6 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests every method through ``koap train``: no weight depends on hidden labels; killed runs resume exactly."""
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -288,6 +289,21 @@ def test_a_training_leaves_the_caller_its_threads_and_random_numbers(tmp_path, d
     threads, state = torch.get_num_threads(), torch.manual_seed(11).get_state()
     train_tiny(tmp_path / "run", demonstrations, planner, "linear", run=RunConfig(threads=threads + 1))
     assert torch.get_num_threads() == threads and torch.equal(torch.get_rng_state(), state)
+
+
+def test_the_start_of_a_logger_is_no_time_of_training(tmp_path, demonstrations, planner, monkeypatch):
+    clock = Mock(perf_counter=Mock(return_value=0.0))
+
+    @contextlib.contextmanager
+    def start(*names):
+        clock.perf_counter.return_value = 1e4  # s
+        yield None
+
+    monkeypatch.setattr(on_disk, "time", clock)
+    monkeypatch.setattr(on_disk, "open_logger", start)
+    train_tiny(tmp_path / "run", demonstrations, planner, "linear")
+    summary = RunDirectory(tmp_path / "run").read_json("summary.json")
+    assert summary["train_seconds"] == {"planner": 0.0, "controller": 0.0}
 
 
 def test_fitting_has_the_threads_that_its_options_say(monkeypatch):
