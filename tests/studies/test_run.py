@@ -257,6 +257,13 @@ def test_a_damaged_study_json_is_named(curve, demonstrations, capsys):
     assert f"{curve / 'study.json'} is damaged" in fails(capsys, *command_of(curve, demonstrations))
 
 
+def test_a_damaged_table_of_cells_is_written_again(tmp_path):
+    failed = b"run,status,reason\ncells/a,failed,no memory\n"
+    for content, reasons in ((failed, {"cells/a": "no memory"}), (b"\xff\n", {}), (failed + 200_000 * b"x", {})):
+        (tmp_path / "cells.csv").write_bytes(content)
+        assert run_module._failed_before(tmp_path) == reasons
+
+
 def living(session):
     found = []
     for file in Path("/proc").glob("[0-9]*/stat"):

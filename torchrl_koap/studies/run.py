@@ -158,10 +158,11 @@ def _was_begun(folder: Path) -> bool:
 
 def _failed_before(folder: Path) -> dict[str, str]:
     """Returns why cells failed in the last call, by their folder."""
-    if not (folder / "cells.csv").exists():
+    try:
+        with (folder / "cells.csv").open(newline="", encoding="utf-8") as file:
+            return {row.get("run"): row.get("reason") for row in csv.DictReader(file) if row.get("status") == "failed"}
+    except (FileNotFoundError, UnicodeDecodeError, csv.Error):  # it is written again
         return {}
-    with (folder / "cells.csv").open(newline="", encoding="utf-8") as file:
-        return {row.get("run"): row.get("reason") for row in csv.DictReader(file) if row.get("status") == "failed"}
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
