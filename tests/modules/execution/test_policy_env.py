@@ -8,7 +8,7 @@ import torch
 from small_networks import chunk_policy, small_planner
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import ParallelEnv, SerialEnv
+from torchrl.envs import ParallelEnv, RenameTransform, SerialEnv, TransformedEnv
 from toy_gym import reach
 from toy_policies import EpisodesOfRandomLength
 
@@ -143,3 +143,10 @@ def test_the_environment_writes_what_a_policy_of_other_keys_reads():
     )
     start = PolicyEnv(reach(), policy).reset()
     assert start["frames"].shape[-2:] == (5, 4) and "observation_history" not in start.keys()
+
+
+def test_a_nested_done_is_refused_since_resets_would_not_renew_the_history():
+    ends = ["done", "terminated", "truncated"]
+    nested = TransformedEnv(reach(), RenameTransform(in_keys=ends, out_keys=[("arm", end) for end in ends]))
+    with pytest.raises(ValueError, match=r"needs the key 'done', got \[\('arm', 'done'\), .*by a RenameTransform"):
+        PolicyEnv(nested, feedback())

@@ -127,7 +127,7 @@ class PolicyEnv(TransformedEnv):
         observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
 
     Raises:
-        ValueError: if the policy has ``origins``: only an Agent subtracts and adds them.
+        ValueError: if the policy has ``origins``: only an Agent subtracts and adds them; or if ``done`` is nested.
 
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv
@@ -144,6 +144,8 @@ class PolicyEnv(TransformedEnv):
     def __init__(self, env: EnvBase, policy: PlanningPolicy, *, observation_key: NestedKey = OBSERVATION):
         if policy.origins is not None:
             raise ValueError("PolicyEnv does not support policies with origins: use an Agent, which applies them")
+        if "done" not in env.done_keys:  # TorchRL would renew only the entries beside ``done`` at a reset
+            raise ValueError(f"PolicyEnv needs the key 'done', got {env.done_keys}: rename them by a RenameTransform")
         key = policy.planner.noise_key  # None: the planner draws its own noise
         transforms = policy_transforms(policy.history, observation_key=observation_key, history_key=policy.in_keys[0])
         if key is not None:
