@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests latent actions of smoothed windows, the choice of the raw window, and the smoother."""
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -143,6 +145,18 @@ def test_every_preset_is_built_for_wide_states(preset, columns):
     model = make_koopman_inverse_dynamics(columns, 2, preset=preset)
     written = model(TensorDict({"state": torch.randn(1, 17, columns)}, [1]))
     assert written["action"].shape == (1, 17, 2) and written["action"].isfinite().all()
+
+
+@pytest.mark.parametrize("columns", [3, 33])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_single_window_needs_no_batch_dimension(preset, columns):
+    torch.manual_seed(0)
+    model, window = make_koopman_inverse_dynamics(columns, 2, preset=preset), torch.randn(60, columns).cumsum(0)
+    fitted = [copy.deepcopy(model) for _ in range(2)]
+    for each, given in zip(fitted, (window, window[None]), strict=True):
+        each.prepare(given, updates=1)
+        each.finish(given)
+    torch.testing.assert_close(*(each.state_dict() for each in fitted))
 
 
 FRAMES = [-4, -3, -2, -1, 0, 2, 3, 4]

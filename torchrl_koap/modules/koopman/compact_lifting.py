@@ -78,7 +78,7 @@ class NoiseAdjustedComponents(nn.Module):
     @torch.no_grad()
     def fit(self, windows: Tensor) -> None:
         """Fits the components to windows ``[*B, T >= 5, d]`` in the networks' units; no label is read."""
-        windows = windows.flatten(0, -3)
+        windows = windows.reshape(-1, *windows.shape[-2:])
         noise = _credible(noise_covariance(windows[:: -(-len(windows) // MOST_WINDOWS)]))
         states = windows.flatten(0, -2).double()
         states = states - states.mean(0)
@@ -231,8 +231,8 @@ class CompactLifting(TensorDictModuleBase):
         Gradients of the losses do not unfold a folded surface. :func:`isomap` is computed on means of a few successive
         frames, which are less noisy. Windows have 5 frames or more; each network takes at most 1000 updates.
         """
-        updates = min(updates, PRETRAINING_UPDATES)
-        weights, components = self.components.weights, self.components(windows.flatten(0, -3)).detach()
+        updates, windows = min(updates, PRETRAINING_UPDATES), windows.reshape(-1, *windows.shape[-2:])
+        weights, components = self.components.weights, self.components(windows).detach()
         spans = components.unfold(1, AVERAGED, AVERAGED).flatten(0, 1)  # [N, k, AVERAGED]
         chosen = torch.randperm(len(spans), generator=torch.Generator().manual_seed(0))[:MEANS]
         spans = spans[chosen.to(spans.device)]
@@ -258,7 +258,7 @@ class CompactLifting(TensorDictModuleBase):
         """Chooses, after training, one network by the reconstruction errors of both on windows ``[*B, T, d]``."""
         self.kept.fill_(1.0)
         sums = torch.zeros(2, dtype=torch.float64)
-        for part in windows.flatten(0, -3).split(BATCH):
+        for part in windows.reshape(-1, *windows.shape[-2:]).split(BATCH):
             target = self.components(part)
             for index, made in enumerate(self._decoded(self.encode(part))):
                 sums[index] += ((made - target).square() * self.components.weights).sum().double().cpu()

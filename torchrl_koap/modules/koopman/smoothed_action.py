@@ -151,7 +151,7 @@ class LatentActionSmoothed(LatentActionModule):
     @torch.no_grad()
     def finish(self, windows: Tensor) -> None:
         """Fits to windows ``[*B, T, d]`` all that depends on the lifting: spread, smoother and spread of the steps."""
-        windows = windows.flatten(0, -3)
+        windows = windows.reshape(-1, *windows.shape[-2:])
         now = self.reader.valid_frames(windows.shape[-2])[:1]
         self.spread.fill_(1.0)
         lifted = torch.cat([self._lift(part) for part in windows.split(BATCH)])
