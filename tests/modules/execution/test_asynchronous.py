@@ -19,6 +19,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     make_policy,
 )
+from torchrl_koap.modules.execution.agent import FarStateWarning
 
 
 class HeldPlanner(CountingPlanner):
@@ -138,6 +139,14 @@ def test_another_rate_than_that_of_the_data_is_warned_of(recwarn):
     recwarn.clear()
     AsynchronousAgent(policy, control_hz=24).close()
     assert not recwarn.list
+
+
+def test_warnings_of_a_far_state_name_the_line_of_the_caller():
+    policy = make_policy(small_planner(), make_koopman_inverse_dynamics(2, 2), state_of=(0, 1))
+    with AsynchronousAgent(policy, control_hz=30.0) as agent, pytest.warns(FarStateWarning) as told:
+        agent.reset(np.array([99.0, 0.0]))
+        agent.act(np.array([99.0, 99.0]))
+    assert [each.filename for each in told] == [__file__] * 2
 
 
 def test_refusals():

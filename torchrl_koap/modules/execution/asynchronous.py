@@ -7,7 +7,6 @@ import math
 import time
 import warnings
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,6 +86,7 @@ class AsynchronousAgent(Agent):
         self._closed = True
         self._thread.shutdown(wait=True)
 
+    @torch.no_grad()
     def reset(self, observation: object = None) -> None:
         """Begins an episode with the next observation.
 
@@ -97,10 +97,6 @@ class AsynchronousAgent(Agent):
         super().reset()
         if observation is not None:
             self._make_first(self._checked(observation).unsqueeze(-2).expand(-1, self.policy.history, -1))
-
-    def _checked(self, observation: Any) -> Tensor:
-        self._refuse_closed()
-        return super()._checked(observation)
 
     def _refuse_closed(self) -> None:
         if self._closed:
@@ -118,6 +114,7 @@ class AsynchronousAgent(Agent):
 
     @torch.no_grad()
     def _decide(self) -> Tensor:
+        self._refuse_closed()
         frames, policy = self._frames, self.policy
         if self._plan is None:
             self._make_first(frames)
