@@ -10,7 +10,7 @@ import torch
 from small_networks import chunk_policy, small_planner
 
 from torchrl_koap.modules import Execution, make_koopman_inverse_dynamics, make_policy
-from torchrl_koap.modules.execution.export import FACTS, ExportError, export_policy, exportable
+from torchrl_koap.modules.execution.export import FACTS, Exportable, ExportError, export_policy, exportable
 
 needs_onnx = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
@@ -122,6 +122,19 @@ def test_onnx_is_called_as_its_metadata_say(tmp_path):
     np.testing.assert_array_equal(limited, held)
     assert actions.shape == (5, int(facts["steps_per_plan"]), 3) and limited.any() and not limited.all()
     assert np.abs(actions[..., 0]).max() == pytest.approx(usual) and float(facts["control_hz"]) == 30.0
+
+
+class Convolved(torch.nn.Conv1d):
+    def forward(self, observations, noise):
+        return (super().forward(observations) + noise,)
+
+
+@needs_onnx
+def test_a_float64_policy_that_onnx_cannot_run_is_told(tmp_path):
+    example = torch.zeros(1, 2, 3, dtype=torch.float64)
+    what = Exportable(Convolved(2, 2, 1).double(), {"observations": example, "noise": example}, {})
+    with pytest.raises(ExportError, match=r"cannot run this policy; in float64, convert it by .float\(\): .*Conv"):
+        export_policy(what, tmp_path / "policy.onnx", kind="onnx")
 
 
 def test_facts_are_in_the_file_of_torch_export(exported):

@@ -174,7 +174,12 @@ def _read_onnx(what: Exportable, file: Path) -> Callable[..., Outputs]:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
-    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    try:
+        session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    except onnxruntime.capi.onnxruntime_pybind11_state.NotImplemented as error:
+        raise ExportError(
+            f"ONNX Runtime cannot run this policy; in float64, convert it by .float(): {error}"
+        ) from error
     names = list(what.inputs)
 
     def run(*inputs: Tensor) -> Outputs:
