@@ -72,6 +72,7 @@ def test_a_row_says_what_a_cell_found(finished):
     assert row["episodes"] == len(result["episode"]) == len(outcomes) == 1
     assert row["successes"] == sum(outcomes.values())
     assert row["mean_steps"] == result["episode"][0]["steps"]
+    assert row["train_seconds"] == sum(summary["train_seconds"].values())
     assert row["labelled_units"] == row["trajectories_touched"] == 2
     assert row["labelled_transitions"] == summary["labels"]["labelled_transitions"] > 0
     assert row["action_error"] == 1e3 * result["action_errors"]["outside_budget"]["unit"][0][
@@ -140,7 +141,19 @@ def test_a_cell_is_evaluated_on_the_data_where_they_are_now(root, planner, tmp_p
 
 def test_outcomes_are_compared_by_context_and_else_by_seed():
     rows = [{"seed": 100, "outcome": "success", "context": 7}, {"seed": 101, "outcome": "timeout"}]
-    assert cells_file._outcomes_of({"episode": rows}) == [[7, 100, True], [101, 101, False]]
+    rows += [{"seed": 102, "outcome": "collision", "context": 0}]
+    assert cells_file._outcomes_of({"episode": rows}) == [[7, 100, True], [101, 101, False], [0, 102, False]]
+
+
+def test_successes_are_whole_and_the_entropy_is_pooled_where_contexts_have_one_rollout_each():
+    counts = {"selected_units": 1, "labelled_transitions": 9, "trajectories_touched": 1}
+    success = {"rate": 29 / 50, "low": 0.4, "high": 0.7}  # 28.999999999999996 of 50
+    found = {"action_errors_on": None, "rates": {"success": success}, "episodes": 50}
+    found |= {"mode_entropy": None, "pooled_mode_entropy": 0.25}
+    for result, entropy in ((found, 0.25), (found | {"mode_entropy": 0.0}, 0.0)):
+        row = cells_file._found_in({"labels": counts, "controller_updates": 0}, result)
+        assert (row["successes"], row["mode_entropy"]) == (29, entropy)
+        assert [row[f"success_{name}"] for name in success] == [*success.values()]
 
 
 def test_a_trajectory_without_a_relative_error_has_no_outcome():

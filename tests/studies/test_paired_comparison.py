@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from torchrl_koap.studies.paired_comparison import compare, holm, sign_flip_p
+from torchrl_koap.studies.paired_comparison import compare, compare_cells, holm, sign_flip_p
 
 
 def outcomes(rates, seed, *, seeds=3, contexts=60):
@@ -28,6 +28,7 @@ def test_p_value_by_hand():
     ]
     assert sign_flip_p(values) == np.mean([abs(total) >= abs(sum(values)) - 1e-9 for total in sums])
     assert sign_flip_p([1.0] * 40) == pytest.approx(2 / 10_001)  # of so many, signs are drawn
+    assert sign_flip_p([1.0] * 3 + [0.0] * 40) == 2 / 8  # signs of zeros are none
 
 
 def test_identical_outcomes_differ_by_nothing():
@@ -96,6 +97,23 @@ def test_only_shared_pairs_count():
     assert compare({0: {(0, 0): True}}, {1: {(0, 0): True}}) is None
     assert compare({0: {(0, 0): True}}, {0: {(1, 1): True}}) is None
     assert compare({}, {}) is None
+
+
+def test_seeds_that_share_few_contexts_count_only_there():
+    """Contexts that a drawn seed lacks are no ties, and draws without any shared context are left out."""
+    contexts = {0: range(10), 1: (0,), 2: (0,)}
+    first, second = ({s: {(c, 0): good for c in shared} for s, shared in contexts.items()} for good in (1.0, 0.0))
+    result = compare(first, second)
+    assert (result.difference, result.low, result.high, result.n) == (1.0, pytest.approx(0.7), 1.0, 12)
+
+
+@pytest.mark.parametrize(("kind", "interval"), [("offline", (None, None)), (None, (0.0, 1.0))])
+def test_errors_of_cells_are_not_taken_for_successes(kind, interval):
+    """The error of a single trajectory has no interval, the success in a single context has one."""
+    place = {"task": "arm", "labels": 1.0, "demonstrations": 1.0, "label_unit": "trajectory", "seed": 0}
+    rows = [place | {"method": name, "run": name, "status": "done", "kind": kind} for name in ("koap", "linear")]
+    (found,) = compare_cells(rows, {"koap": {(1, 0): 1.0}, "linear": {(1, 0): 0.0}})
+    assert (found["difference"], (found["low"], found["high"])) == (1.0, interval)
 
 
 def test_holm_is_monotone_and_keeps_order():

@@ -78,6 +78,13 @@ def test_cells_stand_at_their_levels_beside_the_papers():
     assert above_the_paper(paper_entries(ROWS)) == (1, 3)
 
 
+def test_a_cell_that_failed_is_said():
+    broken = {"status": "failed"}
+    rows = [cell("sorting", "koap", 0.01, 30), cell("sorting", "koap", 0.01, seed=1) | broken]
+    (row,) = layout_rows(paper_entries([*rows, cell("sorting", "dp", 0.01) | broken]))
+    assert row["koap"] == "50.0 (38-62), 1 failed [61.7 +- 5.6]" and row["dp"] == "failed [0.0 +- 0.0]"
+
+
 def test_an_average_is_over_all_tasks_or_none():
     averages = average_over_tasks(paper_entries(ROWS))
     assert set(averages) == {"koap"}  # dp was not run on Sorting
@@ -87,6 +94,12 @@ def test_an_average_is_over_all_tasks_or_none():
     halves = [(0.9 - 0.79854, 0.95341 - 0.9), (0.55 - 0.46081, 0.63614 - 0.55)]  # of the cells' Wilson intervals
     assert low == pytest.approx(mean - (halves[0][0] ** 2 + halves[1][0] ** 2) ** 0.5 / 2, abs=1e-3)
     assert high == pytest.approx(mean + (halves[0][1] ** 2 + halves[1][1] ** 2) ** 0.5 / 2, abs=1e-3)
+
+
+def test_the_papers_average_is_over_the_same_tasks_or_none():
+    both = [cell(task, "nonlinear", share, 30) for task, share in (("avoiding", 0.02), ("sorting", 0.01))]
+    ((*_, paper),) = average_over_tasks(paper_entries(both))["nonlinear"]
+    assert paper is None and all_paper_cells()["avoiding", "nonlinear", 1].success > 0
 
 
 def test_what_is_written(tmp_path):

@@ -40,7 +40,7 @@ def test_a_file_of_cells_is_written_whole_or_not_at_all(tmp_path):
 
 
 def test_seeds_are_pooled():
-    item = summarise([cell(seed=0, successes=30), cell(seed=1, successes=15), failed(seed=2)])[0]
+    item = summarise([cell(seed=1, successes=15), cell(seed=0, successes=30), failed(seed=2)])[0]
     assert item.episodes == 60
     assert item.measures["success"] == Measure(0.75, *wilson_interval(45, 60))
     assert item.measures["seed_success"] == Measure(0.75, 0.5, 1.0)
@@ -60,8 +60,8 @@ def test_a_terminal_shows_success_or_the_action_error():
         "avoiding, linear, 2 % labels": "action error 2.2 % of the mean action's",
         "avoiding, koap, 10 % labels": "no training done",
     }
-    (name,) = result_rows([cell(demonstrations=0.5)])
-    assert name == "avoiding, koap, 2 % labels, 50 % of the demonstrations"
+    (name,) = result_rows([cell(labels=0.125, demonstrations=0.5)])
+    assert name == "avoiding, koap, 12.5 % labels, 50 % of the demonstrations"
 
 
 def test_nothing_is_pooled_that_differs():
@@ -70,6 +70,13 @@ def test_nothing_is_pooled_that_differs():
     assert len(items) == 10
     assert all(item.episodes == 30 for item in items)
     assert [item.task for item in items] == ["avoiding"] * 5 + ["sorting"] * 5
+
+
+def test_shares_ascend_and_methods_keep_their_order():
+    items = summarise([cell("vae", labels=0.1), cell("vae"), cell("koap", labels=0.1), cell("koap")])
+    assert [(item.labels, item.method) for item in items] == [
+        (share, method) for share in (0.02, 0.1) for method in ("vae", "koap")
+    ]
 
 
 def test_a_method_without_any_done_cell_stays():
