@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from late_files import wait_until
 
+from torchrl_koap.studies import launchers
 from torchrl_koap.studies.launchers import Job, Machines, launch
 
 pytestmark = pytest.mark.usefixtures("job_server")
@@ -155,6 +156,24 @@ def test_ray_that_is_not_installed_names_the_extra(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl_koap\[ray\]'"):
         Machines(launcher="ray")
+
+
+def test_no_more_jobs_run_at_a_time_than_there_are_workers(tmp_path):
+    class Pool:
+        workers, running, most = 2, [], 0
+
+        def start(self, job):
+            self.running.append(job)
+            self.most = max(self.most, len(self.running))
+
+        def finished(self):
+            return [(self.running.pop(), None)]
+
+        def stop(self):
+            pass
+
+    pool, jobs = Pool(), jobs_of(tmp_path, **dict.fromkeys("abcde"))
+    assert {job for job, _ in launchers._schedule(list(jobs), pool)} == set(jobs) and pool.most == 2
 
 
 def test_no_jobs_end_at_once():

@@ -299,7 +299,28 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
         assert (out / cell / name).read_bytes() == (whole_curve / cell / name).read_bytes()
 
 
-def test_fewer_seeds_remove_no_cells(tmp_path):
-    study = run_module.complete(Study(out=tmp_path, seeds=3))
+@pytest.fixture
+def begun(tmp_path):
+    """A study that an earlier call has begun."""
+    study = run_module.complete(Study(out=tmp_path, seeds=3, planners=("pretrained:avoiding",)))
     RunDirectory(tmp_path).write_json("study.json", to_json(replace(study, out=Path())))
-    assert run_module._together(replace(study, seeds=1)) == study
+    return study
+
+
+def test_fewer_seeds_remove_no_cells(begun):
+    assert run_module._together(replace(begun, seeds=1)) == begun
+    assert run_module._together(replace(begun, first_seed_only=(2,))) == begun
+
+
+def test_another_shared_planner_is_another_study(begun):
+    run_module._check_folder(begun)
+    for planners in ((), ("avoiding=/elsewhere",)):
+        with pytest.raises(RunDirectoryError, match="with another planners .avoiding=.*; choose another --out"):
+            run_module._check_folder(replace(begun, planners=planners))
+
+
+def test_a_planner_whose_weights_are_gone_is_trained_again(tmp_path):
+    RunDirectory(tmp_path).write_json("result.json", {"row": {}, "outcomes": []})
+    assert not run_module._is_trained(tmp_path)
+    (tmp_path / "planner.safetensors").touch()
+    assert run_module._is_trained(tmp_path)

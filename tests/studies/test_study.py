@@ -8,7 +8,7 @@ import pytest
 from offline_runs import save_arm
 from tiny_runs import TINY, koap
 
-from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig, RunConfig
+from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, LabelConfig, PlannerConfig, RunConfig
 from torchrl_koap.runs.run_directory import RunDirectoryError, pretrained_folders
 from torchrl_koap.runs.weights import CheckpointError
 from torchrl_koap.studies import Study, run_study
@@ -40,8 +40,9 @@ def test_cells_of_a_seed_share_a_planner_of_that_seed(asked):
         if cell.method == "koap":
             alone = study.planner_config(cell)
             assert (alone.out, alone.planner, alone.labels.fraction) == (shared, planner, None)
-            assert alone.run.seed == cell.seed
+            assert (alone.run.seed, alone.run.threads) == (cell.seed, 1)
         assert (config.labels.fraction, config.run.seed, config.controller.steps) == (0.5, cell.seed, 7)
+        assert config.run.threads == study.eval_config(cell).threads == 1
         expected = planner if cell.method == "dp" else PlannerConfig(source=shared)
         assert config.planner == expected and config.out == study.out / cell.folder
 
@@ -51,6 +52,9 @@ def test_a_planner_per_share_of_the_demonstrations(asked):
     assert {study.planner_folder(cell).name for cell in cells} == {f"{a}-seed{s}" for a in (0.5, 1) for s in range(3)}
     half = study.planner_config(cells[0])
     assert (half.labels.trajectories, half.run.seed) == (0.5, 0)
+    study, cells = asked(methods=("koap",), demonstrations=(0.5,), label_unit="window")
+    wanted = LabelConfig(fraction=0.5, unit="window", trajectories=0.5)
+    assert {study.train_config(cell).labels for cell in cells} == {wanted}
 
 
 def test_every_training_seed_meets_noise_of_its_own(asked):
@@ -86,6 +90,8 @@ def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations
     with pytest.raises(ValueError, match="planner options have no effect"):
         asked(methods=("koap",), planners=("pretrained:avoiding",), planner=wide)
     asked(methods=("koap", "dp"), planners=("pretrained:avoiding",), planner=wide)  # of dp
+    one_of_two = {"tasks": ("avoiding", "sorting"), "datasets": (), "planners": ("avoiding=pretrained:avoiding",)}
+    asked(methods=("koap",), planner=wide, **one_of_two)  # of sorting
     named, _ = asked(methods=("koap",), planners=("pretrained:avoiding",))
     assert named.planners == (f"avoiding={pretrained_folders()['avoiding'].absolute()}",)
 
