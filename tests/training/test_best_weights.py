@@ -58,7 +58,9 @@ def test_the_latest_good_averaged_weights_are_kept_and_training_ends(tmp_path):
     assert (best.best.item(), best.step.item()) == (0.5, 30)
     scores = [float(row["held_out_score"]) for row in run.read_metrics() if row["held_out_score"]]
     assert scores == [0.9, 0.5, 0.52, *[0.53] * 5], "1.5 times 30 updates and four more scores"
-    assert run.last_metrics("planner")["updates"] == 85, "a resumed run reads from here how many there were"
+    last = run.last_metrics("planner")
+    assert last["updates"] == 85, "a resumed run reads from here how many there were"
+    assert (last["kept_update"], last["best_held_out_score"]) == (30, 0.5), "also behind the last score"
     assert load_tensors(tmp_path / "checkpoints" / "planner.safetensors")[1]["step"] == 85
     kept = best.network.state_dict()
     assert all(torch.equal(value, kept[name]) for name, value in curve.seen[2].items())
@@ -96,6 +98,7 @@ def test_a_resumed_training_keeps_the_same_weights_bit_for_bit(tmp_path, stop):
     clock = SimpleNamespace(now=0.0)
     with mock.patch.object(best_weights, "perf_counter", lambda: clock.now):  # every score takes a second
         _, whole, _ = training(tmp_path / "whole", score)
+        assert whole.seconds.item() == clock.now
         with pytest.raises(KeyboardInterrupt):
             training(tmp_path / "cut", score, stop=stop)
         _, cut, _ = training(tmp_path / "cut", score, resume=True)

@@ -36,7 +36,8 @@ def test_where_all_have_labels_some_of_these_are_held_out_and_lose_none():
 
 
 @pytest.mark.parametrize(
-    ("count", "fraction", "number"), [(1, 0.1, 0), (2, 0.1, 1), (2, 0.9, 1), (50, 0.1, 5), (5, 0, 0)]
+    ("count", "fraction", "number"),
+    [(1, 0.1, 0), (2, 0.1, 1), (2, 0.9, 1), (9, 0.1, 1), (10, 0.1, 2), (50, 0.1, 5), (5, 0, 0)],
 )
 def test_one_is_held_out_at_least_and_one_is_left(count, fraction, number):
     assert len(choose_held_out(flat(count), fraction)) == number

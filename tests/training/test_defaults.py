@@ -91,6 +91,8 @@ class TestThePlanner:
         assert resolved(planner=PlannerConfig(network="mlp")).planner.width == 512
         assert resolved("stacking", planner=PlannerConfig(width=64)).planner.width == 64
         assert resolved().planner.width == 32
+        bare = replace(get_task("avoiding"), defaults=replace(get_task("avoiding").defaults, planner={}))
+        assert resolve(TrainConfig(out="run"), bare).planner.steps == 12000
 
     def test_lends_its_network_but_not_its_frames_to_methods_that_sample_actions(self):
         actions, plans = (resolved("sorting", method).planner for method in ("dp", "koap"))
@@ -154,7 +156,7 @@ class TestExecution:
             config = TrainConfig(out="run", method=method, execution=ExecutionConfig(**asked))
             return resolve(config, task).execution.on(Execution())
 
-        assert execution(task) == Execution(temperature=0.4)
+        assert execution(task) == Execution(temperature=0.4) and execution(task, "dp").temperature == 0.4
         assert execution(get_task("aligning")) == Execution(lead=0.1)
         fast = replace(task, control_hz=100)
         assert execution(fast).replan_interval == 10 and execution(fast, replan_interval=3).replan_interval == 3

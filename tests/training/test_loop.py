@@ -12,6 +12,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_koap.modules import MLPDenoiser, StatePlanner, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
+from torchrl_koap.runs.config import PlannerConfig
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 from torchrl_koap.training import loop
@@ -19,6 +20,7 @@ from torchrl_koap.training.checkpoints import load_training_state, save_training
 from torchrl_koap.training.loop import (
     WARMUP,
     DivergedError,
+    Phases,
     moving_average,
     train_phase,
     warmup_cosine,
@@ -71,6 +73,15 @@ def test_first_update_is_that_of_adamw_on_the_sum_of_the_losses():
     assert loss.x.item() == pytest.approx(3 - rate * 0.1 * 3 - rate, abs=1e-6)
     assert values["loss_a"] == 3 and values["loss_b"] == 6 and values["learning_rate"] == pytest.approx(rate)
     assert "diagnostic" not in values and values["iterations_per_second"] > 0
+
+
+def test_a_denoiser_is_trained_at_its_own_rate_with_weight_decay(monkeypatch):
+    """Without a gradient only the decay is left."""
+    monkeypatch.setattr(loop, "moving_average", lambda *_: None)
+    loss = Quadratic()
+    values = Phases().denoise("x", loss, constant(0.0), PlannerConfig(steps=1, learning_rate=0.4))
+    assert values["learning_rate"] == pytest.approx(0.4 / WARMUP)
+    assert 3 - loss.x.item() == pytest.approx(3 * 0.4 / WARMUP * 1e-4)
 
 
 def test_logger_and_progress_hear_of_every_logged_step():
