@@ -3,12 +3,14 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
+import torch
 from tiny_runs import koap
 from torchrl.envs import TransformedEnv
 
-from torchrl_koap.evaluation import EvalConfig, latency
+from torchrl_koap.evaluation import EvalConfig, closed_loop, evaluate, latency
 from torchrl_koap.evaluation.closed_loop import choose_contexts, find_environment
 from torchrl_koap.evaluation.data_errors import AFTER
 from torchrl_koap.evaluation.statistics import rate
@@ -72,6 +74,21 @@ def test_an_animation_that_cannot_be_made_is_skipped(copied_run, monkeypatch):
 def test_rollouts_of_a_context_follow_each_other():
     numbers, places = choose_contexts(get_task("aligning"), EvalConfig(episodes=5, rollouts_per_context=2))
     assert numbers == [0, 0, 1, 1, 2] and (places[0] == places[1]).all() and (places[1] != places[2]).any()
+
+
+def test_rollouts_begin_in_their_contexts_and_have_the_scores_of_their_task(tmp_path, monkeypatch):
+    config = EvalConfig(episodes=4, rollouts_per_context=2, threads=1, batch_size=3, out=tmp_path / "run")
+    found, sizes = find_environment(get_task("stacking"), config), []
+    found = replace(found, max_steps=2, make_env=lambda n, make=found.make_env: sizes.append(n) or make(n))
+    monkeypatch.setattr(closed_loop, "find_environment", lambda *_: found)
+    result = evaluate("pretrained:stacking", config)
+    assert sizes == [3, 1]
+    tensors = load_tensors(tmp_path / "run" / "rollouts.safetensors")[0]
+    assert [row["context"] for row in result["episode"]] == [0, 0, 1, 1] and result["contexts"] == 2
+    assert list(result["rates"]) == ["success", "one box stacked", "two boxes stacked"]
+    assert torch.equal(tensors["context"], torch.from_numpy(found.contexts))
+    began, wanted = tensors["object_position"][:, 0], tensors["context"][..., :2]
+    assert (began - wanted).abs().max() < 0.01 < (wanted[0] - wanted[2]).abs().max()
 
 
 @pytest.mark.parametrize(("name", "noisy"), [("avoiding", False), ("po_sorting", True)])

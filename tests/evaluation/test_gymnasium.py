@@ -137,6 +137,15 @@ def test_an_episode_that_an_error_ended_is_not_in_the_mean_return(arm_run):
     assert found["mean_return"] is None and found["left_out_of_return"] == 1
 
 
+def test_no_more_environments_run_at_a_time_than_asked(arm_run, monkeypatch):
+    def refuse(*_, batch_size, **more):
+        raise RuntimeError(f"{batch_size} at a time")
+
+    monkeypatch.setattr(closed_loop, "roll_out", refuse)
+    with pytest.raises(RuntimeError, match="2 at a time"):
+        evaluate(arm_run, EvalConfig(episodes=3, env="toy_gym:ToyReach-v0", num_envs=2, threads=1))
+
+
 def test_limited_commands_are_those_of_the_rollouts(arm_run, monkeypatch):
     counted = []
     monkeypatch.setattr(closed_loop, "limited_commands", lambda policy: counted.append(policy.limited.tolist()) or {})

@@ -98,12 +98,13 @@ def test_an_environment_that_draws_its_own_starts_is_seeded():
             seen = torch.tensor(self.generator.normal(size=(2, 3))).float()
             return super()._reset(tensordict).set("observation", seen)
 
-    def starts(seeds):
+    def starts(seeds, **options):
         policy = make_policy(wandering_planner(), EchoController(), state_of=(1, 2))
-        episodes = roll_out(policy, lambda num: Drawn(num, [[1]] * num), seeds, max_steps=2)
+        episodes = roll_out(policy, lambda num: Drawn(num, [[1]] * num), seeds, max_steps=2, **options)
         return torch.stack([episode[0]["observation"] for episode in episodes])
 
     assert torch.equal(starts([5, 6]), starts([5, 6])) and not torch.equal(starts([5, 6]), starts([7, 8]))
+    assert torch.equal(starts([5, 6, 7, 8], batch_size=2)[2:], starts([7, 8])), "not as those of the first batch"
 
 
 def test_one_episode_per_environment_even_if_some_end_early():
