@@ -17,7 +17,7 @@ from torchrl_koap.data import save_demonstrations
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
 from torchrl_koap.evaluation.data_errors import summarise_errors
 from torchrl_koap.evaluation.findings import offline_faults
-from torchrl_koap.evaluation.offline import evaluate_actions
+from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.files import DataError
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.config import LabelConfig
@@ -120,6 +120,11 @@ def test_a_single_column_with_labels_outside_the_budget(tmp_path):
     assert "action_errors.png" in page and "None" not in page
 
 
+def other_seed(run):
+    """Returns errors of other plans, or other chunks of actions, sampled by another seed."""
+    return evaluate_offline(Trained.load(run), EvalConfig(threads=1, seed=7))[0]
+
+
 def test_columns_of_several_units_and_a_method_without_a_closed_form(tmp_path):
     arm = save_arm(tmp_path / "mixed", joints=3, units=["m", "rad", "N"])
     run = train_arm(tmp_path / "run", arm, method="dd")
@@ -127,6 +132,7 @@ def test_columns_of_several_units_and_a_method_without_a_closed_form(tmp_path):
     assert [row["unit"] for row in result["plan_errors"]["unit"]] == ["m", "rad", "N"]
     assert "not fitted in closed form" in result["action_errors"]["left_out"]["note"]
     assert result["relative_action_error"] is None
+    assert other_seed(run)["relative_plan_error"] != result["relative_plan_error"]
     write_report(run)
     assert (run / "plots" / "plan_errors.png").exists() and not (run / "plots" / "action_errors.png").exists()
 
@@ -141,6 +147,7 @@ def test_a_policy_of_its_own_is_judged_by_its_first_actions(tmp_path, capsys):
     assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 3
     assert result["labels_read_outside_budget"] >= outside["labels"] == 3 * 26
     assert result["relative_action_error"] == outside["relative"] > 0
+    assert other_seed(run)["relative_action_error"] != outside["relative"]
     assert [row["columns"] for row in outside["unit"]] == [["dq0", "dq1"]]
     assert "trained again without each trajectory" in result["action_errors"]["left_out"]["note"]
     assert (run / "plots" / "action_errors.png").exists()
