@@ -54,6 +54,20 @@ def test_plans_between_recorded_ways_score_worse_than_their_error_says(monkeypat
     assert left < left_error < middle_error < middle
 
 
+def test_standing_still_scores_one_and_the_distance_from_recordings_counts_squared(monkeypatch):
+    paths = [np.random.default_rng(seed).normal(size=(30, 2)).cumsum(0) for seed in range(2)]
+    data, task = make_demonstrations(paths, control_hz=10, action_dim=1)
+    data = select_state(data, range(2))
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
+    score = plan_score(planner, data, cut_windows(data, 16, select=["state"], pad_before=1)["state"], task)
+    monkeypatch.setattr(
+        planner_file, "sample_sequences", lambda _, seen, samples: seen[None, :, -1:].expand(4, -1, 14, -1)
+    )
+    for distance in (1.0, 3.0):
+        monkeypatch.setattr(planner_file, "relative_distance", lambda *_, far=distance: far)
+        assert score(planner) == pytest.approx(distance**2)
+
+
 @pytest.mark.parametrize(("columns", "robot", "share"), [(9, (3, 4), 1 / 3), (5, (0, 1, 2), None), (6, (0, 1), None)])
 def test_the_robot_counts_a_third_of_the_loss_or_more(columns, robot, share):
     paths = [np.random.default_rng(seed).normal(size=(20, columns)).cumsum(0) for seed in range(3)]
@@ -156,6 +170,28 @@ def test_actions_turn_with_the_scene_and_lead_back_with_the_robot():
     moved = augmentation(task, states, actions=True)(windows.clone())
     torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :3].diff(dim=1))
     assert not torch.allclose(moved["action"], windows["action"])
+
+
+def test_scenes_turn_and_like_objects_swap_for_planners():
+    def augmented(task):
+        torch.manual_seed(0)
+        states = torch.rand(1, 16, task.state_dim).expand(50, -1, -1)
+        return states, augmentation(task, states)(TensorDict({"state": states.clone()}, [50]))["state"]
+
+    states, turned = augmented(get_task("aligning"))
+    assert not torch.equal(turned[..., -3:], states[..., -3:])  # of the box
+    task = get_task("sorting")
+    still = replace(task, planar_parts=(), defaults=replace(task.defaults, recovery=0.0))
+    states, swapped = augmented(still)
+    assert torch.allclose(swapped.sort(-1).values, states.sort(-1).values, atol=1e-6)
+    assert not torch.equal(swapped, states)
+
+
+def test_scenes_stay_where_they_are_if_actions_could_not_turn_with_them():
+    task, states = get_task("aligning"), torch.rand(20, 16, get_task("aligning").state_dim)
+    unnamed = replace(task, actions={name: replace(action, column=None) for name, action in task.actions.items()})
+    windows = TensorDict({"state": states.clone(), "action": torch.rand(20, 16, 3)}, [20])
+    assert torch.equal(augmentation(unnamed, states, actions=True)(windows)["state"], states)
 
 
 def test_the_robot_is_shifted_by_its_usual_step_in_any_unit_unless_the_task_says_how_far():
