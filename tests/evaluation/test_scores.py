@@ -119,4 +119,6 @@ def test_bootstrap_interval_covers_the_mean():
     values = [float(value) for value in range(100)]
     low, high = bootstrap_interval(values, lambda units: sum(units) / len(units))
     assert 40 < low < 49.5 < high < 59  # 49.5 +- 1.96 * 28.9 / 10
+    low, high = bootstrap_interval([0.0, 1.0], lambda units: sum(units) / len(units))
+    assert (low, high) == pytest.approx((0.0, 1.0), abs=0.05), "a statistic of 0 is one"
     assert bootstrap_interval([1.0] * 9, lambda units: sum(units) / len(units)) == (1.0, 1.0)

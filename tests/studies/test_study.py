@@ -62,6 +62,8 @@ def test_every_training_seed_meets_noise_of_its_own(asked):
     found = {(cell.method, cell.seed): study.eval_config(cell) for cell in cells}
     assert [found["koap", seed].seed for seed in range(3)] == [EvalConfig.seed, 1100, 2100]
     assert found["koap", 2] == found["dd", 2] and found["dd", 0].episodes == 2
+    study, cells = asked(methods=("koap",), run=RunConfig(plugins=("json",)))
+    assert study.eval_config(cells[0]).plugins == study.train_config(cells[0]).run.plugins == ("json",)
 
 
 def test_koap_paper_is_measured_as_published_unless_told_otherwise(asked):

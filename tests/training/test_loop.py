@@ -78,10 +78,12 @@ def test_first_update_is_that_of_adamw_on_the_sum_of_the_losses():
 def test_a_denoiser_is_trained_at_its_own_rate_with_weight_decay(monkeypatch):
     """Without a gradient only the decay is left."""
     monkeypatch.setattr(loop, "moving_average", lambda *_: None)
-    loss = Quadratic()
-    values = Phases().denoise("x", loss, constant(0.0), PlannerConfig(steps=1, learning_rate=0.4))
+    loss, phases = Quadratic(), Phases()
+    values = phases.denoise("x", loss, constant(0.0), PlannerConfig(steps=1, learning_rate=0.4))
     assert values["learning_rate"] == pytest.approx(0.4 / WARMUP)
     assert 3 - loss.x.item() == pytest.approx(3 * 0.4 / WARMUP * 1e-4)
+    phases("y", loss, constant(), num_steps=3, learning_rate=0.1)
+    assert phases.updates == 4
 
 
 def test_logger_and_progress_hear_of_every_logged_step():
