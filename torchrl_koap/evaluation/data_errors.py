@@ -27,6 +27,7 @@ from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics, StatePlanner
 from torchrl_koap.modules.planning.energy_score import energy_score, relative_score, sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
+from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import shift_actions
 from torchrl_koap.tasks.columns import unit_groups
@@ -40,7 +41,9 @@ BEFORE, AFTER = 8, 11
 _MOST_LABELS = 20_000  # more of them hardly change the errors
 _ENTRIES = (STATE, ACTION, EPISODE)
 _BATCH = 2048  # windows that are decoded at once
-_MOST_FOLDS = 20  # largest number of labelled trajectories that are left out in turn
+_MOST_FOLDS = (
+    10  # each takes as long as fitting the decoder: largest number of labelled trajectories that are left out in turn
+)
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
@@ -187,18 +190,20 @@ def errors_left_out(
     episodes = labelled_episodes(labelled)
     if len(episodes) < 2:
         return {"note": "only one trajectory has labels: none can be left out"}
-    folds = []
-    for number in spread_evenly(episodes, _MOST_FOLDS):
-        fold = labelled.copy()
-        hidden = labelled[EPISODE] == number
-        fold[HAS_ACTION] = labelled[HAS_ACTION] & ~hidden.unsqueeze(-1)
-        fold[ACTION] = torch.where(fold[HAS_ACTION], labelled[ACTION], math.nan)
-        again = copy.deepcopy(controller)
-        with suppress(UnusableLabelsError):  # of the other trajectories
-            fit_closed_form(again, fold, **action_facts(task, columns))
-            predicted, true, episode = first_actions(again, labelled, [int(number)])
-            if len(true):  # otherwise its labels lie too near its end
-                folds.append((_with_baselines(predicted, true, fold, labelled, [int(number)], repeated), true, episode))
+    chosen, folds = spread_evenly(episodes, _MOST_FOLDS).tolist(), []
+    with progress_bar(len(chosen), "leave one out", unit="trajectory") as bar:
+        for number in chosen:
+            fold = labelled.copy()
+            hidden = labelled[EPISODE] == number
+            fold[HAS_ACTION] = labelled[HAS_ACTION] & ~hidden.unsqueeze(-1)
+            fold[ACTION] = torch.where(fold[HAS_ACTION], labelled[ACTION], math.nan)
+            again = copy.deepcopy(controller)
+            with suppress(UnusableLabelsError):  # of the other trajectories
+                fit_closed_form(again, fold, **action_facts(task, columns))
+                predicted, true, episode = first_actions(again, labelled, [number])
+                if len(true):  # otherwise its labels lie too near its end
+                    folds.append((_with_baselines(predicted, true, fold, labelled, [number], repeated), true, episode))
+            bar.update()
     if not folds:
         return {"note": "no labelled step has enough recorded future to decode its action"}
     models, truths, numbers = zip(*folds, strict=True)
