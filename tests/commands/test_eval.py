@@ -69,6 +69,8 @@ def test_an_animation_that_cannot_be_made_is_skipped(copied_run, monkeypatch):
     assert "film.gif was not made" in (copied_run / "index.html").read_text()
     made = {file.name for file in (copied_run / "plots").iterdir()}
     assert {"rollouts.gif", "rollouts.png"} <= made and "film.gif" not in made
+    assert koap("eval", copied_run, "--episodes", 1, "--threads", 1, "--quiet", "--no-report") == 0
+    assert not (copied_run / "index.html").exists()  # it told the numbers of the earlier evaluation
 
 
 def test_rollouts_of_a_context_follow_each_other():

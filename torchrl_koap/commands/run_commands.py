@@ -74,7 +74,7 @@ class Eval(Command):
     Attributes:
         run: run directory of `koap train`, or pretrained:NAME, a trained policy of the repository.
         config: all options of the rollouts.
-        report: draw the pictures and write the report.
+        report: draw the pictures and write the report; without, an earlier report is deleted.
         animate: make an animation of the rollouts for the report.
         logger: where scores go in addition to the run directory: wandb (offline unless WANDB_MODE is set) or
             tensorboard; each needs its extra.
@@ -91,7 +91,11 @@ class Eval(Command):
         check_logger(self.logger)
         result = evaluate(self.run, self.config)
         folder = Path(self.run) if self.config.out is None else self.config.out
-        report = {"report": str(write_report(folder, animation=self.animate))} if self.report else {}
+        report = {}
+        if self.report:
+            report["report"] = str(write_report(folder, animation=self.animate))
+        else:
+            (folder / "index.html").unlink(missing_ok=True)  # it tells the numbers of an earlier evaluation
         with open_logger(self.logger, folder) as logger:
             if logger is not None:
                 rates = {f"{name}_rate": values["rate"] for name, values in result.get("rates", {}).items()}

@@ -41,9 +41,7 @@ BEFORE, AFTER = 8, 11
 _MOST_LABELS = 20_000  # more of them hardly change the errors
 _ENTRIES = (STATE, ACTION, EPISODE)
 _BATCH = 2048  # windows that are decoded at once
-_MOST_FOLDS = (
-    10  # each takes as long as fitting the decoder: largest number of labelled trajectories that are left out in turn
-)
+_MOST_FOLDS = 10  # labelled trajectories that are left out in turn; each takes as long as fitting the decoder
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
