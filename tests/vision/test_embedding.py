@@ -13,7 +13,7 @@ from torchrl_koap.data import make_recordings, open_dataset, read_recordings, sa
 from torchrl_koap.data.ted import load_ted, read_about
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
-from torchrl_koap.vision import Observer, Projection, backbones, load_encoder
+from torchrl_koap.vision import Observer, Projection, backbones, embedding, load_encoder
 from torchrl_koap.vision.embedding import embed_recordings, join_recordings, read_sources
 from torchrl_koap.vision.encoder import load_cameras
 
@@ -50,13 +50,34 @@ def test_embeddings_are_further_columns_that_are_not_the_robot_s(tmp_path):
     frames = np.load(tmp_path / "raw" / "03" / "top.npy")
     wanted = load_encoder(cameras["top"]).embed(torch.from_numpy(frames[:-1]))
     torch.testing.assert_close(data["observation"][data["episode"] == 3][:, 2:7], wanted, rtol=1e-4, atol=1e-5)
+    recordings, _ = read_sources([tmp_path / "raw"], task)
+    again = embed_recordings(recordings, task, tmp_path / "again", network=OWN, components=9)
+    assert [report.components for report in again.values()] == [5, 5]  # of the task
 
 
-def test_pictures_unlike_those_of_other_recordings_are_named(tmp_path):
-    raw = write_filmed(tmp_path / "raw")
+@pytest.mark.parametrize("trajectories", [9, 12])
+def test_pictures_unlike_those_of_other_recordings_are_named_if_there_are_ten(tmp_path, trajectories, recwarn):
+    raw = write_filmed(tmp_path / "raw", ("top",), trajectories)
     np.save(raw / "07" / "top.npy", np.zeros_like(np.load(raw / "07" / "top.npy")))
-    with pytest.warns(UserWarning, match="camera 'top': pictures of 07.npz are unlike those of the others: dark"):
-        embed(save_demonstrations(tmp_path / "own", read_recordings(raw)), tmp_path / "seen", cameras=["top"])
+    embed(save_demonstrations(tmp_path / "own", read_recordings(raw)), tmp_path / "seen")
+    said = [str(each.message) for each in recwarn if "unlike" in str(each.message)]
+    assert len(said) == (trajectories >= 10)
+    assert all("camera 'top': pictures of 07.npz are unlike those of the others: dark" in each for each in said)
+
+
+def test_components_are_fitted_to_nine_trajectories_in_ten_and_judged_on_the_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(embedding, "MOST", 150)  # of 180 frames: every second one
+    recordings, task = read_sources([write_own(tmp_path, cameras=("top",), trajectories=10)], None)
+    given = {"network": OWN, "components": 5}
+    bare = replace(task, robot=(), state=dict.fromkeys(task.observation_parts, "plain"))
+    report = embed_recordings(recordings, bare, tmp_path / "seen", **given)["top"]
+    embedded = load_ted(tmp_path / "seen" / "ted")[1]
+    assert embedded.robot == (0, 1) and embedded.state_dim == 2 + 5
+    fitted = load_cameras(tmp_path / "seen" / "cameras")["top"]
+    clips = [torch.from_numpy(np.load(file)) for file in sorted((tmp_path / "raw").glob("*/top.npy"))]
+    features = [load_encoder(fitted).features(clip) for clip in clips]
+    torch.testing.assert_close(fitted.mean, torch.cat([features[index][index % 2 :: 2] for index in range(9)]).mean(0))
+    assert report.kept == pytest.approx(fitted.kept(features[9]))
 
 
 @pytest.mark.parametrize("offset", [4e6, 1e8])
@@ -144,6 +165,7 @@ def test_a_task_with_embeddings_of_its_own_takes_several_sources(tmp_path):
     ("rate", "names", "fault"),
     [
         (30.0, ["x", "y"], "the source of b cannot be used: it has 30 frames per second, the first 10: convert"),
+        (8.0, ["x", "y"], "the source of b cannot be used: it has 8 frames per second, the first 10: convert"),
         (10.0, ["y", "x"], "the source of b cannot be used: its actions are y, x; those of the first x, y"),
     ],
 )
@@ -155,6 +177,12 @@ def test_sources_of_another_rate_or_with_other_actions_are_refused(rate, names, 
     assert len(join_recordings([first, replace(first, control_hz=11.0)]).states) == 2
     with pytest.raises(DataError, match=fault):
         join_recordings([first, recorded("b", control_hz=rate, action_names=names)])
+
+
+def test_joined_sources_have_the_cameras_of_all(tmp_path):
+    sets = {"both": ("top", "wrist"), "one": ("wrist",)}
+    parts = [read_recordings(write_filmed(tmp_path / name, cameras, 2)) for name, cameras in sets.items()]
+    assert {name: len(clips) for name, clips in join_recordings(parts).cameras.items()} == {"wrist": 4}
 
 
 def embedder_of(size):
@@ -192,8 +220,10 @@ def test_sources_of_other_units_or_kinds_of_actions_are_refused(tmp_path):
 
     first = stored("first", state_units="rad", action_kind="delta")
     assert len(read_sources([first, stored("bare"), stored("same", state_units="rad")], None)[0].states) == 3
+    unknown = stored("unknown", action_kind="raw"), stored("hand")  # without labels, its kind of actions says nothing
+    assert len(read_sources(unknown, None)[0].states) == 2
     with pytest.raises(DataError, match="the unit of column 'state_0' is 'deg', before 'rad'"):
-        read_sources([first, stored("turned", state_units="deg")], None)
+        read_sources([first, stored("between"), stored("turned", state_units="deg")], None)
     with pytest.raises(DataError, match="the kind of action 'action_0' is 'raw', before 'delta'"):
         read_sources([first, stored("kind", action_kind="raw")], None)
 

@@ -34,7 +34,9 @@ def fitted():
 
 
 def test_a_network_of_ones_own_embeds_and_stays_as_it_is():
-    embed = encoder().train()
+    embed = encoder()
+    assert not embed.backbone.training and not embed.backbone.stages.training
+    embed.train()
     data = embed(TensorDict({"pixels": frames()[None]}, [1]))
     assert data["embedding"].shape == (1, 3, FEATURES) and not data["embedding"].requires_grad
     assert not embed.backbone.training and not any(p.requires_grad for p in embed.parameters())
@@ -66,7 +68,9 @@ def test_a_projection_keeps_what_varies_most_and_survives_its_file(tmp_path):
         [9.0, 5, 1, 1, 1, 1, 1, 1]
     )
     projection = Projection.fit(features, 2)
-    assert set(projection.components.abs().argmax(0).tolist()) == {0, 1}
+    largest = projection.components.abs().argmax(0, keepdim=True)
+    assert set(largest.flatten().tolist()) == {0, 1}
+    assert (projection.components.gather(0, largest) > 0).all()  # signs are the same on every machine
     wide = Projection.fit(features[:6], 2)  # fewer frames than features: the same subspace idea, another product
     assert wide(features[:6]).std(0)[0].item() == pytest.approx(1.0, rel=1e-3)
     with pytest.raises(ValueError, match="fitted on 8 features, got 5"):
@@ -76,7 +80,8 @@ def test_a_projection_keeps_what_varies_most_and_survives_its_file(tmp_path):
     with pytest.raises(ValueError, match="all 9 frames look the same"):
         Projection.fit(torch.ones(9, 4), 2)
     spread = features.var(0)
-    assert projection.kept(features) == pytest.approx(float(spread[:2].sum() / spread.sum()), abs=0.01)
+    kept = float(spread[:2].sum() / spread.sum())
+    assert Projection.fit(features + 9.0, 2).kept(features + 9.0) == pytest.approx(kept, abs=0.01)
     embed = encoder(projection=fitted())
     again = load_encoder(embed.projection.save(tmp_path / "own.safetensors"))
     torch.testing.assert_close(again.embed(frames()), embed.embed(frames()), rtol=0, atol=2e-2)
@@ -91,14 +96,21 @@ def test_frames_of_another_size_are_resized_and_said_once():
         assert torch.equal(embed.embed(large), first)
     flat = torch.full((1, 64, 64, 3), 77, dtype=torch.uint8)  # of one colour at any size
     torch.testing.assert_close(embed.embed(flat), embed.embed(flat[:, :32, :32]))
+    dotted = torch.zeros(1, 160, 160, 3, dtype=torch.uint8)
+    dotted[:, 2::5, 2::5] = 255  # dots in the middle of each pixel of the small picture
+    shown = FrozenImageEncoder(backbones.Backbone(torch.nn.Flatten(), "none", "pixels"), size=32)._pooled
+    assert shown(dotted.permute(0, 3, 1, 2) / 255).max() < 0.0  # they are averaged, below the mean brightness
 
 
 def test_large_frames_are_shown_small_and_keep_their_shape():
     shown = []
     network = backbones.Backbone(torch.nn.AvgPool2d(8), "none", "mean")
     network.register_forward_pre_hook(lambda _, given: shown.append(tuple(given[0].shape)))
-    FrozenImageEncoder(network, size=(480, 640)).embed(torch.zeros(1, 480, 640, 3, dtype=torch.uint8))
-    assert shown == [(1, 3, 96, 128)]
+    embed = FrozenImageEncoder(network, size=(480, 640))
+    embed.embed(torch.zeros(1, 480, 640, 3, dtype=torch.uint8))
+    assert shown == [(1, 3, 96, 128)] and embed.identity["size"] == "480x640"
+    with pytest.raises(ValueError, match="size of the frames must be at least 1, got 0"):
+        FrozenImageEncoder(network, size=0)
 
 
 def test_frames_of_another_dtype_or_without_colours_are_refused():
@@ -119,7 +131,11 @@ def test_networks_may_be_modules_files_and_without_maps(tmp_path):
         "import torch\nnetwork = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(2), torch.nn.Flatten())\n"
     )
     backbone = load_backbone(f"{tmp_path}/own.py:network")
-    assert FrozenImageEncoder(backbone, size=32).embed(frames()).shape == (3, 12)
+    own = FrozenImageEncoder(backbone, size=32)
+    assert own.embed(frames()).shape == (3, 12)
+    white = (1 - torch.tensor(backbones.MEAN)) / torch.tensor(backbones.STD)
+    seen = own.embed(torch.full((1, 32, 32, 3), 255, dtype=torch.uint8))
+    torch.testing.assert_close(seen, white.repeat_interleave(4)[None])
     single = FrozenImageEncoder(backbones.Backbone(torch.nn.AvgPool2d(32), "none", "mean"), size=32)
     assert single.embed(frames()).shape == (3, 3) and single.embed(frames()).std(0).min() > 0
     with pytest.raises(ValueError, match=r"must return \[B, C, h, w\] or \[B, F\], got \[1, 3, 1024\]"):
@@ -135,6 +151,15 @@ def test_a_network_s_file_is_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir("/")
     assert backbone.name == f"{tmp_path}/own.py:network"
     assert load_backbone(backbone.name).stages is backbone.stages  # the file is run once
+
+
+def test_a_network_that_moved_is_the_given_file_of_its_name():
+    projection = fitted()
+    projection.about["network"] = "/old/net.py:make"
+    projection.find_network(["/new/task.py"])
+    assert projection.about["network"] == "/old/net.py:make"
+    projection.find_network(["/new/net.py", "/new/task.py"])
+    assert projection.about["network"] == "/new/net.py:make"
 
 
 def test_networks_that_are_missing(monkeypatch):

@@ -68,6 +68,8 @@ def test_a_camera_needs_its_part_of_the_task():
     task = Task(name="arm", observation_parts={"top": 3, "x": 1}, actions={"a": Action("m")}, position="x")
     with pytest.raises(ValueError, match="camera 'wrist' has embeddings of 4 columns, task 'arm' has none"):
         Observer(task, cameras)
+    with pytest.raises(ValueError, match="camera 'top' has embeddings of 4 columns, task 'arm' has 3 for that name"):
+        Observer(task, {"top": cameras["wrist"]})
 
 
 def test_networks_are_loaded_before_the_first_frame(monkeypatch):

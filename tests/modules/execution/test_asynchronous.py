@@ -2,6 +2,7 @@
 """Tests planning in a thread while the previous plan is executed."""
 
 import threading
+import time
 import warnings
 from concurrent.futures import wait
 
@@ -94,6 +95,38 @@ def test_a_slow_plan_is_bound_for_whole_steps_but_never_completely():
     agent.close()
 
 
+@pytest.mark.parametrize("slow", [0, 1])
+def test_the_time_of_the_last_plan_says_how_much_of_the_next_one_is_bound(slow, monkeypatch):
+    agent, sample = make_agent(), HeldPlanner.sample
+    known = agent.policy.planner.known
+
+    def slowly(planner, *given, **options):
+        time.sleep(0.05 * (len(known) == slow))  # 1.5 control steps
+        return sample(planner, *given, **options)
+
+    monkeypatch.setattr(HeldPlanner, "sample", slowly)
+    agent.reset(np.zeros(2))
+    for step in range(5):
+        agent.act(np.array([step, 0.0]))
+        if agent._pending is not None:
+            agent._pending.result(10)
+    assert len(known) == 3 and known[slow + 1].shape[1] >= 2
+    agent.close()
+
+
+def test_a_reset_waits_for_the_plan_of_the_last_episode():
+    agent = make_agent()
+    planner = agent.policy.planner
+    agent.reset(np.zeros(2))
+    planner.let_go.clear()
+    for _ in range(3):
+        agent.act(np.zeros(2))
+    threading.Timer(0.05, planner.let_go.set).start()
+    agent.reset()
+    assert len(planner.known) == 2
+    agent.close()
+
+
 def test_a_plan_that_ends_before_the_next_is_there_is_told_in_every_episode():
     agent = make_agent()
     planner, steps = agent.policy.planner, agent.policy.planner.horizon
@@ -105,6 +138,7 @@ def test_a_plan_that_ends_before_the_next_is_there_is_told_in_every_episode():
             ages = [plan_behind(agent.act(np.zeros(2)))[1] for _ in range(steps)]
             assert not told
             agent.act(np.zeros(2))
+            assert told
             agent.act(np.zeros(2))
         planner.let_go.set()
         assert [each.filename for each in told] == [__file__]

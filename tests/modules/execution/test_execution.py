@@ -36,6 +36,7 @@ def test_missing_values_are_the_defaults():
         ({"lead": -0.1}, "lead must be a number >= 0, got -0.1"),
         ({"lead": float("inf")}, "lead must be a number >= 0"),
         ({"gain": 0.0}, "gain must be a number above 0, got 0.0"),
+        ({"gain": float("inf")}, "gain must be a number above 0, got inf"),
         ({"temperature": -0.1}, r"temperature must be in 0..1, got -0.1"),
         ({"limits": -0.1}, "limits must be a number >= 0, or infinity, got -0.1"),
         ({"temperature": 1.1}, "temperature must be in 0..1"),
