@@ -36,6 +36,11 @@ BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE
             r"wanted bodies with equally many state columns \(parts NAME_...\), got box 3, lid 0",
         ),
         ({"relative_positions": (("tool", "command"),)}, "'command' is no part of the state"),
+        ({"planar_parts": ("tool", "box_tan_yaw")}, "planar_parts: 'box_tan_yaw' is neither a position"),
+        (
+            {"planar_parts": ("box_tan_yaw",), "state": {"tool": "plain", "box_tan_yaw": "tan_yaw"}},
+            "planar_parts: 'box_tan_yaw' is neither a position",
+        ),
         ({"observation_parts": {**TOY["observation_parts"], "more": ("tool_0",)}}, "columns named twice: tool_0"),
         (
             {"scene": Scene(bodies=(BOX, LID), shared_starts=HERE)},

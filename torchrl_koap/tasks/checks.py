@@ -96,6 +96,10 @@ def _column_faults(task: Task) -> Iterator[str]:
     for name in (*(name for group in task.relative_positions for name in group), *task.planar_parts):
         if name not in task.state_parts:
             yield f"relative_positions or planar_parts: {name!r} is no part of the state"
+    for name in task.planar_parts:
+        part = task.state_slices.get(name, slice(0, 2))
+        if task.state_parts.get(name) == "tan_yaw" or part.stop - part.start < 2:
+            yield f"planar_parts: {name!r} is neither a position (x, y) nor a quaternion"
     for group in task.interchangeable:
         widths = {name: len(task.body_columns(name)) for name in group if name in task.objects}
         if 0 in widths.values() or len(set(widths.values())) > 1:
