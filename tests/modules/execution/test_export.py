@@ -10,6 +10,7 @@ import torch
 from small_networks import chunk_policy, small_planner
 
 from torchrl_koap.modules import Execution, make_koopman_inverse_dynamics, make_policy
+from torchrl_koap.modules.execution import export
 from torchrl_koap.modules.execution.export import FACTS, Exportable, ExportError, export_policy, exportable
 
 needs_onnx = pytest.mark.skipif(
@@ -158,6 +159,26 @@ def test_aotinductor(tmp_path):
     what = exportable(policy(), columns=COLUMNS)
     loaded = export_policy(what, tmp_path / "policy.aoti.pt2", kind="aoti")
     assert loaded.get_metadata()["steps_per_plan"] == "4"
+
+
+@pytest.mark.parametrize("off", [2e-5, float("nan")])
+def test_a_file_that_differs_in_one_number_for_several_robots_is_refused(off, tmp_path, monkeypatch):
+    what = exportable(policy(), columns=COLUMNS)
+    assert not torch.equal(*what.batch(2)[0])  # of different robots
+
+    def read(_, file):
+        def run(*inputs):
+            actions, limited = what.module(*inputs)
+            if len(actions) > 1:
+                actions[-1, -1, -1] += off * actions.abs().max()
+            return actions, limited
+
+        return run
+
+    monkeypatch.setitem(export._KINDS, "torch", (lambda *_: None, read))
+    with pytest.raises(ExportError, match=f"differs from the policy by {off:.1e}, at most 1e-05 is allowed"):
+        export_policy(what, tmp_path / "x.pt2")
+    assert export.relative_gap([torch.zeros(2)], [torch.zeros(2)]) == 0.0
 
 
 def test_faults(tmp_path):
