@@ -142,7 +142,7 @@ def test_contexts_that_a_task_never_draws_are_named():
         with pytest.raises(ValueError, match=r"\[C, 2, 3\] .* for box, target\), got shape"):
             check_contexts(task, wrong)
     outside = good.copy()
-    outside[2, 0, 1] = 0.1
+    outside[2, 0, 1] = -0.0999
     with pytest.raises(ValueError, match=r"context 2 puts 'box' at .* outside its region: x 0.4..0.6, y -0.25..-0.1"):
         check_contexts(task, outside)
     missing = good.copy()

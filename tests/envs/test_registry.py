@@ -56,6 +56,13 @@ def test_an_environment_takes_a_variant_of_its_task(make, name):
     assert env.task is task and env.rollout(9)["next", "truncated"].flatten().tolist() == [False, True]
 
 
+def test_the_noise_of_a_task_is_added_on_request():
+    task = replace(get_task("avoiding"), noise=0.003)
+    clean, noisy = (make_env(task, 100, noisy=noisy).reset()["observation"] for noisy in (False, True))
+    assert torch.equal(clean[:, 2:], clean[:, :2]) and torch.equal(noisy[:, :2], clean[:, :2])
+    assert (noisy - clean)[:, 2:].std().item() == pytest.approx(0.003, rel=0.2)
+
+
 def test_seeds_make_contexts_repeatable():
     env = gymnasium.make("torchrl_koap/Sorting2-v0")
     found = [[env.reset(seed=seed)[1]["context"], env.reset()[1]["context"]] for seed in (3, 3, 4)]
