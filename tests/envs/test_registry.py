@@ -45,6 +45,9 @@ def test_layout_of_the_batched_environment(name):
 def test_an_episode_ends_after_the_steps_of_the_task(task):
     assert make_env(task).max_steps == task.max_steps
     assert make_env(task, max_steps=3).max_steps == 3
+    env = ManipulationGymEnv(replace(task, max_steps=1))
+    env.reset(seed=0)
+    assert env.step(np.zeros(2))[2:4] == (False, True)  # truncated, not terminated
 
 
 @pytest.mark.parametrize(

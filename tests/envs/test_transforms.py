@@ -47,9 +47,13 @@ def test_noise_is_independent_unless_seeds_are_given():
     assert not torch.equal(first(zeros.copy())["observation"], second(zeros.copy())["observation"])
     for noise in (first, second):
         noise.seed_episodes([3, 4])
-    assert torch.equal(first(zeros.copy())["observation"], second(zeros.copy())["observation"])
+    both = first(zeros.copy())["observation"]
+    assert torch.equal(both, second(zeros.copy())["observation"])
+    first.seed_episodes([4])  # an episode depends on its own seed alone
+    assert torch.equal(first(zeros[1:].copy())["observation"], both[1:]) and not torch.equal(both[0], both[1])
 
 
-def test_a_negative_sigma_is_refused():
-    with pytest.raises(ValueError, match="sigma must be >= 0, got -1"):
-        EndEffectorNoise("sorting", sigma=-1)
+@pytest.mark.parametrize("sigma", [-1, float("nan")])
+def test_a_negative_sigma_is_refused(sigma):
+    with pytest.raises(ValueError, match=f"sigma must be >= 0, got {sigma}"):
+        EndEffectorNoise("sorting", sigma=sigma)

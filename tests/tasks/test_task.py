@@ -157,8 +157,8 @@ def test_a_leaf_of_another_task_is_refused():
 
 
 def test_a_path_of_avoiding_tells_its_mode():
-    path = np.array([[0.55, -0.1], [0.5, 0.08], [0.6, 0.27]])
-    assert avoiding.mode_of_path(path) == 18 and avoiding.mode_of_path(path[:2]) == -1
+    path = np.array([[0.55, -0.12], [0.45, -0.09], [0.5, 0.08], [0.6, 0.3], [0.3, 0.31]])  # the first frame decides
+    assert avoiding.mode_of_path(path) == 18 and avoiding.mode_of_path(path[:3]) == -1
 
 
 def aligned(distance, degrees):
