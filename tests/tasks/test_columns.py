@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchrl_koap.tasks import TASKS, Columns, get_task
-from torchrl_koap.tasks.columns import double_yaw, yaw_of
+from torchrl_koap.tasks.columns import double_yaw, thousandths, yaw_of
 
 PARTS = {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1}
 TOY = {"name": "toy", "observation_parts": PARTS, "command": "command"}
@@ -45,6 +45,9 @@ def test_columns_have_names_and_units():
     assert columns.observation_names[-1] == "box_tan_yaw"
     assert columns.state_names == ("tool_0", "tool_1", "box_tan_yaw_cos_2yaw", "box_tan_yaw_sin_2yaw")
     assert columns.state_units == ("m", "m", "", "") and columns.state_dim == 4
+    named = Columns(name="arm", observation_parts={"joints": 2, "hand_position": ("x",), "cup_xy": 1, "grip": 1})
+    assert named.known_units == ("rad", "rad", "m", "m", "")
+    assert [thousandths(unit) for unit in ("m", "rad", "")] == [("mm", 1e3), ("mrad", 1e3), ("", 1.0)]
 
 
 def test_wrong_observations_are_named():
@@ -90,3 +93,4 @@ def test_yaw_is_where_the_first_axis_points_from_above():
     quaternion = torch.nn.functional.normalize(torch.randn(50, 4, dtype=torch.float64), dim=-1)
     axis = Rotation.from_quat(quaternion.roll(-1, -1).numpy()).as_matrix()[:, :2, 0]
     torch.testing.assert_close(yaw_of(quaternion), torch.nn.functional.normalize(torch.from_numpy(axis), dim=-1))
+    assert yaw_of(torch.tensor([0.5, -0.5, 0.5, 0.5])).tolist() == [0.0, 0.0]  # it points straight up

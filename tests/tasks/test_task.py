@@ -161,6 +161,11 @@ def test_a_path_of_avoiding_tells_its_mode():
     assert avoiding.mode_of_path(path) == 18 and avoiding.mode_of_path(path[:3]) == -1
 
 
+def test_avoiding_ends_behind_the_line():
+    states = torch.tensor([[0.3, 0.351], [0.4, 0.35], [0.5, 0.3]])
+    assert get_task("avoiding").goal_reached(states).tolist() == [True, False, False]
+
+
 def aligned(distance, degrees):
     state = torch.zeros(11, dtype=torch.float64)
     angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
