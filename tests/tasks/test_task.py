@@ -75,11 +75,18 @@ def test_units_decide_nothing_but_which_errors_are_averaged():
 
 
 def test_columns_of_a_body_are_not_those_of_another_whose_name_begins_alike():
-    parts = {"arm": 2, "cup_xy": 2, "cup_2_xy": 2, "cup_2_spin": 2, "cup_spin": 2}
+    parts = {"arm": 2, "cup_xy": 2, "cup_2_xy": 2, "cup_2_spin": 2, "cup_spin": 2, "cupboard": 1}
     bodies = tuple(Body(name, f"{name}_xy") for name in ("cup", "cup_2"))
     given = TOY | {"observation_parts": parts, "position": "arm", "command": None, "state": {}, "hidden": ()}
     task = Task(**given | {"scene": Scene(bodies=bodies), "interchangeable": (("cup", "cup_2"),)})
     assert task.interchangeable_columns() == [[[2, 3, 8, 9], [4, 5, 6, 7]]]
+
+
+def test_columns_of_a_task_by_their_use():
+    assert get_task("aligning").planar_columns() == ([(0, 1), (3, 4), (7, 8)], [(5, 6), (9, 10)])
+    assert get_task("sorting_2").interchangeable_columns() == []  # one box of each colour
+    assert Task(**TOY).controller_columns("robot") == (0, 1, 2, 3, 4)  # of a task that does not name its robot
+    assert get_task("avoiding").plans_position and not get_task("stacking").plans_position
 
 
 @pytest.mark.parametrize("name", list(TASKS))
