@@ -61,6 +61,8 @@ def test_a_seed_is_that_of_one_episode():
     assert (first != second).any(-1).all()  # the environment's own generator goes on
     env.seed_episodes([4, 9])
     assert torch.equal(env.reset()["observation"], first)
+    env.set_seed(8)
+    assert torch.equal(env.reset()["observation"][1], first[1])  # the second environment has the next seed
 
 
 def test_origins_of_the_data_are_subtracted_from_observations_and_added_to_actions():
@@ -270,6 +272,19 @@ def test_a_wrong_observation_fails_its_episode_and_the_others_go_on(seen, said, 
     assert rollout["observation"].isfinite().all()
 
 
+def test_a_reset_clears_the_outcome_of_the_last_episode(monkeypatch):
+    observe = registered()._observe
+    spoilt = lambda env: env.time == 2 and env.np_random_seed == 11  # noqa: E731
+    monkeypatch.setattr(registered(), "_observe", lambda env: np.zeros(5) if spoilt(env) else observe(env))
+    env = GymnasiumBatch("ToyReach-v0", TASK, 2)
+    for _ in range(2):
+        end = run(env, 6, [10, 11])[:, -1]
+        assert end["success"].flatten().tolist() == [True, False] and end["failed"].flatten().tolist() == [False, True]
+    start = env.reset()
+    assert not any(start[name].any() for name in ("success", "failed", "done", "truncated"))
+    assert [(error["seed"], error["step"]) for error in env.record.errors] == [(11, 2)] * 2
+
+
 def test_a_picture_s_environment_names_the_entry_that_is_wrong():
     env = Seen()
     episode = GymnasiumEpisode(env, 0, max_steps=9)
@@ -298,6 +313,7 @@ def test_rounding_of_float32_is_no_clipping():
     env = GymnasiumEpisode(env, 0, max_steps=9)
     env.reset(seed=0)
     assert float(ACTION[0]) > 0.1 and not env.step(ACTION)[-1]["clipped"].any()
+    assert env.step(1.001 * ACTION)[-1]["clipped"].all()
 
 
 def test_an_error_in_a_step_ends_the_episode():
@@ -311,3 +327,17 @@ def test_an_error_in_a_step_ends_the_episode():
 def test_success_may_be_said_in_words(said, wanted):
     env = GymnasiumEpisode(Reach(), 0, max_steps=9)
     assert env._succeeded({"is_success": said}, 0.0, False) is wanted
+
+
+def test_a_final_reward_means_success_above_twice_any_earlier_one():
+    class Rewards(Reach):
+        def step(self, action):
+            seen, _, _, _, _ = super().step(action)
+            reward = rewards.pop(0)
+            return seen, reward, not rewards, False, {}
+
+    for given, wanted in (([1.0, 0.1, 2.0], False), ([1.0, 0.1, 2.1], True), ([-1.0, 0.0], False), ([0.1], True)):
+        rewards = list(given)
+        assert played(GymnasiumEpisode(Rewards(), 0, max_steps=9), len(given))[-1][-1]["success"] is wanted, given
+    asked = GymnasiumEpisode(Reach(), 0, max_steps=9, success_key="arrived")
+    assert not asked._succeeded({}, 2.0, True)  # a requested key is not replaced by a reward

@@ -12,7 +12,7 @@ import pytest
 import torch
 from toy_task import TOY
 
-from torchrl_koap.tasks import TASKS, Action, Body, Scene, Task, avoiding, get_task, sorting
+from torchrl_koap.tasks import TASKS, Action, Body, Scene, Shape, Task, avoiding, get_task, sorting
 from torchrl_koap.tasks.modes import note_arrivals
 
 
@@ -80,6 +80,16 @@ def test_columns_of_a_body_are_not_those_of_another_whose_name_begins_alike():
     given = TOY | {"observation_parts": parts, "position": "arm", "command": None, "state": {}, "hidden": ()}
     task = Task(**given | {"scene": Scene(bodies=bodies), "interchangeable": (("cup", "cup_2"),)})
     assert task.interchangeable_columns() == [[[2, 3, 8, 9], [4, 5, 6, 7]]]
+
+
+def test_a_region_is_covered_by_its_rectangle():
+    covered = Shape.over(((0.2, 0.4), (-0.1, 0.5)), "region")
+    assert (*covered.center, *covered.half) == pytest.approx((0.3, 0.2, 0.1, 0.3))
+
+
+def test_only_a_task_that_names_no_code_is_stored_with_its_data():
+    assert get_task("avoiding").definition() is None
+    assert Task.from_json(Task(**TOY).definition()) == Task(**TOY)
 
 
 def test_columns_of_a_task_by_their_use():
