@@ -140,7 +140,7 @@ def test_success_one_step_late_and_latched():
 
 
 def test_crossing_while_touching_is_a_success(monkeypatch):
-    env = AvoidingEnv(2, dtype=torch.float64)
+    env = AvoidingEnv(2, max_steps=2, dtype=torch.float64)
     env.reset()
     both, touching = np.array([True, False]), np.array([True, True])
     monkeypatch.setattr(env, "_check", lambda rows: (both[rows], touching[rows]))
@@ -150,6 +150,7 @@ def test_crossing_while_touching_is_a_success(monkeypatch):
         out = act(env, torch.zeros(2))
         assert out["success"][:, 0].tolist() == [True, False]
         assert out["collision"][:, 0].tolist() == [False, True]
+        assert out["terminated"].all() and out["truncated"].all()  # both, in the last step
 
 
 def test_mode_flags_are_set_once():

@@ -2,6 +2,7 @@
 """Tests that simulated actions match later execution and leave the environment unchanged."""
 
 import copy
+import multiprocessing
 import pickle
 import subprocess
 import sys
@@ -69,3 +70,15 @@ def test_copies_and_what_is_unpickled_have_simulations_of_their_own(tmp_path):
     assert all(torch.equal(step["next", "observation"], wanted) for step in steps)
     load = f"import pickle; print(pickle.load(open({str(tmp_path / 'env')!r}, 'rb')).rollout(3).shape)"
     assert "[2, 3]" in subprocess.run([sys.executable, "-c", load], capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are forked on Linux")
+def test_a_forked_environment_has_threads_of_its_own():
+    env = AvoidingEnv(2, num_threads=2)
+    env.rollout(1)
+    forked = multiprocessing.get_context("fork").Process(target=env.rollout, args=(1,))
+    forked.start()
+    forked.join(20)
+    forked.kill()
+    assert forked.exitcode == 0
+    env.close()

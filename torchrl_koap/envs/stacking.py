@@ -78,7 +78,6 @@ class StackingEnv(ManipulationEnv):
     def _begin(self, rows: np.ndarray) -> None:
         self._commands[rows, :7] = self.sims.joint_positions[rows]
         self._commands[rows, 7] = self.sims.gripper_width[rows]
-        self.sims.grasping[rows] = False
 
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
         self._commands[rows, :7] += action[:, :7]

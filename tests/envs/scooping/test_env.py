@@ -115,6 +115,9 @@ def test_targets_that_are_far_away_are_approached_at_a_limited_speed():
     before = env.commands
     env.step(data.set("action", torch.tensor(before + 1.0, dtype=torch.float32)))
     np.testing.assert_allclose(np.abs(env.commands - before).max(), 0.25, atol=1e-6)
+    for _ in range(25):
+        env.step(data.set("action", torch.full((1, 7), 9.0)))
+    np.testing.assert_allclose(env.commands[0], env.action_spec.high[0], atol=1e-6)  # the limits of the joints
     with pytest.raises(ValueError, match="must be finite"):
         env.step(data.set("action", torch.full((1, 7), torch.nan)))
 
