@@ -151,6 +151,8 @@ def test_crossing_while_touching_is_a_success(monkeypatch):
         assert out["success"][:, 0].tolist() == [True, False]
         assert out["collision"][:, 0].tolist() == [False, True]
         assert out["terminated"].all() and out["truncated"].all()  # both, in the last step
+    assert out["reward"].tolist() == [[1.0], [0.0]]
+    assert not act(env, torch.zeros(2), mask=[False, True])["reward"].any()  # of the steps of this call
 
 
 def test_mode_flags_are_set_once():

@@ -4,6 +4,7 @@
 import numpy as np
 from expert_test_base import ExpertTestBase, first_attempts
 
+from torchrl_koap.envs.experts import avoiding
 from torchrl_koap.envs.experts.avoiding import FULL_PUSH, AvoidingExpert, mode_gaps
 
 
@@ -18,6 +19,24 @@ def test_mode_gaps_count_like_the_environment():
 def test_most_first_attempts_take_the_asked_mode():
     found, _ = first_attempts("avoiding", list(range(24)) * 2, None, [(11, index) for index in range(48)])
     assert sum(not attempt.fault for attempt in found) >= 42
+
+
+def test_why_attempts_are_discarded(monkeypatch):
+    ((whole,), _) = first_attempts("avoiding", [1], None, [(11, 1)])
+    ((cut,), _) = first_attempts("avoiding", [1], None, [(11, 1)], max_steps=whole.steps - 1)
+
+    draw = avoiding._draw
+    with monkeypatch.context() as patch:
+        patch.setattr(avoiding, "_draw", lambda mode, generator: draw(1, generator))
+        ((other,), _) = first_attempts("avoiding", [2], None, [(11, 1)])
+
+    def give_up(expert, seen):
+        expert.finished[:] = True
+        return np.zeros((len(seen), 2))
+
+    monkeypatch.setattr(AvoidingExpert, "act", give_up)
+    ((left,), _) = first_attempts("avoiding", [1], None, [(11, 1)])
+    assert [each.fault for each in (whole, cut, other, left)] == ["", "unfinished", "mode", "unfinished"]
 
 
 def test_it_lingers_behind_the_line_and_finishes():

@@ -3,6 +3,7 @@
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -107,6 +108,23 @@ def test_a_step_after_the_success_of_all_changes_nothing(graphics):
     first = env.step(start.clone().set("action", torch.zeros(2, 7)))["next"]
     second = env.step(first.clone().set("action", torch.ones(2, 7)))["next"]
     assert (first == second).all() and first["success"].all() and first["reward"].tolist() == [[1.0], [1.0]]
+
+
+def test_a_piece_must_stay_on_the_spoon_after_it_was_low_over_the_bowl(monkeypatch):
+    sims, carried = ScoopingSimulations("robot", 1), True
+    monkeypatch.setattr(sims, "pieces_on_spoon", lambda row: int(carried))
+
+    def at(*heights):
+        for height in heights:
+            sims._assess(0, SimpleNamespace(site_xpos={sims._site: (*BOWL, height)}, mocap_pos=[(*BOWL, 0.0)]))
+        return bool(sims.rim[0]), bool(sims.success[0])
+
+    assert at(*[0.2] * 9) == (False, False)  # it came from above and was never low
+    assert at(0.08, *[0.095] * 5) == (True, False)
+    carried = False
+    assert at(0.095) == (True, False)  # the piece fell
+    carried = True
+    assert at(*[0.095] * 5) == (True, False) and at(0.095) == (True, True)
 
 
 def test_targets_that_are_far_away_are_approached_at_a_limited_speed():
