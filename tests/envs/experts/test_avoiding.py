@@ -2,6 +2,7 @@
 """Tests the scripted expert of Avoiding: it takes the requested mode and stops behind the finish line."""
 
 import numpy as np
+import pytest
 from expert_test_base import ExpertTestBase, first_attempts
 
 from torchrl_koap.envs.experts import avoiding
@@ -14,6 +15,11 @@ class TestAvoidingExpert(ExpertTestBase):
 
 def test_mode_gaps_count_like_the_environment():
     assert [12 * row1 + 4 * row2 + row3 for row1, row2, row3 in map(mode_gaps, range(24))] == list(range(24))
+
+
+def test_clearance_is_that_of_the_measured_rod():
+    frames = np.array([[0.5, -0.1, 0.5, -0.2], [0.5, -0.1, 0.5, -0.16]])
+    assert AvoidingExpert.clearance(frames) == pytest.approx(0.06 - 0.03 - 0.01)
 
 
 def test_most_first_attempts_take_the_asked_mode():

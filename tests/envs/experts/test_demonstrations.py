@@ -21,7 +21,7 @@ from torchrl_koap.envs.experts.demonstrations import (
     record_demonstrations,
     record_to_folder,
 )
-from torchrl_koap.envs.experts.recording import ar1_noise
+from torchrl_koap.envs.experts.recording import Attempt, ar1_noise
 from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.closed_loop import choose_contexts
 from torchrl_koap.keys import validate
@@ -111,6 +111,8 @@ def test_modes_are_balanced():
     assert np.bincount(balanced_modes(96, 24, 0)).tolist() == [4] * 24
     counts = np.bincount(balanced_modes(29, 24, 1), minlength=24)
     assert counts.sum() == 29 and set(counts) == {1, 2}
+    further = balanced_modes(29, 24, 1)[24:]
+    assert further == sorted(further)
     assert balanced_modes(5, 24, 1) != balanced_modes(5, 24, 2)
 
 
@@ -120,6 +122,23 @@ def test_failed_attempts_are_counted_and_given_up_on(monkeypatch):
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
     with pytest.raises(RecordingError, match=r"episodes \[0, 1\].*'collision': 4"):
         record_demonstrations(episodes=2)
+
+
+def test_attempts_have_other_draws_and_after_four_another_context(monkeypatch):
+    contexts, seeds = [], []
+
+    def fail(env, task, modes, drawn, own, progress, hand):
+        contexts.append(drawn.copy())
+        seeds.extend(own)
+        return [Attempt(np.zeros((2, 20)), np.zeros((1, 3)), 2, "mode")]
+
+    monkeypatch.setattr(demonstrations, "play", fail)
+    monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 6)
+    with pytest.raises(RecordingError, match="'mode': 6"):
+        record_demonstrations("aligning", 1)
+    same = [np.array_equal(contexts[0], each) for each in contexts]
+    assert same == [True] * 4 + [False] * 2 and np.array_equal(contexts[4], contexts[5])
+    assert seeds == [(0, 0, attempt) for attempt in range(6)]
 
 
 @pytest.mark.parametrize(("limit", "value", "reason"), [("least_clearance", 1.0, "close"), ("most_rows", 30, "slow")])

@@ -14,6 +14,7 @@ from torchrl_koap.envs.experts.disturbances import (
     disturbed_columns,
     height_column,
 )
+from torchrl_koap.envs.experts.recording import Attempt
 from torchrl_koap.tasks import get_task
 
 WANTED = np.array([[0.003, 0.01]])
@@ -82,6 +83,34 @@ def test_grippers_are_left_alone():
     assert disturbed_columns(get_task("aligning")).tolist() == [0, 1]
 
 
+def test_an_impulse_follows_the_steps_so_far_when_the_operator_rests():
+    hand, pace = Disturbances(get_task("avoiding"), [(1, 0, 0)], [True]), np.linalg.norm(WANTED)
+    done = [hand.disturb(WANTED * (step == 0))[0] for step in range(300)]
+    impulses = [spell for spell in hand.spells[0] if spell[2] == "impulse" and spell[1] <= 300]
+    assert impulses
+    for begin, end, _ in impulses:
+        for step in range(begin, end):
+            assert 0.69 <= np.linalg.norm(done[step]) / (pace * 0.98**step) <= 1.41
+
+
+def test_joints_slip_by_at_most_half_of_their_step():
+    wanted = np.array([[0.01] * 7 + [0.08]])
+    hand = Disturbances(get_task("stacking"), [(1, 0, 0)], [True])
+    done = np.stack([hand.disturb(wanted)[0] for _ in range(400)])
+    assert (done[:, 7] == 0.08).all()
+    slips = [step for begin, end, kind in hand.spells[0] if kind == "slip" for step in range(begin, min(end, 400))]
+    assert slips
+    for off in np.abs(done[slips, :7] - 0.01):
+        assert 0 < off.max() <= 0.5 * np.linalg.norm(wanted[0, :7])
+
+
+def test_disturbances_are_noted_in_steps_of_the_data():
+    spells = [(0, 3, "slip"), (4, 9, "impulse"), (6, 9, "slip")]
+    of_d3il, other = (Attempt(np.zeros((6, 4)), np.zeros((5, 2)), steps) for steps in (6, 5))
+    assert demonstrations._within(spells, of_d3il) == ((0, 2, "slip"), (3, 5, "impulse"))
+    assert demonstrations._within(spells, other) == ((0, 3, "slip"), (4, 5, "impulse"))
+
+
 @pytest.fixture(scope="module")
 def disturbed():
     return record_demonstrations("avoiding", 6, seed=2, num_threads=1, disturbance=0.5)
@@ -128,6 +157,7 @@ def test_recorded_actions_are_those_that_were_executed(disturbed, monkeypatch):
 
 def test_a_task_brings_its_share_of_disturbed_demonstrations():
     assert get_task("aligning").defaults.disturbance == 0.5 and get_task("avoiding").defaults.disturbance == 0
+    assert demonstrations._share(get_task("aligning"), 0) == 0  # unless another one is asked for
     _, report = record_demonstrations("aligning", 1, seed=2, num_threads=1)
     assert report.notes["disturbance"] == 0.5 and report.each("disturbed") == list(choose_disturbed(1, 0.5, 2))
 
