@@ -82,3 +82,11 @@ def test_a_forked_environment_has_threads_of_its_own():
     forked.kill()
     assert forked.exitcode == 0
     env.close()
+
+
+def test_a_simulation_that_diverges_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
+    env, data = started(AvoidingEnv, "avoiding", 0)
+    env.sims.data[1].qvel[:] = np.nan
+    with pytest.raises(RuntimeError, match="the simulation of environment 1 became unstable"):
+        env.step(data.set("action", torch.zeros(2, 2, dtype=torch.float64)))
