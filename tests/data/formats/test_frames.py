@@ -73,6 +73,13 @@ def test_frames_on_a_clock_of_their_own_are_matched(tmp_path):
     table = dict(np.load(tmp_path / "run_0.npz"))
     np.savez(tmp_path / "run_0.npz", time_ms=1e3 * table.pop("timestamp"), **table)
     np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
+    parted = {"stamp.secs": np.arange(6) // 10, "stamp.nsecs": np.arange(6) % 10 * 1e8}  # as ROS stores it
+    np.savez(tmp_path / "run_0.npz", **parted, **table)
+    np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
+    for odd in (np.where(times > 0.5, np.nan, times), np.r_[times[1], times[0], times[2:]]):
+        np.save(tmp_path / "run_0" / "wrist_times.npy", odd)
+        with pytest.raises(DataError, match="camera 'wrist': its times do not increase, or are missing"):
+            read_recordings(tmp_path)
     np.save(tmp_path / "run_0" / "wrist_times.npy", times[:9])
     with pytest.raises(DataError, match=r"wrist_times.npy needs 18 times and a clock, got times .9."):
         read_recordings(tmp_path)

@@ -44,8 +44,8 @@ class Clock:
         return mean if abs(mean - median) > _SAME * abs(median) else median
 
 
-def clocks_of(columns: Sequence[Mapping[str, np.ndarray]], sources: Sequence[str]) -> list[Clock]:
-    """Returns time stamps, given in seconds by name for every trajectory, from the first frame of each."""
+def time_stamps(columns: Sequence[Mapping[str, np.ndarray]]) -> dict[str, list[np.ndarray]]:
+    """Adds nanoseconds to the seconds beside them, as ROS stores both: columns in seconds by name per trajectory."""
     found: dict[str, list[np.ndarray]] = {}
     for name in columns[0]:
         times = [clocks[name] for clocks in columns]
@@ -54,6 +54,12 @@ def clocks_of(columns: Sequence[Mapping[str, np.ndarray]], sources: Sequence[str
             found[name] = times
         else:
             found[other] = [part + rest for part, rest in zip(found[other], times, strict=True)]
+    return found
+
+
+def clocks_of(columns: Sequence[Mapping[str, np.ndarray]], sources: Sequence[str]) -> list[Clock]:
+    """Returns time stamps, given in seconds by name for every trajectory, from the first frame of each."""
+    found = time_stamps(columns)
     return [Clock(name, [part - part[:1] for part in times], sources) for name, times in found.items()]
 
 

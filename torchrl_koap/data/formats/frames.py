@@ -246,10 +246,12 @@ def _nearest(stamps: np.ndarray, clock: np.ndarray, camera: str) -> np.ndarray:
         if len(clock) == len(stamps):  # too short a recording, left out later
             return np.arange(len(stamps))
         raise ValueError(f"camera {camera!r}: wanted two or more frames for {len(clock)} rows, got {len(stamps)}")
+    if not (np.diff(stamps) >= 0).all():
+        raise ValueError(f"camera {camera!r}: its times do not increase, or are missing")
     after = np.searchsorted(stamps, clock).clip(1, len(stamps) - 1)
     nearest = np.where(clock - stamps[after - 1] <= stamps[after] - clock, after - 1, after)
     off, most = np.abs(stamps[nearest] - clock), LATE * float(np.median(np.diff(stamps)))
-    if off.max() > most:
+    if not off.max() <= most:  # NaN where the row has no time
         row = int(off.argmax())
         raise ValueError(
             f"camera {camera!r}: no frame for row {row} at {clock[row]:.4g} s, the nearest is {off[row]:.3g} s away"

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.clocks import UNEVEN
+from torchrl_koap.data.formats.clocks import UNEVEN, time_stamps
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.frames import TIMES, clips_beside
 from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, named_twice, number_of, numbered
@@ -65,7 +65,8 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     for file in files:
         try:
             piece = _READERS[file.suffix.lower()](file, action_columns)
-            pieces.append(replace(piece, cameras=clips_beside(file, next(iter(piece.clocks.values()), None))))
+            (clock,) = next(iter(time_stamps([piece.clocks]).values()), [None])
+            pieces.append(replace(piece, cameras=clips_beside(file, clock)))
         except (ValueError, OSError) as error:
             faults.append((str(file), str(error)))
     refuse(folder, gathered(faults) or _lacking(pieces, action_columns or ()))
