@@ -60,6 +60,9 @@ def test_all_columns_that_separate_episodes_are_used():
     both = read(session=[0, 0, 0, 0, 1, 1], trial=[0, 0, 1, 1, 0, 0])
     assert [frames[:, 0].tolist() for frames in both.states] == X.reshape(3, 2).tolist()
     assert [len(frames) for frames in read(session=[0, 0, 0, 0, 1, 1], done=[0, 1, 0, 1, 0, 1]).states] == [2, 2, 2]
+    for counter in ([*range(3)] * 2, [5, 3, 4, 2, 0, 1]):  # begins again, or is out of order
+        found = read(frame_index=counter, done=np.isin(counter, [1, 3]))
+        assert [len(frames) for frames in found.states] == ([2, 2] if counter[0] == 0 else [2, 2, 2])
     with pytest.raises(DataError, match="trial 0 of session 0 returns"):
         read(trial=[0, 0, 1, 1, 0, 0], session=[0] * 6)
 

@@ -243,14 +243,15 @@ def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
         return order, _changes(number[order]) | _flagged(piece, order)
     if frame is not None and (np.diff(frame) <= 0).any():
         if len(np.unique(frame)) == len(rows):  # one episode, out of order
-            return np.argsort(frame), rows == 0
+            order = np.argsort(frame)
+            return order, _flagged(piece, order)
         starts = np.r_[True, np.diff(frame) < 0]
         if not (frame[starts] == frame[0]).all() or (np.diff(frame) == 0).any():
             raise ValueError(
                 f"column {counter!r} neither continues nor restarts: add a column 'episode' that says which"
                 " rows belong together"
             )
-        return rows, starts
+        return rows, starts | _flagged(piece, rows)
     starts = _flagged(piece, rows)
     if starts.sum() == 1 < len(rows) and clock is not None and (np.diff(clock) < 0).any():
         again = np.r_[True, np.diff(clock) < 0]
