@@ -230,6 +230,8 @@ def test_resampling_leaves_out_lost_frames_of_recordings_without_actions():
     for rate in ({"declared_hz": 30.0}, {"control_hz": 30.0}):
         same = assemble([whole_untimed, lost_untimed], "data", **options, **rate)
         assert same.sources == found.sources and "6 frames with states that are NaN" in same.skipped
+    empty = replace(lost, actions={"v": np.full(40, np.nan)})  # a column that only holds labels in other files
+    assert assemble([whole, empty], "data", **options).sources == found.sources
     for pieces, more in (([lost] * 7, {}), ([Piece("robot", lost.states, {"v": time})], options)):
         with pytest.raises(DataError, match="states are not finite, first at frame 7 in column 'x': fill") as error:
             assemble(pieces, "data", action_dim=1, **more)

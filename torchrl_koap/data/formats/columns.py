@@ -130,6 +130,7 @@ def assemble(
     refuse(source, problems)
     times = None
     if resample is not None:
+        pieces = [piece if _labelled(piece) else replace(piece, actions=None) for piece in pieces]
         times = [np.arange(piece.frames) / rate for piece in pieces] if counting is None else counting.times
         seen_in = [np.isfinite(_stack(piece.states, observed)).all(1) | bool(piece.actions) for piece in pieces]
         times = [at[rows] for at, rows in zip(times, seen_in, strict=True)]
@@ -149,6 +150,10 @@ def assemble(
         source=source,
     )
     return recordings if resample is None else resampled(recordings, resample, action_kind, times=times)
+
+
+def _labelled(piece: Piece) -> bool:
+    return any(np.isfinite(values).any() for values in (piece.actions or {}).values())
 
 
 def _without(columns: Mapping[str, Any], dropped: Sequence[str]) -> dict[str, Any]:
