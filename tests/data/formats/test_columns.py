@@ -25,6 +25,7 @@ def test_a_flag_ends_an_episode(name, kind):
     found = read(**{name: ENDS.astype(kind)})
     np.testing.assert_array_equal(np.stack(found.states)[..., 0], X.reshape(2, 3))
     assert found.skipped == (name,) and found.sources == ("run[0]", "run[1]")
+    assert [len(frames) for frames in read(**{name: np.array([0, 0, 1, 1, 0, 0]).astype(kind)}).states] == [4, 2]
 
 
 def test_a_counter_splits_and_sorts():
@@ -37,10 +38,15 @@ def test_a_counter_splits_and_sorts():
     rows = np.random.default_rng(1).permutation(30)
     few = read(episode=[0] * 6, x=[0, 1, 2, 3, 5, 4], time=np.array([0, 1, 2, 3, 5, 4]) / 20)
     np.testing.assert_array_equal(few.states[0][:, 0], np.arange(6))
+    told = read(episode=[0] * 6, frame_index=[0, 1, 2, 3, 5, 4], time=np.arange(6) / 20)
+    np.testing.assert_array_equal(told.states[0][:, 0], X[[0, 1, 2, 3, 5, 4]])  # the counter counts
+    uneven = read(episode=[0] * 30, x=rows, time=(rows / 20) ** 2)
+    np.testing.assert_array_equal(uneven.states[0][:, 0], np.arange(30))
     by_time = read(x=rows, time=rows / 20)
     np.testing.assert_array_equal(by_time.states[0][:, 0], np.arange(30))
-    with pytest.raises(DataError, match="neither continues nor restarts"):
-        read(frame_index=[0, 1, 1, 2, 3, 4])
+    for counter in ([0, 1, 1, 2, 3, 4], [0, 1, 2, 1, 2, 3]):
+        with pytest.raises(DataError, match="neither continues nor restarts"):
+            read(frame_index=counter)
 
 
 @pytest.mark.parametrize("back", [1.03, 3600])
@@ -61,8 +67,9 @@ def test_all_columns_that_separate_episodes_are_used():
     assert [frames[:, 0].tolist() for frames in both.states] == X.reshape(3, 2).tolist()
     assert [len(frames) for frames in read(session=[0, 0, 0, 0, 1, 1], done=[0, 1, 0, 1, 0, 1]).states] == [2, 2, 2]
     for counter in ([*range(3)] * 2, [5, 3, 4, 2, 0, 1]):  # begins again, or is out of order
-        found = read(frame_index=counter, done=np.isin(counter, [1, 3]))
-        assert [len(frames) for frames in found.states] == ([2, 2] if counter[0] == 0 else [2, 2, 2])
+        for numbers in ({}, {"episode": [0, 0, 0, 1, 1, 1] if counter[0] == 0 else [0] * 6}):
+            found = read(frame_index=counter, done=np.isin(counter, [1, 3]), **numbers)
+            assert [len(frames) for frames in found.states] == ([2, 2] if counter[0] == 0 else [2, 2, 2])
     with pytest.raises(DataError, match="trial 0 of session 0 returns"):
         read(trial=[0, 0, 1, 1, 0, 0], session=[0] * 6)
 
@@ -85,12 +92,18 @@ def test_columns_are_chosen_by_name():
     pieces = [Piece("run", states, {"v": X, "w": X})]
     found = assemble(pieces, "data", control_hz=5, state_columns=["time", "x"], drop_columns=["w"])
     assert (found.state_names, found.action_names, found.skipped) == (("time", "x"), ("v",), ("y", "w"))
+    found = assemble(pieces, "data", control_hz=5, state_columns=["x", "y"], drop_columns=["y"])
+    assert found.state_names == ("x",)
+    timed = {"time": np.tile(np.arange(3) / 50, 2), "trial": np.arange(6) // 3}
+    found = assemble([Piece("run", states | timed, {"v": X})], "data", state_columns=["x"])
+    assert found.control_hz == pytest.approx(50) and len(found.states) == 2  # by columns that are no state
     with pytest.raises(DataError, match=r"unknown column in drop_columns \(--drop-columns\): 'yy'; did you mean 'y'"):
         assemble(pieces, "data", control_hz=5, drop_columns=["yy"])
 
 
 def test_the_rate_is_read_in_its_unit_and_compared():
     assert read(control_hz=None, time_ms=np.arange(6) * 20.0).control_hz == pytest.approx(50)
+    assert assemble([Piece("run", {"x": X}, {"v": X})], "data", declared_hz=20, control_hz=5).control_hz == 5
     with pytest.raises(DataError, match="gives 50 frames per second, the source declares 20"):
         assemble([Piece("run", {"x": X, "timestamp": np.arange(6) / 50}, {"v": X})], "data", declared_hz=20)
 
@@ -181,12 +194,21 @@ def test_archives_say_where_episodes_end(name, values, tmp_path):
     if len(values) == 2 and values[0]:  # anything may count from 0
         with pytest.raises(DataError, match="'other' may be the episode of each frame"):
             read_recordings(tmp_path)
-        assert read_recordings(tmp_path, drop_columns=["other"]).skipped == ("other",)
+        for options in ({"drop_columns": ["other"]}, {"state_columns": ["state_0"]}):
+            assert read_recordings(tmp_path, **options).skipped == ("other",)
 
 
 def test_a_clock_that_starts_again_and_flags_of_starts():
     for column in ({"time": [0.0, 0.1, 0.2, 0, 0.1, 0.2]}, {"is_first": [1, 0, 0, 1, 0, 0]}):
         assert [len(frames) for frames in read(**column).states] == [3, 3]
+    with pytest.raises(DataError, match="time stamps do not increase"):  # set back, not started again
+        read(control_hz=None, time=[0.0, 0.1, 0.2, 0.3, 0.2, 0.3])
+
+
+def test_several_episodes_need_an_action_for_every_frame():
+    piece = Piece("run", {"x": X, "done": ENDS}, {"v": X[:5]})
+    with pytest.raises(DataError, match="run: it holds 2 episodes and 5 actions for 6 frames: with several episodes"):
+        assemble([piece], "data", control_hz=20)
 
 
 def test_episodes_of_one_frame_are_left_out_and_listed():

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, number_of
+from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, leaves, number_of
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,7 @@ from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, numb
         "length": "lengths episode_length",
         "frame": "timestep stepIndex frame_number",
         "other": "discount cumulative_reward return_to_go next.success __index_level_0__ dt cost success_rate",
-        None: "q restart length return_spring left_arm_time_constant step_height q_s run_speed take_off trial_force",
+        None: "q restart length return_spring left_arm_time_constant step_height q_s run_speed take_off trial_force s min",
     }.items(),
 )
 def test_names_identify_columns_that_are_not_states(kind, names):
@@ -25,7 +25,7 @@ def test_names_identify_columns_that_are_not_states(kind, names):
 
 
 def test_units_of_clocks():
-    assert [kind_of(f"time_{unit}")[1] for unit in ("s", "msec", "us", "ns")] == [1, 1e-3, 1e-6, 1e-9]
+    assert [kind_of(f"time_{unit}")[1] for unit in ("s", "msec", "us", "ns", "min")] == [1, 1e-3, 1e-6, 1e-9, 60]
     assert [kind_of(f"Time ({micro}s)") for micro in "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"] == [("clock", 1e-6)] * 2
 
 
@@ -56,8 +56,14 @@ def test_dates_of_a_clock_are_seconds(zone, recwarn):
 
 
 def test_numbers_of_episodes_that_float64_cannot_tell_apart():
-    for values in (np.array([2**63, 2**63 + 1], np.uint64), np.array([f"{2**63}", f"{2**63 + 1}"])):
-        assert as_numbers("episode", values).tolist() == [0, 1]
+    for first, kind in ((2**63, np.uint64), (-(2**63), np.int64)):
+        for values in (np.array([first, first + 1], kind), np.array([f"{first}", f"{first + 1}"])):
+            assert as_numbers("episode", values).tolist() == [0, 1]
+    assert as_numbers("episode", np.zeros(0, int)).shape == (0,)
+
+
+def test_nested_observations_are_in_the_order_of_their_names():
+    assert [name for name, _ in leaves({"b": 1, "a": {"d": 2, "c": (3, 4)}})] == ["a_c_0", "a_c_1", "a_d", "b"]
 
 
 def test_columns_of_any_type():

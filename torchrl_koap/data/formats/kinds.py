@@ -123,7 +123,7 @@ def as_numbers(name: str, values: np.ndarray) -> np.ndarray | None:
     texts = ["" if value is None else str(value) for value in plain]
     numbers = [number_of(text) for text in texts]
     known = [number for number in numbers if number is not None]
-    if len(known) == len(numbers) and not (kind == "episode" and max(known, default=0) > _EXACT):
+    if len(known) == len(numbers) and not (kind == "episode" and max(map(abs, known), default=0) > _EXACT):
         return np.array(known)
     if kind == "episode":
         order = {text: number for number, text in enumerate(dict.fromkeys(texts))}
