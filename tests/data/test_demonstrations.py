@@ -85,6 +85,8 @@ def test_absolute_actions_are_targets_of_columns():
     assert task.targets == {0: 0, 1: 1}
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="absolute", targets=[1, 0])
     assert task.targets == {0: 1, 1: 0}
+    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="absolute", targets=[3, 1], command=[0])
+    assert task.targets == {0: 2, 1: 0}  # of the state, which lacks the command
 
 
 def test_every_action_may_be_of_its_own_kind():
@@ -140,6 +142,7 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
     [
         ({"control_hz": None}, "control_hz .* is missing"),
         ({"command": ["q3"]}, "unknown column in command .*: 'q3'; did you mean 'q2'"),
+        ({"command": [-1]}, r"command .*: there is no column -1, only 0..3"),
         ({"command": [9]}, r"command .*: there is no column 9, only 0..3"),
         ({"command": [0, 2]}, "command columns must be adjacent, got q1, cup_x"),
         ({"command": [0, 1, 2, 3]}, "every column is a command"),
@@ -158,6 +161,7 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
         ({"robot": [True, False]}, r"robot \(--robot\) takes columns by name or number, got True"),
         ({"robot": []}, r"used: robot \(--robot\) names no column$"),
         ({"max_steps": 0}, r"max_steps \(--max-steps\) must be a positive whole number, got 0"),
+        ({"max_steps": 9.5}, r"max_steps \(--max-steps\) must be a positive whole number, got 9.5"),
         ({"state_names": ["time", *NAMES[1:]]}, "state column 'time' is a clock, a counter or a flag by its name"),
     ],
 )
@@ -188,15 +192,15 @@ def test_a_robot_that_stands_where_there_are_labels():
 @pytest.mark.parametrize("offset", [4e6, 1e8])
 def test_an_offset_is_subtracted_in_float64_and_stored(offset, tmp_path):
     far = [frames + [offset, 0, 0, -offset] for frames in STATES]
-    targets = [far[0][1:, [0, 3]], None, None]
-    absolute = {"control_hz": 20, "action_kind": "absolute", "targets": [0, 3]}
+    targets = [far[0][1:, [3, 0]], None, None]
+    absolute = {"control_hz": 20, "action_kind": "absolute", "targets": [3, 0]}
     data, task = make_demonstrations(far, targets, **absolute)
     moved = [frames - task.observation_origin for frames in far]
     near, _ = make_demonstrations(moved, control_hz=20, action_dim=2)
     torch.testing.assert_close(data["observation"], near["observation"], atol=0, rtol=0)
     assert np.abs(np.array(task.observation_origin) - [offset, 0, 0, -offset]).max() < 20
-    assert task.origins[1] == (task.observation_origin[0], task.observation_origin[3])
-    torch.testing.assert_close(data["action"][:29], data["next", "observation"][:29, [0, 3]])
+    assert task.origins[1] == (task.observation_origin[3], task.observation_origin[0])
+    torch.testing.assert_close(data["action"][:29], data["next", "observation"][:29, [3, 0]])
     assert Task.from_json(task.to_json()) == task
     again = read_recordings(save_demonstrations(tmp_path / "far", far, targets, **absolute))
     np.testing.assert_allclose(again.states[0], far[0], rtol=0, atol=1e-5)

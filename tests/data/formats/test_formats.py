@@ -27,6 +27,8 @@ def recordings():
 def test_a_folder_of_tables(tmp_path):
     np.savez(tmp_path / "a.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)))
     assert read_recordings(tmp_path, control_hz=10).num_labels == 4
+    with pytest.raises(DataError, match="control_hz .* must be a positive number of frames per second, got 0"):
+        read_recordings(tmp_path, control_hz=0)
     with pytest.raises(ValueError, match="observations .*: not an option for a table, or a folder of "):
         read_recordings(tmp_path, control_hz=10, observations=["x"])
 

@@ -71,12 +71,11 @@ def test_frames_on_a_clock_of_their_own_are_matched(tmp_path):
     np.save(tmp_path / "run_0" / "wrist_times.npy", times)
     np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
     table = dict(np.load(tmp_path / "run_0.npz"))
-    np.savez(tmp_path / "run_0.npz", time_ms=1e3 * table.pop("timestamp"), **table)
-    np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
-    parted = {"stamp.secs": np.arange(6) // 10, "stamp.nsecs": np.arange(6) % 10 * 1e8}  # as ROS stores it
-    np.savez(tmp_path / "run_0.npz", **parted, **table)
-    np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
-    for odd in (np.where(times > 0.5, np.nan, times), np.r_[times[1], times[0], times[2:]]):
+    time = table.pop("timestamp")
+    for clock in ({"time_ms": 1e3 * time}, {"stamp.secs": time // 1, "stamp.nsecs": time % 1 * 1e9}):  # as ROS
+        np.savez(tmp_path / "run_0.npz", **clock, **table)
+        np.testing.assert_array_equal(read(read_recordings(tmp_path), "wrist"), frames[::3])
+    for odd in (np.where(times > 0.5, np.nan, times), times[[1, 0, *range(2, 18)]]):
         np.save(tmp_path / "run_0" / "wrist_times.npy", odd)
         with pytest.raises(DataError, match="camera 'wrist': its times do not increase, or are missing"):
             read_recordings(tmp_path)
@@ -98,6 +97,27 @@ def test_a_camera_with_fewer_than_two_times_is_refused_unless_its_recording_is_a
     np.save(tmp_path / "run_0" / "wrist_times.npy", np.zeros(count))
     with pytest.raises(DataError, match=f"camera 'wrist': wanted two or more frames for 6 rows, got {count}"):
         read_recordings(tmp_path)
+
+
+def test_pictures_may_count_from_any_number(tmp_path):
+    folder = write_tables(tmp_path, lengths=(6,), clock=True) / "run_0" / "top"
+    for index in range(6):
+        (folder / f"{index:06d}.png").rename(folder / f"take_{index + 7}.png")
+    assert read_recordings(tmp_path).cameras["top"][0].numbers == tuple(range(7, 13))
+    (folder / "take_9.png").unlink()
+    np.save(tmp_path / "run_0" / "top_times.npy", [0.0, 0.1, 0.32, 0.4, 0.5])
+    assert read_recordings(tmp_path).cameras["top"][0].numbers == (7, 8, 8, 10, 11, 12)
+
+
+def test_pictures_of_a_palette_are_colours_and_all_have_one_size(tmp_path):
+    colour = np.full((4, 4, 3), (250, 0, 0), np.uint8)
+    Image.fromarray(colour).convert("P", palette=Image.Palette.ADAPTIVE).save(tmp_path / "0.png")
+    np.testing.assert_array_equal([*Clip(str(tmp_path), (0,)).read()], [colour])
+    cases = [(film(1)[0], "is 8 x 10, the camera's others are 4 x 4"), (colour[0], "has shape")]
+    for number, (other, said) in enumerate(cases, 1):
+        Image.fromarray(other).save(tmp_path / f"{number}.png")
+        with pytest.raises(ValueError, match=f"frame {number} {said}"):
+            list(Clip(str(tmp_path), (0, number)).read())
 
 
 def test_cameras_are_cut_together_with_states(tmp_path):
@@ -152,8 +172,8 @@ def test_frames_that_an_hdf5_file_no_longer_holds_are_missing(tmp_path, entry):
     np.testing.assert_array_equal(list(clip.take(range(4)).read()), film(4))
     with h5py.File(tmp_path / "a.hdf5", "a") as file:
         file["data/demo_0/next_obs/top"] = film(5)[1:]
-    missing = "frame 5 is missing: .*a.hdf5 has 5" if "/obs/" in entry else "frame 4 is missing: .*a.hdf5 has 4"
-    with pytest.raises(ValueError, match=missing):
+    held = 5 if "/obs/" in entry else 4
+    with pytest.raises(ValueError, match=f"frame {held} is missing: .*a.hdf5 has {held}"):
         list(Clip(clip.file, tuple(range(6)), entry).read())
 
 
@@ -293,16 +313,14 @@ def test_what_is_missing_is_named(tmp_path):
         read_recordings(tmp_path)
     (tmp_path / "run_1" / "top" / "000003.png").unlink()
     (tmp_path / "run_1" / "top" / "000004.png").unlink()
-    with pytest.raises(
-        DataError,
-        match=r"run_1.npz: camera 'top' has 2 frames .*give .* top_times.npy .*drop the camera with .* top",
-    ):
+    said = r"run_1.npz: camera 'top' has 2 frames .*give .* top_times.npy .*drop the camera with .* top"
+    with pytest.raises(DataError, match=said):
         read_recordings(tmp_path)
     (tmp_path / "run_1" / "wrist.npy").unlink()
     with pytest.raises(DataError, match="camera 'wrist' has no frames in run_1.npz"):
         read_recordings(tmp_path, drop_columns=["top"])
     with pytest.raises(DataError, match="must end in a unique number"):
-        (tmp_path / "run_1" / "top" / "final.png").write_bytes(b"")
+        (tmp_path / "run_1" / "top" / "other_0.png").write_bytes(b"")
         read_recordings(tmp_path)
 
 

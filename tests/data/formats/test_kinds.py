@@ -17,7 +17,7 @@ from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, leav
         "length": "lengths episode_length",
         "frame": "timestep stepIndex frame_number",
         "other": "discount cumulative_reward return_to_go next.success __index_level_0__ dt cost success_rate",
-        None: "q restart length return_spring left_arm_time_constant step_height q_s run_speed take_off trial_force s min",
+        None: "q s restart length return_spring left_arm_time_constant step_height q_s run_speed take_off trial_force",
     }.items(),
 )
 def test_names_identify_columns_that_are_not_states(kind, names):

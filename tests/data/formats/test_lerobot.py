@@ -77,7 +77,22 @@ def test_names_in_several_groups(tmp_path):
     assert read_lerobot(write(tmp_path, features=features)).state_names[:7] == (*arms["left"], *arms["right"])
 
 
-@pytest.mark.parametrize("given", [{"x": None}, {name: None if name == JOINTS[3] else 1 for name in JOINTS}])
+def test_names_with_the_numbers_of_their_columns(tmp_path):
+    numbers = {joint: number for number, joint in reversed([*enumerate(JOINTS)])}
+    features = FEATURES | {"observation.state": {**FEATURES["observation.state"], "names": numbers}}
+    assert read_lerobot(write(tmp_path, features=features)).state_names[:7] == tuple(JOINTS)
+
+
+def test_rows_in_any_order_are_sorted(tmp_path):
+    wanted, root = read_lerobot(write(tmp_path / "a")), write(tmp_path / "b")
+    file = root / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(file).take(np.random.default_rng(0).permutation(12)), file)
+    np.testing.assert_array_equal(read_lerobot(root).states, wanted.states)
+
+
+@pytest.mark.parametrize(
+    "given", [{"x": None}, [*JOINTS, "more"], {name: None if name == JOINTS[3] else 1 for name in JOINTS}]
+)
 def test_names_without_numbers_are_not_used(given, tmp_path):
     features = FEATURES | {"observation.state": {**FEATURES["observation.state"], "names": given}}
     assert read_lerobot(write(tmp_path, features=features)).state_names[:2] == ("state_0", "state_1")
@@ -121,13 +136,15 @@ def test_an_episode_whose_file_has_no_actions(tmp_path):
 @VERSIONS
 def test_pictures_inside_the_tables_are_referred_to(version, tmp_path):
     features = FEATURES | {"observation.images.wrist": {"dtype": "image", "shape": [4, 4, 3], "names": None}}
-    picture = io.BytesIO()
-    Image.new("RGB", (4, 4)).save(picture, "png")
-    pictures = pa.array([{"bytes": picture.getvalue(), "path": None}] * 12)
+    pictures = [io.BytesIO() for _ in range(12)]
+    for row, picture in enumerate(pictures):
+        Image.new("RGB", (4, 4), (row, 0, 0)).save(picture, "png")
+    pictures = pa.array([{"bytes": picture.getvalue(), "path": None} for picture in pictures])
     root = write(tmp_path, features=features, change={"observation.images.wrist": pictures}, version=version)
     recordings = read_lerobot(root)
     assert recordings.skipped == ("observation.images.front (its videos are not here)",)
-    assert [len(clip) for clip in recordings.cameras["wrist"]] == [len(frames) for frames in recordings.states]
+    seen = [[frame[0, 0, 0] for frame in clip.read()] for clip in recordings.cameras["wrist"]]
+    assert seen == [[*range(6)], [*range(6, 12)]]
     assert recordings.state_names == (*JOINTS, "force")
 
 
@@ -295,7 +312,7 @@ def test_invalid_descriptions(tmp_path):
     for change, message in (
         ({"features": shaped}, "info.json cannot be used: 'shape' of action must be a list of numbers"),
         ({"video_path": "{camera}/{file_index}.mp4"}, "info.json: 'video_path' has an unknown part: 'camera'"),
-        ({"fps": float("inf")}, "info.json holds no fps: pass control_hz"),
+        *(({"fps": fps}, "info.json holds no fps: pass control_hz") for fps in (float("inf"), 0)),
     ):
         described = {"codebase_version": "v3.0", "fps": 30, "total_episodes": 2, "features": FEATURES} | change
         (root / "meta/info.json").write_text(json.dumps(described))

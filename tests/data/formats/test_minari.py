@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests local Minari data sets."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Tuple
@@ -37,6 +39,12 @@ def test_an_unknown_data_set_and_rate(dataset):
         read_minari("minari:slider/other-v0")
     with pytest.raises(DataError, match=r"its environment cannot be made \(\w+: .*pass control_hz"):
         read_minari(dataset)
+
+
+def test_the_rate_is_that_of_the_environment(dataset, monkeypatch):
+    environment = SimpleNamespace(metadata={"render_fps": 12.5})
+    monkeypatch.setattr("minari.MinariDataset.recover_environment", lambda self: environment)
+    assert read_minari(dataset).control_hz == 12.5
 
 
 def test_columns_that_would_replace_each_other_are_refused(tmp_path, monkeypatch):

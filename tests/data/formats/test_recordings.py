@@ -74,6 +74,7 @@ def with_nan(array):
         ([FRAMES[0]], [np.ones((4, 1))], {}, r"trajectory 0: states must be \[T, d\], got \[3\]"),
         ([with_nan(FRAMES)], [np.ones((4, 1))], {}, "not finite, first at frame 2 in column 'state_1'"),
         ([FRAMES], [np.full((4, 1), np.inf)], {}, "the action of step 0 is infinite; mark unknown actions by NaN"),
+        ([FRAMES], [np.ones((6, 1))], {}, "6 actions for 5 frames; wanted one per frame"),
         ([FRAMES], [np.ones((3, 1))], {}, r"3 actions for 5 frames; wanted one per frame \(5\) or one per"),
         ([FRAMES], [np.ones(4)], {}, r"actions must be \[T, a\] or \[T - 1, a\], got \[4\]"),
         ([FRAMES], [np.array([["x"]] * 4)], {}, "wanted numbers"),

@@ -106,7 +106,7 @@ def test_chosen_observations(file):
 def test_the_frame_behind_the_last_action(file):
     with h5py.File(file, "a") as stream:
         demo = stream["data/demo_2"]
-        demo["next_obs/eef"] = np.array([2.0, 2.0, 2.0, 7.0])[:, None].repeat(3, 1)
+        demo["next_obs/eef"] = np.array([2.0, 2.0 + 1e-7, 2.0, 7.0])[:, None].repeat(3, 1)  # rounded
         demo["next_obs/width"] = np.arange(1.0, 5.0)
     recordings = read_robomimic(file)
     assert len(recordings.states[0]) == 5 and recordings.num_labels == 4
@@ -125,6 +125,16 @@ def test_next_observations_that_are_not_those_of_the_next_frame(width, file):
         read_robomimic(file)
     recordings = read_robomimic(file, drop_columns=["next_obs"])
     assert len(recordings.states[0]) == 4 and recordings.skipped == ("next_obs",)
+
+
+def test_time_stamps_beside_the_observations(file):
+    with h5py.File(file, "a") as stream:
+        del stream["data"].attrs["env_args"]
+        for demo in stream["data"].values():
+            demo["timestamps"] = 7 + np.arange(len(demo["obs/width"])) / 25
+            demo["frame"] = np.arange(3)  # of something else
+    recordings = read_robomimic(file)
+    assert recordings.control_hz == pytest.approx(25) and recordings.skipped == ("frame", "timestamps")
 
 
 def test_ends_of_episodes_beside_the_observations(file):
@@ -206,7 +216,8 @@ def test_faults(file, tmp_path):
     ("entry", "values", "message"),
     [
         ("obs/eef", np.zeros((4, 3)), "demo_10: its columns have different numbers of rows: 4 in .*; 5 in width"),
-        ("next_obs/eef", np.zeros((4, 2)), r"demo_10: next_obs/eef is \[4, 2\], obs/eef is \[5, 3\]"),
+        ("next_obs/eef", np.zeros((5, 2)), r"demo_10: next_obs/eef is \[5, 2\], obs/eef is \[5, 3\]"),
+        ("next_obs/eef", np.zeros((4, 3)), r"demo_10: next_obs/eef is \[4, 3\], obs/eef is \[5, 3\]"),
         ("actions", np.zeros((5, 6)), "demo_10: its action columns are not those of demo_2: it lacks action_6"),
     ],
 )

@@ -38,8 +38,40 @@ def test_archives_without_names_keep_the_names_of_other_entries(tmp_path):
     assert recordings.state_names == ("x", "y") and recordings.control_hz == pytest.approx(25)
     assert recordings.sources == ("a.npz[0]", "a.npz[1]", "b.npz[0]", "b.npz[1]")
     np.testing.assert_array_equal(recordings.states[0], recordings.states[2])
+    (tmp_path / "a.npz").rename(tmp_path / "c.npz")
+    assert read_tables(tmp_path).state_names == ("x", "y")
+    (tmp_path / "c.npz").rename(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", states=FRAMES[:, :1], actions=np.ones((6, 1)), speed=FRAMES[:, 1], **beside)
     with pytest.raises(DataError, match="its state columns are not those of a.npz"):
+        read_tables(tmp_path)
+
+
+def test_archives_that_declare_other_rates(tmp_path):
+    for name, rate in (("a", 20), ("b", 20), ("c", 22)):
+        np.savez(tmp_path / f"{name}.npz", states=np.repeat(FRAMES**2, 5, 0), actions=np.ones((30, 1)), control_hz=rate)
+    assert read_tables(tmp_path).control_hz == 20
+    np.savez(tmp_path / "c.npz", states=np.repeat(FRAMES**2, 5, 0), control_hz=30)
+    with pytest.raises(DataError, match="the files have 20 to 30 frames per second: pass resample"):
+        read_tables(tmp_path)
+    assert read_tables(tmp_path, control_hz=25).control_hz == 25
+    held = {"resample": 10.0, "action_kind": "velocity"}
+    assert [len(frames) for frames in read_tables(tmp_path, **held).states] == [15, 15, 10]
+    np.savez(tmp_path / "b.npz", states=FRAMES**2)  # as fast as which?
+    with pytest.raises(DataError, match="the files have 20 to 30 frames per second"):
+        read_tables(tmp_path, **held)
+    np.savez(tmp_path / "b.npz", states=FRAMES, control_hz=0)
+    with pytest.raises(DataError, match="b.npz: entry 'control_hz' must be one positive number"):
+        read_tables(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("ends", [4, 2, 6]), ("ends", [2, 4]), ("lengths", [2, 3]), ("lengths", [0, 6])]
+    + [("starts", [1, 3]), ("starts", [0, 4, 2])],
+)
+def test_borders_of_episodes_that_do_not_fit_are_refused(name, values, tmp_path):
+    np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((6, 1)), control_hz=9, **{f"episode_{name}": values})
+    with pytest.raises(DataError, match=f"entry 'episode_{name}' must have one number for each of 6 frames, or the"):
         read_tables(tmp_path)
 
 

@@ -9,7 +9,7 @@ import pytest
 pq = pytest.importorskip("pyarrow.parquet")
 
 from torchrl_koap.data import make_recordings, read_recordings  # noqa: E402
-from torchrl_koap.data.formats.writers import LeRobotWriter, write_lerobot  # noqa: E402
+from torchrl_koap.data.formats.writers import LeRobotWriter, write_lerobot, write_npz  # noqa: E402
 
 
 def test_a_data_set_of_format_3(tmp_path):
@@ -37,11 +37,20 @@ def test_a_data_set_of_format_3(tmp_path):
     assert rows["timestamp"][:3] == pytest.approx([0.0, 0.08, 0.16])
 
 
-@pytest.mark.parametrize(("offset", "dtype"), [(0.0, "float32"), (4e6, "float64")])
+@pytest.mark.parametrize(("offset", "dtype"), [((0, 0), "float32"), ((4e6, 0), "float64"), ((0, 4e6), "float64")])
 def test_numbers_that_float32_rounds_coarsely_are_written_in_float64(tmp_path, offset, dtype):
-    states = [np.linspace(offset, offset + 1, 20).reshape(10, 2)]
-    recordings = make_recordings(states, [np.full((9, 1), 0.5)], control_hz=30.0)
+    states = [np.linspace(0, 1, 20).reshape(10, 2) + offset[0]]
+    actions = np.where(np.arange(9)[:, None] == 4, np.nan, states[0][1:, :1] - offset[0] + offset[1])
+    recordings = make_recordings(states, [actions], control_hz=30.0)
     write_lerobot(recordings, tmp_path / "arm")
     info = json.loads((tmp_path / "arm/meta/info.json").read_text())
     assert info["features"]["observation.state"]["dtype"] == dtype
-    np.testing.assert_allclose(read_recordings(tmp_path / "arm").states[0], states[0], rtol=0, atol=1e-6)
+    found = read_recordings(tmp_path / "arm")
+    np.testing.assert_allclose(found.states[0], states[0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.actions[0], actions, rtol=0, atol=1e-6)
+
+
+def test_archives_are_read_in_the_order_in_which_they_were_written(tmp_path):
+    states = [np.full((2, 1), number) for number in range(11)]
+    write_npz(make_recordings(states, action_dim=1, control_hz=30.0), tmp_path / "arm")
+    np.testing.assert_array_equal(read_recordings(tmp_path / "arm").states, states)
