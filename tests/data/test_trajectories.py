@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import extrapolate_ends, flatten_trajectories, select_state
-from torchrl_koap.data.trajectories import mark_labels
+from torchrl_koap.data.trajectories import begins, mark_labels
 from torchrl_koap.keys import validate
 
 
@@ -71,6 +71,11 @@ def test_labels_are_marked_where_actions_are():
     bare = mark_labels(data.exclude("has_action", "action"), action_dim=2)
     validate(bare)
     assert not bare["has_action"].any()
+
+
+def test_trajectories_begin_where_their_number_changes():
+    episode = torch.tensor([5, 5, 3, 9, 9])
+    assert begins(TensorDict({"episode": episode}, [5])).tolist() == [True, False, True, True, False]
 
 
 def flat(lengths, *, seed=0, dtype=torch.float32):

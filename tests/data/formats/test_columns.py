@@ -8,6 +8,7 @@ import pytest
 
 from torchrl_koap.data import read_recordings
 from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.files import DataError
 
 X = np.random.default_rng(0).normal(size=6).cumsum()
@@ -85,6 +86,9 @@ def test_columns_that_are_not_states_are_dropped_and_listed(name):
 def test_a_column_that_rises_evenly_is_a_clock():
     found = read(x=np.random.default_rng(0).normal(size=30), ticks=np.arange(30) * 7.0)
     assert found.state_names == ("x",) and found.skipped == ("ticks (it rises evenly: a clock)",)
+    ways = {"a": np.arange(30.0), "b": np.random.default_rng(1).normal(size=30)}
+    pieces = [Piece(name, {"x": way, "y": way**2}, {"v": way}) for name, way in ways.items()]
+    assert assemble(pieces, "data", control_hz=20).state_names == ("x", "y")  # in one file it is the motion
 
 
 def test_columns_are_chosen_by_name():
@@ -203,6 +207,12 @@ def test_a_clock_that_starts_again_and_flags_of_starts():
         assert [len(frames) for frames in read(**column).states] == [3, 3]
     with pytest.raises(DataError, match="time stamps do not increase"):  # set back, not started again
         read(control_hz=None, time=[0.0, 0.1, 0.2, 0.3, 0.2, 0.3])
+
+
+def test_a_camera_with_more_frames_than_rows_is_named():
+    piece = Piece("run", {"x": X}, {"v": X}, cameras={"top": Clip("top.npy", tuple(range(7)))})
+    with pytest.raises(DataError, match="run: camera 'top' has 7 frames for 6 rows: give their times in top_times.npy"):
+        assemble([piece], "data", control_hz=20)
 
 
 def test_several_episodes_need_an_action_for_every_frame():

@@ -91,7 +91,7 @@ def test_rows_in_any_order_are_sorted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "given", [{"x": None}, [*JOINTS, "more"], {name: None if name == JOINTS[3] else 1 for name in JOINTS}]
+    "given", [{"x": None}, [*JOINTS, JOINTS[0]], {name: None if name == JOINTS[3] else 1 for name in JOINTS}]
 )
 def test_names_without_numbers_are_not_used(given, tmp_path):
     features = FEATURES | {"observation.state": {**FEATURES["observation.state"], "names": given}}
@@ -146,6 +146,12 @@ def test_pictures_inside_the_tables_are_referred_to(version, tmp_path):
     seen = [[frame[0, 0, 0] for frame in clip.read()] for clip in recordings.cameras["wrist"]]
     assert seen == [[*range(6)], [*range(6, 12)]]
     assert recordings.state_names == (*JOINTS, "force")
+
+
+def test_a_feature_of_text_is_listed(tmp_path):
+    features = FEATURES | {"observation.task": {"dtype": "string", "shape": [1], "names": None}}
+    recordings = read_lerobot(write(tmp_path, features=features, change={"observation.task": pa.array(["go"] * 12)}))
+    assert recordings.state_names == (*JOINTS, "force") and "observation.task" in recordings.skipped
 
 
 def test_chosen_features(tmp_path):
@@ -221,6 +227,7 @@ FILES = [
     (edited("action", lambda rows: ["up"] * len(rows)), "FILE: column 'action' must hold numbers or lists of numbers"),
     (edited("action", lambda rows: [1.0] * len(rows)), "FILE: column 'action' holds double, but list"),
     (lambda t: t.slice(0, 0), "1 episodes are missing: 1"),
+    (lambda t: pa.concat_tables([t, t.slice(5)]), "FILE: episode 1 has 7 rows, its description says 6"),
     (lambda t: t.slice(0, 4), "FILE: episode 1 has 4 rows, its description says 6"),
     (edited("frame_index", put(5, 9)), "FILE: column 'frame_index' of episode 1 must count 0, 1, 2, ..."),
     (edited("observation.state", lambda rows: [row[:3] for row in rows]), "'observation.state' has rows of 3 and 7"),
@@ -245,6 +252,8 @@ def test_faults_name_file_and_column(change, problem, tmp_path):
 
 def test_actions_that_are_announced_and_absent_are_told(tmp_path):
     assert "action (info.json lists it, no file has it)" in read_lerobot(write(tmp_path, actions="missing")).skipped
+    with pytest.raises(DataError, match="action_names has 7 names for 3 columns"):
+        read_lerobot(tmp_path, action_dim=3)
 
 
 def test_missing_episodes_are_told(tmp_path):

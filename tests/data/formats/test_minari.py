@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from recording_writers import store_minari
 
 from torchrl_koap.data.formats.minari import read_minari
@@ -45,6 +45,14 @@ def test_the_rate_is_that_of_the_environment(dataset, monkeypatch):
     environment = SimpleNamespace(metadata={"render_fps": 12.5})
     monkeypatch.setattr("minari.MinariDataset.recover_environment", lambda self: environment)
     assert read_minari(dataset).control_hz == 12.5
+
+
+def test_numbered_actions_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    episode = PLACES, [1] * 6
+    name = store_minari(tmp_path, "slider/test-v0", Box(-9, 9, (1,)), Discrete(3), [episode] * 2)
+    with pytest.raises(DataError, match=r"episode 0, episode 1: actions must be \[T, a\], got int64 \[6\]"):
+        read_minari(name, control_hz=25)
 
 
 def test_columns_that_would_replace_each_other_are_refused(tmp_path, monkeypatch):

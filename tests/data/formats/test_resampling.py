@@ -6,7 +6,7 @@ import pytest
 
 from torchrl_koap.data import make_demonstrations, make_recordings
 from torchrl_koap.data.formats.frames import Clip
-from torchrl_koap.data.formats.resampling import resampled
+from torchrl_koap.data.formats.resampling import leap_bounds, quaternion_starts, resampled
 from torchrl_koap.files import DataError
 
 TIME = np.arange(41) / 20
@@ -45,12 +45,13 @@ def test_irregular_frames():
 
 
 def test_changes_are_summed_and_other_actions_are_held():
-    steps = np.stack([np.ones(40), np.arange(40.0), np.arange(40.0)], 1)
-    recordings = recorded(TIME, actions=steps)
-    half = resampled(recordings, 10, ["change", "velocity", "absolute"]).actions[0]
-    np.testing.assert_allclose(half, np.stack([np.full(20, 2), *2 * [np.arange(0, 40, 2)]], 1))
-    double = resampled(recordings, 40, ["change", "velocity", "absolute"]).actions[0]
-    np.testing.assert_allclose(double, np.stack([np.full(80, 0.5), *2 * [np.arange(80) // 2]], 1))
+    kinds = ["change", "velocity", "absolute", "raw"]
+    recordings = recorded(TIME, actions=np.stack([np.ones(40), *3 * [np.arange(40.0)]], 1), skipped=["a part"])
+    half = resampled(recordings, 10, kinds)
+    np.testing.assert_allclose(half.actions[0], np.stack([np.full(20, 2), *3 * [np.arange(0, 40, 2)]], 1))
+    double = resampled(recordings, 40, kinds).actions[0]
+    np.testing.assert_allclose(double, np.stack([np.full(80, 0.5), *3 * [np.arange(80) // 2]], 1))
+    assert half.skipped == ("a part",)
 
 
 @pytest.mark.parametrize(("kind", "known"), [("change", [True, False, True, True]), ("absolute", [True] * 4)])
@@ -71,6 +72,17 @@ def test_quaternions_keep_their_length_where_their_sign_changes():
     assert apart.min() > np.cos(1 / 40)  # half a recorded step
 
 
+def test_a_quaternion_has_norm_1_in_all_recordings():
+    turn = np.eye(4)
+    assert quaternion_starts([turn, turn]) == [0] and quaternion_starts([turn, 2 * turn]) == []
+
+
+def test_a_leap_is_a_third_of_the_range_and_twenty_usual_steps():
+    bounds, usual = leap_bounds([np.stack([TIME, 0 * TIME, np.where(TIME > 1, 9 + TIME, TIME)], 1)])
+    np.testing.assert_allclose(bounds, [1.0, np.inf, 11 / 3])
+    np.testing.assert_allclose(usual, [0.05, np.inf, 0.05])
+
+
 def test_leaps_are_not_filled():
     angle = (3 * TIME + 1 + np.pi) % (2 * np.pi) - np.pi
     quaternion = np.cos(TIME) * np.where(TIME < 1, 1, -1)
@@ -86,6 +98,18 @@ def test_a_switch_is_that_of_the_nearest_frame():
     np.testing.assert_array_equal(found, np.arange(61) > 0)  # 0.033 s is nearer to 0.05 s than to 0 s
 
 
+@pytest.mark.parametrize("column", [7 * np.arange(41), TIME[:5]])
+def test_many_whole_numbers_and_a_few_fractions_are_no_switches(column):
+    found = resampled(recorded(column, np.zeros(len(column))), 40).states[0][:, 0]
+    np.testing.assert_allclose(found[1::2], (column[1:] + column[:-1]) / 2)
+
+
+def test_the_last_frame_is_kept_and_two_are_enough():
+    """1.16 s last 29 steps of 0.04 s, although their quotient is rounded to less."""
+    assert [len(resampled(recorded(TIME), rate).states[0]) for rate in (0.5, 1)] == [2, 3]
+    assert len(resampled(make_recordings([TIME[:30, None]], action_dim=1, control_hz=25), 25).states[0]) == 30
+
+
 def test_an_action_a_little_late_is_that_of_its_step():
     times = TIME + 0.004 * (np.arange(41) % 2)
     found = resampled(recorded(TIME, times=times, actions=np.arange(40.0)[:, None]), 20, "absolute", times=[times])
@@ -94,7 +118,7 @@ def test_an_action_a_little_late_is_that_of_its_step():
 
 def test_one_lost_frame_with_clock_jitter_is_not_a_gap():
     times = np.delete(TIME, 20) + 0.01 * (np.arange(40) == 20)  # 0.11 s apart
-    assert len(resampled(recorded(times, times=times), 20, times=[times]).states) == 1
+    assert [len(resampled(recorded(times, times=times), rate, times=[times]).states) for rate in (20, 40)] == [1, 1]
     times = np.delete(TIME, [20, 21])
     assert len(resampled(recorded(times, times=times), 20, times=[times]).states) == 2
 
@@ -110,6 +134,8 @@ def test_cameras_show_the_nearest_frame_behind_a_gap_too():
     recordings = recorded(TIME, times=times, cameras={"top": [Clip("top.npy", tuple(range(100, 141)))]})
     before, behind = resampled(recordings, 10, times=[times]).cameras["top"]
     assert before.numbers == tuple(range(100, 120, 2)) and behind.numbers == tuple(range(120, 141, 2))
+    before, _ = resampled(recordings, 30, times=[times]).cameras["top"]
+    assert before.numbers[:7] == (100, 101, 101, 102, 103, 103, 104)
 
 
 def test_gaps_end_trajectories_and_are_told():
@@ -137,6 +163,12 @@ def test_gaps_end_trajectories_and_are_told():
 def test_what_cannot_be_done_is_refused(rate, kind, message):
     with pytest.raises(DataError, match=message):
         resampled(recorded(TIME, actions=TIME[:-1, None]), rate, kind)
+
+
+def test_the_slowest_recording_limits_the_rate():
+    recordings, times = make_recordings([TIME[:, None]] * 2, action_dim=1), [TIME, 2 * TIME]
+    with pytest.raises(DataError, match=r"30 Hz is more than twice the rate of 1 \(10 Hz\): .* may be at most 20,"):
+        resampled(recordings, 30, times=times)
 
 
 def test_demonstrations_at_another_rate():

@@ -193,6 +193,10 @@ def test_next_observations_in_one_table_are_listed(file):
     with h5py.File(file, "a") as stream:
         stream["data/demo_2/next_obs"] = np.zeros((4, 4))
     assert read_robomimic(file).skipped == ("next_obs",)
+    with h5py.File(file, "a") as stream:
+        del stream["data/demo_2/next_obs"]
+        stream["data/demo_2/next_obs/eef"] = np.zeros((4, 3))  # without the width
+    assert read_robomimic(file).skipped == ("next_obs",)
 
 
 def test_faults(file, tmp_path):

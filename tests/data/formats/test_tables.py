@@ -179,12 +179,27 @@ def test_columns_of_parquet_that_would_replace_each_other_are_refused(kind, tmp_
         read_tables(tmp_path)
 
 
-def test_columns_of_parquet_with_one_name_are_refused(tmp_path):
+def test_columns_of_parquet_with_one_name_or_no_numbers_are_refused(tmp_path):
     pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
     parquet = pytest.importorskip("pyarrow.parquet")
-    parquet.write_table(pyarrow.table([np.arange(6)] * 2, names=["x", "x"]), tmp_path / "run.parquet")
+    file = tmp_path / "run.parquet"
+    parquet.write_table(pyarrow.table([np.arange(6)] * 2, names=["x", "x"]), file)
     with pytest.raises(DataError, match="run.parquet: two columns are named x"):
         read_tables(tmp_path)
+    parquet.write_table(pyarrow.table({"x": pyarrow.array([[]] * 6, pyarrow.list_(pyarrow.float32()))}), file)
+    with pytest.raises(DataError, match="run.parquet: column 'x' has rows of 0 numbers"):
+        read_tables(tmp_path)
+
+
+def test_a_row_without_a_time_has_no_camera_frame(tmp_path):
+    """Its frame would be the last one."""
+    time = np.where(np.arange(6) == 2, np.nan, np.arange(6) / 10)
+    np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((6, 1)), time=time)
+    (tmp_path / "a").mkdir()
+    np.save(tmp_path / "a/top.npy", np.zeros((6, 2, 2, 3), np.uint8))
+    np.save(tmp_path / "a/top_times.npy", np.arange(6) / 10)
+    with pytest.raises(DataError, match="a.npz: camera 'top': no frame for row 2 at nan s"):
+        read_tables(tmp_path, control_hz=10)
 
 
 def test_what_is_not_read_is_named(tmp_path):
@@ -278,6 +293,9 @@ def test_archives_with_a_rate_beside_tables_with_time_stamps(tmp_path):
     np.testing.assert_allclose(found.states[1], [FRAMES[0], FRAMES[4]])
     with pytest.raises(DataError, match="no file has time stamps"):  # the rate of the robot is not that of the video
         read_tables(tmp_path, drop_columns=["time_ms", "frame"])
+    own = {"time_ms": 20.0 * np.arange(6), "frame": np.arange(6)}
+    np.savez(tmp_path / "robot.npz", actions=np.ones((6, 1)), control_hz=25, **states, **own)
+    assert read_tables(tmp_path).control_hz == pytest.approx(50)  # stamps of its own are kept
     write_csv(tmp_path / "video.csv", video | {"confidence": [1.0] * 6})
     with pytest.raises(DataError, match=r"has confidence besides; .* or drop .* with drop_columns \(--drop-columns\)"):
         read_tables(tmp_path, resample=12.5)

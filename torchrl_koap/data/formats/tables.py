@@ -307,8 +307,6 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> Piece:
     columns: dict[str, np.ndarray | None] = {}
     for name in table.column_names:
         values = table[name]
-        if pyarrow.types.is_boolean(values.type):
-            values = values.cast(pyarrow.int8())
         kind = number_type(values.type)
         if is_action(name) and values.null_count == len(values) and kind in (None, pyarrow.list_(pyarrow.float64())):
             continue  # no labels, and no width
