@@ -36,6 +36,12 @@ def test_targets_that_are_declared_as_changes():
     assert not warnings(PATHS, TARGETS, action_kind="absolute", targets=JOINTS[:2])
 
 
+def test_steps_without_a_label_say_nothing():
+    data, task = demonstrations(PATHS, [TARGETS[0], None, None, None])
+    (said,) = kind_warnings(data, task, "abcd")
+    assert "of shoulder.pos, elbow pos on average: they look like absolute targets" in said
+
+
 def test_far_numbers_are_compared_as_the_robot_reports_them():
     far = [path + 4e6 for path in PATHS]
     assert not warnings(far, [frames[1:, :2] for frames in far], action_kind="absolute", targets=JOINTS[:2])
