@@ -134,11 +134,11 @@ def test_the_same_angle_a_turn_apart(turn):
     assert not [*turn_warnings([roll], ["roll"]), *turn_warnings([roll, roll + 3 * turn], ["roll"])]
 
 
-@pytest.mark.parametrize("kind", ["column", "action"])
-def test_marks_of_what_is_missing(kind):
-    rows = np.where(np.arange(60)[:, None] % 7, np.sin(TIME), -999)
+@pytest.mark.parametrize(("kind", "mark"), [("column", -999), ("action", -999), ("column", 999)])
+def test_marks_of_what_is_missing(kind, mark):
+    rows = np.where(np.arange(60)[:, None] % 7, np.sin(TIME), mark)
     (warning,) = mark_warnings(rows, ["v"], kind)
-    assert warning.startswith(f"{kind} 'v' is -999 in 9 of 60 rows and within 0") and "missing values?" in warning
+    assert warning.startswith(f"{kind} 'v' is {mark} in 9 of 60 rows and within 0") and "missing values?" in warning
     for sound in (TIME > 1, np.round(TIME), np.minimum(TIME, 1), np.where(TIME > 1.97, 99, TIME)):
         assert not [*mark_warnings(sound.astype(float), ["v"], kind)]
 

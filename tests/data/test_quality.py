@@ -144,7 +144,7 @@ def test_the_same_angle_a_turn_apart_is_warned_of():
 
 
 def test_columns_that_differ_between_trajectories_alone_are_goals():
-    frames = [np.hstack([TIME, 0 * TIME + goal, 0 * TIME]) for goal in (1, 2)]
+    frames = [np.hstack([TIME + goal, 0 * TIME + goal, 0 * TIME]) for goal in (1, 2)]
     assert goal_columns(make_recordings(frames, action_dim=1, state_names=["x", "goal", "shelf"])) == ["goal"]
 
 

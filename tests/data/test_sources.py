@@ -44,8 +44,15 @@ def test_demonstrations_of_another_task_are_used_where_that_is_meant(tmp_path):
     theirs, _ = open_dataset(raw, task=sorting)
     save_ted(theirs.exclude("state"), tmp_path / "demos" / "ted", sorting)
     save_ted(theirs, tmp_path / "with state", sorting)
+    save_ted(theirs, tmp_path / "of its own name", partial)
     wanted = theirs["observation"][:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]]  # no yaw
-    for folder in (raw, tmp_path / "demos", tmp_path / "demos" / "ted", tmp_path / "with state"):
+    for folder in (
+        raw,
+        tmp_path / "demos",
+        tmp_path / "demos" / "ted",
+        tmp_path / "with state",
+        tmp_path / "of its own name",
+    ):
         data, task = open_dataset(folder, task=partial)
         assert task is partial and torch.equal(data["action"], theirs["action"])
         torch.testing.assert_close(data["state"], wanted, rtol=0, atol=6 * partial.noise)  # measured with noise
@@ -68,6 +75,9 @@ def test_demonstrations_of_po_sorting_are_as_noisy_as_its_rollouts(tmp_path):
     assert not change[:, others].any()
     inner = (noisy["step_count"] < 198).squeeze(-1).nonzero().squeeze(-1)
     assert torch.equal(noisy["next", "observation"][inner], noisy["observation"][inner + 1])
+    last = torch.tensor([198, 397])  # whose next frame is not the first one of another trajectory
+    behind = (noisy["next", "observation"] - clean["next", "observation"])[last, 2:4]
+    assert behind.all() and (behind != change[last + 1, 2:4]).all()
     assert noisy["state"].shape[-1] == 10  # no yaw, of planner or controller
     stored, _ = load_ted(tmp_path / "ted")
     assert torch.equal(stored["observation"], clean["observation"])

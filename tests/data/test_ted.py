@@ -76,6 +76,10 @@ def change(path, **entries):
             lambda path: (path / "steps.safetensors").write_bytes(b"1"),
             "steps.safetensors cannot be used: it was changed",
         ),
+        (
+            lambda path: (path / "steps.safetensors").write_bytes(b"1" * (path / "steps.safetensors").stat().st_size),
+            "steps.safetensors cannot be used: it was changed",
+        ),
         (lambda path: change(path, format=1), "no description of a data set in format 2"),
         (lambda path: change(path, steps=5), "its entries do not have 5 steps"),
         (lambda path: change(path, lengths="many"), "missing or invalid: lengths"),
