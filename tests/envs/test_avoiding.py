@@ -7,7 +7,17 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from env_test_base import HUMAN, EnvTestBase, act, assert_starts_as_recorded, recordings_of, replay, start_recorded
+from env_test_base import (
+    HUMAN,
+    OTHER_MUJOCO,
+    WHY_OTHER,
+    EnvTestBase,
+    act,
+    assert_starts_as_recorded,
+    recordings_of,
+    replay,
+    start_recorded,
+)
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
@@ -55,6 +65,7 @@ def test_parity_with_the_original(start):
 
 
 @needs_human
+@pytest.mark.skipif(OTHER_MUJOCO, reason=WHY_OTHER)
 def test_human_demonstrations_replay_to_their_own_logs():
     files = sorted(HUMAN.glob("*.pkl"))
     logs = [pickle.loads(path.read_bytes())["robot"] for path in files]

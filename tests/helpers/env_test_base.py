@@ -17,6 +17,9 @@ from torchrl_koap.envs.mujoco.controller import FINGER_OPEN
 # recordings and human demonstrations that the package does not ship; tests that need them are skipped without
 SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).parents[3] / "shared"))
 HUMAN = SHARED / "d3il_avoiding_human"
+MUJOCO = "4."  # the recordings were made with this version; others differ by micrometres
+OTHER_MUJOCO = not mujoco.__version__.startswith(MUJOCO)
+WHY_OTHER = f"the recordings are of MuJoCo {MUJOCO}x, this is {mujoco.__version__}"
 
 
 def act(env, action, mask=None):
@@ -33,6 +36,8 @@ def recordings_of(task):
     file = SHARED / "d3il_reference" / f"{task}.npz"
     if not file.exists():
         pytest.skip(f"no recordings at {file}")
+    if OTHER_MUJOCO:
+        pytest.skip(WHY_OTHER)
     return np.load(file)
 
 
