@@ -74,7 +74,8 @@ class RunDirectory:
     def refuse_data(self) -> None:
         """Raises a RunDirectoryError if the folder holds a data set or, without a run, recordings."""
         held = stored_folder(self.path)
-        if held is None and not (self.path / "config.json").exists() and find_format(self.path) is not None:
+        ours = any((self.path / name).exists() for name in FILES)  # ``metrics.csv`` is a table, too
+        if held is None and not ours and find_format(self.path) is not None:
             held = self.path
         if held is not None:
             raise RunDirectoryError(f"{held} holds data, which need a folder of their own; choose another --out")
