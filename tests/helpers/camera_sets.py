@@ -11,6 +11,11 @@ from torchrl_koap.tasks import get_task
 CAMERA = "observation.images.third_person"
 
 
+def read(recordings, camera, index=0):
+    """Reads all frames ``[T, height, width, 3]`` that a camera saw in one recording."""
+    return np.stack(list(recordings.cameras[camera][index].read()))
+
+
 def episode(embodiment, length=6, seed=0):
     generator = np.random.default_rng(seed)
     frames = generator.integers(0, 256, (length + 1, 8, 8, 3), dtype=np.uint8)
