@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from torchrl_koap.data import read_recordings
-from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.frames import Clip
+from torchrl_koap.data.formats.pieces import Piece
 from torchrl_koap.files import DataError
 
 X = np.random.default_rng(0).normal(size=6).cumsum()
@@ -45,9 +46,11 @@ def test_a_counter_splits_and_sorts():
     np.testing.assert_array_equal(uneven.states[0][:, 0], np.arange(30))
     by_time = read(x=rows, time=rows / 20)
     np.testing.assert_array_equal(by_time.states[0][:, 0], np.arange(30))
-    for counter in ([0, 1, 1, 2, 3, 4], [0, 1, 2, 1, 2, 3]):
+    for numbers in ({}, {"episode": [0] * 6}):
         with pytest.raises(DataError, match="neither continues nor restarts"):
-            read(frame_index=counter)
+            read(frame_index=[0, 1, 2, 1, 2, 3], **numbers)
+        with pytest.raises(DataError, match="'frame_index' goes from 1 to 1: add the missing frames"):
+            read(frame_index=[0, 1, 1, 2, 3, 4], **numbers)
 
 
 @pytest.mark.parametrize("back", [1.03, 3600])
@@ -79,8 +82,8 @@ def test_all_columns_that_separate_episodes_are_used():
     "name", ["Timestamp", "time_s", "stamp", "Time [ms]", "__index_level_0__", "Unnamed: 0", "reward"]
 )
 def test_columns_that_are_not_states_are_dropped_and_listed(name):
-    found = read(**{name: X})
-    assert found.state_names == ("x",) and [said.partition(" (its")[0] for said in found.skipped] == [name]
+    found = read(**{name: np.arange(6) * (50 if "ms" in name else 0.05)})
+    assert found.state_names == ("x",) and found.skipped == (name,)
 
 
 def test_a_column_that_rises_evenly_is_a_clock():
@@ -202,9 +205,12 @@ def test_archives_say_where_episodes_end(name, values, tmp_path):
             assert read_recordings(tmp_path, **options).skipped == ("other",)
 
 
-def test_a_clock_that_starts_again_and_flags_of_starts():
-    for column in ({"time": [0.0, 0.1, 0.2, 0, 0.1, 0.2]}, {"is_first": [1, 0, 0, 1, 0, 0]}):
-        assert [len(frames) for frames in read(**column).states] == [3, 3]
+def test_a_clock_or_counter_that_starts_again_and_flags_of_starts():
+    for column in ({"time": [0.0, 0.1, 0.2, 0, 0.1, 0.2]}, {"frame_index": [0, 1, 2] * 2}):
+        for numbers in ({}, {"file": [7] * 6}):  # inside a number, too
+            np.testing.assert_array_equal(np.stack(read(**column, **numbers).states)[..., 0], X.reshape(2, 3))
+    for flags in ([1, 0, 0, 1, 0, 0], [1, 1, 0, 1, 1, 0], [0, 0, 0, 1, 1, 1]):  # a flag may stay 1
+        assert [len(frames) for frames in read(is_first=flags).states] == [3, 3]
     with pytest.raises(DataError, match="time stamps do not increase"):  # set back, not started again
         read(control_hz=None, time=[0.0, 0.1, 0.2, 0.3, 0.2, 0.3])
 

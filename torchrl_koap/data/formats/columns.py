@@ -1,49 +1,23 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Converts named columns to recordings, for all readers: selects states, splits episodes, finds the frame rate."""
+"""Converts named columns to recordings, for all readers: selects states, finds the frame rate, checks the rest."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.clocks import NOT_READ, UNEVEN, clocks_of, find_rate, rises_evenly, told_rate, usual_rate
-from torchrl_koap.data.formats.frames import Clip
+from torchrl_koap.data.formats.clocks import NOT_READ, clocks_of, find_rate, rises_evenly, told_rate, usual_rate
 from torchrl_koap.data.formats.kinds import kind_of
+from torchrl_koap.data.formats.pieces import Piece, split_episodes
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import unknown
-
-SHUFFLED = 0.25  # rows are out of order if their clock goes back in more than this share of them
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Content of one file, demonstration or episode, as a reader found it."""
-
-    name: str  # for messages
-    states: dict[str, np.ndarray]  # columns [T], all but the actions
-    actions: dict[str, np.ndarray] | None = None  # columns [T] or [T - 1]; None if there are none
-    unclear: tuple[str, ...] = ()  # columns of ``states`` whose meaning the user must state
-    cameras: dict[str, Clip] = field(default_factory=dict)  # location of the frames, one per row
-    declared_hz: float | None = None  # frames per second, if the source declares it
-    unread: tuple[str, ...] = ()  # parts that were left out
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return len(next(iter(self.states.values()), ()))
-
-    @property
-    def clocks(self) -> dict[str, np.ndarray]:
-        """Columns of time stamps, in seconds."""
-        kinds = {name: kind_of(name) for name in self.states}
-        return {name: self.states[name] * unit for name, (kind, unit) in kinds.items() if kind == "clock"}
 
 
 def assemble(
@@ -86,7 +60,7 @@ def assemble(
     ]
     refuse(source, problems + gathered([*_other_names(pieces), *_other_lengths(pieces)]))
     refuse(source, list(_camera_faults(pieces)))
-    parts = [part for piece in pieces for part in _episodes(piece, problems)]
+    parts = [part for piece in pieces for part in split_episodes(piece, problems)]
     short = [f"{part.name} (fewer than two frames)" for part in parts if part.frames < 2]
     pieces = [part for part in parts if part.frames > 1]
     if not pieces:
@@ -134,7 +108,7 @@ def assemble(
         times = [np.arange(piece.frames) / rate for piece in pieces] if counting is None else counting.times
         seen_in = [np.isfinite(_stack(piece.states, observed)).all(1) | bool(piece.actions) for piece in pieces]
         times = [at[rows] for at, rows in zip(times, seen_in, strict=True)]
-        pieces = [_taken(piece, np.flatnonzero(rows)) for piece, rows in zip(pieces, seen_in, strict=True)]
+        pieces = [piece.taken(np.flatnonzero(rows)) for piece, rows in zip(pieces, seen_in, strict=True)]
         lost = sum(int((~rows).sum()) for rows in seen_in)
         left_out += [f"{lost} frames with states that are NaN"] if lost else []
     recordings = make_recordings(
@@ -167,128 +141,16 @@ def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarra
 def _lost_frames(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
     """Finds pieces whose frame counter skips numbers; used where no clock shows lost frames."""
     for piece in pieces:
-        for name in [name for name in piece.states if kind_of(name)[0] == "frame"]:
-            steps = np.diff(piece.states[name])
+        for name, frame in piece.of_kind("frame").items():
+            steps = np.diff(frame)
             lost = np.flatnonzero(steps != np.median(steps))
             if len(lost):
-                before, after = piece.states[name][lost[0] : lost[0] + 2]
+                before, after = frame[lost[0] : lost[0] + 2]
                 yield (
                     piece.name,
                     f"column {name!r} goes from {before:g} to {after:g}: add the missing frames, end an episode there"
                     f" (a column 'episode_index'), or drop the counter with {option('drop_columns')}",
                 )
-
-
-def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
-    """Splits a piece into episodes; returns the piece itself if it has one episode."""
-    try:
-        order, begins = _order(piece)
-    except ValueError as error:
-        problems.append(f"{piece.name}: {error}")
-        return [piece]
-    starts, length = np.flatnonzero(begins), len(order)
-    if len(starts) < 2 and np.array_equal(order, np.arange(length)):
-        return [piece]
-    if piece.actions is not None and any(len(values) != length for values in piece.actions.values()):
-        problems.append(
-            f"{piece.name}: it holds {len(starts)} episodes and {len(next(iter(piece.actions.values())))} actions for"
-            f" {length} frames: with several episodes, every frame needs an action"
-        )
-        return [piece]
-    spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
-    names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
-    return [
-        replace(_taken(piece, span), name=name, actions=piece.actions and _cut(piece.actions, span))
-        for name, span in zip(names, spans, strict=True)
-    ]
-
-
-def _taken(piece: Piece, rows: np.ndarray) -> Piece:
-    """Selects frames of a piece and keeps all of its actions."""
-    cameras = {name: clip.take(rows) for name, clip in piece.cameras.items()}
-    return replace(piece, states=_cut(piece.states, rows), cameras=cameras)
-
-
-def _cut(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: values[span] for name, values in columns.items()}
-
-
-def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the order of the rows of a piece, and which of the ordered rows begin an episode.
-
-    Episodes are found by their number, by a frame counter or clock that restarts, and by flags of starts and ends. Rows
-    of an episode that are out of order are sorted by its counter or clock.
-    """
-    rows = np.arange(piece.frames)
-    counter = next((name for name in piece.states if kind_of(name)[0] == "frame"), "")
-    clocks = clocks_of([piece.clocks], [piece.name])
-    frame, clock = piece.states.get(counter), clocks[0].times[0] if clocks else None
-    numbers = {name: values for name, values in piece.states.items() if kind_of(name)[0] == "episode"}
-    for name, values in numbers.items():
-        if np.isnan(values).any():
-            raise ValueError(f"column {name!r} is empty in row {int(np.isnan(values).argmax())}")
-    if numbers:
-        number = np.unique(np.stack(list(numbers.values())), axis=1, return_inverse=True)[1].reshape(-1)
-        sorting = clock if frame is None else frame
-        starts = _changes(number)
-        sorted_by = number[:, None] if sorting is None else np.stack([number, sorting], 1)
-        if starts.sum() > len(np.unique(number)) and len(np.unique(sorted_by, axis=0)) < len(rows):
-            again = next(at for at in np.flatnonzero(starts) if (number[starts] == number[at]).sum() > 1)
-            said = " of ".join(f"{name} {values[again]:g}" for name, values in numbers.items())
-            raise ValueError(
-                f"{said} returns after another one, and no frame index or time gives the order of its rows"
-            )
-        order = rows if sorting is None else np.lexsort((sorting, number))
-        if frame is None and clock is not None:  # a few steps back are faults of the clock, not rows out of order
-            kept = np.argsort(number, kind="stable")
-            begins = np.flatnonzero(_changes(number[kept]))[1:]
-            back = sum(int((np.diff(part) < 0).sum()) for part in np.split(clock[kept], begins))
-            even = rises_evenly(np.split(clock[order], begins), room=UNEVEN, least=1)
-            order = order if even or back > SHUFFLED * len(rows) else kept
-        return order, _changes(number[order]) | _flagged(piece, order)
-    if frame is not None and (np.diff(frame) <= 0).any():
-        if len(np.unique(frame)) == len(rows):  # one episode, out of order
-            order = np.argsort(frame)
-            return order, _flagged(piece, order)
-        starts = np.r_[True, np.diff(frame) < 0]
-        if not (frame[starts] == frame[0]).all() or (np.diff(frame) == 0).any():
-            raise ValueError(
-                f"column {counter!r} neither continues nor restarts: add a column 'episode' that says which"
-                " rows belong together"
-            )
-        return rows, starts | _flagged(piece, rows)
-    starts = _flagged(piece, rows)
-    if starts.sum() == 1 < len(rows) and clock is not None and (np.diff(clock) < 0).any():
-        again = np.r_[True, np.diff(clock) < 0]
-        near = np.abs(clock[again] - clock[0]) < 0.5 * np.median(np.abs(np.diff(clock)))
-        if near.all() and (np.diff(np.flatnonzero(again)) > 1).all():
-            return rows, again
-        order = np.argsort(clock)
-        if rises_evenly([clock[order]], room=UNEVEN):
-            return order, starts
-    return rows, starts
-
-
-def _flagged(piece: Piece, order: np.ndarray) -> np.ndarray:
-    """Returns which of the ordered rows begin an episode by flags of starts and ends; the first one always does."""
-    starts = np.arange(len(order)) == 0
-    for name, values in piece.states.items():
-        kind, flag = kind_of(name)[0], values[order]
-        switch = not set(np.unique(flag)) - {0, 1}
-        if kind in ("start", "end") and not switch:
-            raise ValueError(
-                f"column {name!r} of the {kind}s of episodes must be 0 or 1: rename it if it is something else, or drop"
-                f" it with {option('drop_columns')}"
-            )
-        if kind == "start":
-            starts = starts | (flag > 0)
-        elif kind == "end" or kind == "length" and switch:
-            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # the flag may stay 1 for several rows
-    return starts
-
-
-def _changes(numbers: np.ndarray) -> np.ndarray:
-    return np.r_[True, numbers[1:] != numbers[:-1]]
 
 
 def _even(pieces: Sequence[Piece]) -> set[str]:

@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import declared_rate
-from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.frames import lerobot_clips
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
+from torchrl_koap.data.formats.pieces import Piece
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, check_file, gathered, option, read_bytes, read_json, refuse, some
 

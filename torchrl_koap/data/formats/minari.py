@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.kinds import leaves, named_twice, numbered, spread
+from torchrl_koap.data.formats.pieces import Piece
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import gathered, refuse
 from torchrl_koap.lookup import import_extra

@@ -27,9 +27,10 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import declared_rate
-from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.frames import MAGIC, Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, named_twice, numbered, spread
+from torchrl_koap.data.formats.pieces import Piece
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, option, refuse
 from torchrl_koap.lookup import import_extra

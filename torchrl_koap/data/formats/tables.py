@@ -28,10 +28,11 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.clocks import UNEVEN, time_stamps
-from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.frames import TIMES, clips_beside
 from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, named_twice, number_of, numbered
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
+from torchrl_koap.data.formats.pieces import Piece
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import unknown

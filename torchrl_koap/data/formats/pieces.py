@@ -1,0 +1,180 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Splits tables into episodes by their number, a counter or clock that restarts, and flags of starts and ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from torchrl_koap.data.formats.clocks import UNEVEN, clocks_of, rises_evenly
+from torchrl_koap.data.formats.frames import Clip
+from torchrl_koap.data.formats.kinds import kind_of
+from torchrl_koap.files import option
+
+SHUFFLED = 0.25  # rows are out of order if their clock goes back in more than this share of them
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Content of one file, demonstration or episode, as a reader found it."""
+
+    name: str  # for messages
+    states: dict[str, np.ndarray]  # columns [T], all but the actions
+    actions: dict[str, np.ndarray] | None = None  # columns [T] or [T - 1]; None if there are none
+    unclear: tuple[str, ...] = ()  # columns of ``states`` whose meaning the user must state
+    cameras: dict[str, Clip] = field(default_factory=dict)  # location of the frames, one per row
+    declared_hz: float | None = None  # frames per second, if the source declares it
+    unread: tuple[str, ...] = ()  # parts that were left out
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(next(iter(self.states.values()), ()))
+
+    @property
+    def clocks(self) -> dict[str, np.ndarray]:
+        """Columns of time stamps, in seconds."""
+        kinds = {name: kind_of(name) for name in self.states}
+        return {name: self.states[name] * unit for name, (kind, unit) in kinds.items() if kind == "clock"}
+
+    def taken(self, rows: np.ndarray) -> Piece:
+        """Selects frames and keeps all actions."""
+        cameras = {name: clip.take(rows) for name, clip in self.cameras.items()}
+        return replace(self, states=_cut(self.states, rows), cameras=cameras)
+
+    def of_kind(self, kind: str) -> dict[str, np.ndarray]:
+        """Returns the columns of a kind (:func:`~torchrl_koap.data.formats.kinds.kind_of`)."""
+        return {name: values for name, values in self.states.items() if kind_of(name)[0] == kind}
+
+
+def split_episodes(piece: Piece, problems: list[str]) -> list[Piece]:
+    """Splits a piece into episodes; returns the piece itself if it has one, or if a problem was added."""
+    try:
+        order, begins = _order(piece)
+    except ValueError as error:
+        problems.append(f"{piece.name}: {error}")
+        return [piece]
+    starts, length = np.flatnonzero(begins), len(order)
+    if len(starts) < 2 and np.array_equal(order, np.arange(length)):
+        return [piece]
+    if piece.actions is not None and any(len(values) != length for values in piece.actions.values()):
+        problems.append(
+            f"{piece.name}: it holds {len(starts)} episodes and {len(next(iter(piece.actions.values())))} actions for"
+            f" {length} frames: with several episodes, every frame needs an action"
+        )
+        return [piece]
+    spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
+    names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
+    return [
+        replace(piece.taken(span), name=name, actions=piece.actions and _cut(piece.actions, span))
+        for name, span in zip(names, spans, strict=True)
+    ]
+
+
+def _cut(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.ndarray]:
+    return {name: values[span] for name, values in columns.items()}
+
+
+def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the order of the rows of a piece, and which of the ordered rows begin an episode.
+
+    Rows of one episode number belong together. Among them a frame counter, or else a clock, splits episodes where it
+    restarts, and sorts rows that are out of order. Flags of starts and ends split them, too.
+    """
+    parts = _numbered(piece)
+    counters, clocks = piece.of_kind("frame"), clocks_of([piece.clocks], [piece.name])
+    if counters:
+        name, frame = next(iter(counters.items()))
+        found = [_by_counter(name, frame[rows]) for rows in parts]
+    elif clocks:
+        found = _by_clock([clocks[0].times[0][rows] for rows in parts])
+    else:
+        found = [(np.arange(len(rows)), _first(rows)) for rows in parts]
+    order = np.concatenate([rows[inner] for rows, (inner, _) in zip(parts, found, strict=True)])
+    return order, np.concatenate([starts for _, starts in found]) | _flagged(piece, order)
+
+
+def _numbered(piece: Piece) -> list[np.ndarray]:
+    """Returns the rows of every episode number, or all rows if there are no numbers.
+
+    Raises:
+        ValueError: if a number is missing, or returns without a counter or clock that orders its rows.
+    """
+    numbers = piece.of_kind("episode")
+    if not numbers:
+        return [np.arange(piece.frames)]
+    for name, values in numbers.items():
+        if np.isnan(values).any():
+            raise ValueError(f"column {name!r} is empty in row {int(np.isnan(values).argmax())}")
+    number = np.unique(np.stack(list(numbers.values())), axis=1, return_inverse=True)[1].reshape(-1)
+    rows = np.argsort(number, kind="stable")
+    parts = np.split(rows, np.flatnonzero(np.diff(number[rows])) + 1)
+    again = next((part[1:][np.diff(part) > 1][0] for part in parts if (np.diff(part) > 1).any()), None)
+    if again is not None and not piece.of_kind("frame") and not piece.clocks:
+        said = " of ".join(f"{name} {values[again]:g}" for name, values in numbers.items())
+        raise ValueError(f"{said} returns after another one, and no frame index or time gives the order of its rows")
+    return parts
+
+
+def _by_counter(name: str, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the order of rows by a frame counter ``[T]``, and which of the ordered rows begin an episode."""
+    if len(np.unique(frame)) == len(frame):
+        return np.argsort(frame), _first(frame)
+    starts = np.r_[True, np.diff(frame) < 0]
+    if not (frame[starts] == frame[0]).all():
+        raise ValueError(
+            f"column {name!r} neither continues nor restarts: add a column 'episode' that says which rows belong"
+            f" together, or drop the counter with {option('drop_columns')}"
+        )
+    return np.arange(len(frame)), starts
+
+
+def _by_clock(parts: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns the order of rows by a clock ``[T]``, and which of the ordered rows begin an episode, for all parts.
+
+    A few steps back that are no restart are faults of the clock, not rows out of order.
+    """
+    starts = [_restarts(times) for times in parts]
+    whole = [begins.sum() == 1 for begins in starts]
+    order = [np.argsort(at, kind="stable") if one else np.arange(len(at)) for at, one in zip(parts, whole, strict=True)]
+    back = sum(int((np.diff(at) < 0).sum()) for at, one in zip(parts, whole, strict=True) if one)
+    ordered = [at[rows] for at, rows, one in zip(parts, order, whole, strict=True) if one]
+    shuffled = back > SHUFFLED * sum(map(len, ordered)) or back and rises_evenly(ordered, room=UNEVEN, least=1)
+    if not shuffled:
+        order = [np.arange(len(at)) for at in parts]
+    return list(zip(order, starts, strict=True))
+
+
+def _restarts(times: np.ndarray) -> np.ndarray:
+    """Returns in which rows of a clock ``[T]`` an episode begins: the first, and those that go back to its time."""
+    back = np.r_[True, np.diff(times) < 0]
+    steps = np.abs(np.diff(times))
+    near = np.abs(times[back] - times[0]) < 0.5 * np.median(steps) if len(steps) else np.array([True])
+    return back if near.all() and (np.diff(np.flatnonzero(back)) > 1).all() else _first(times)
+
+
+def _first(rows: np.ndarray) -> np.ndarray:
+    return np.arange(len(rows)) == 0
+
+
+def _flagged(piece: Piece, order: np.ndarray) -> np.ndarray:
+    """Returns which of the ordered rows begin an episode by flags of starts and ends; the first one always does.
+
+    Flags may stay 1 for several rows.
+    """
+    starts = _first(order)
+    for name, values in piece.states.items():
+        kind, flag = kind_of(name)[0], values[order]
+        switch = not set(np.unique(flag)) - {0, 1}
+        if kind in ("start", "end") and not switch:
+            raise ValueError(
+                f"column {name!r} of the {kind}s of episodes must be 0 or 1: rename it if it is something else, or drop"
+                f" it with {option('drop_columns')}"
+            )
+        if kind == "start":
+            starts = starts | np.r_[False, (flag[:-1] == 0) & (flag[1:] > 0)]
+        elif kind == "end" or kind == "length" and switch:
+            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]
+    return starts
