@@ -113,7 +113,7 @@ def test_unknown_loggers_suggest_the_nearest():
 
 
 def test_metrics_csv_needs_no_logger(tmp_path):
-    with open_logger("csv", tmp_path) as logger:
+    with open_logger("csv", tmp_path, {}) as logger:
         assert logger is None
     assert not list(tmp_path.iterdir())
 
@@ -126,10 +126,11 @@ def test_losses_and_scores_arrive_in_the_run_directory(name, tmp_path, monkeypat
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "run"
-    with open_logger(name, run) as logger:
+    with open_logger(name, run, {"method": "koap", "planner": {"steps": 3217, "source": None}}) as logger:
         logger.log_scalar("planner/loss_planner", 0.5, step=1)
         log_scores(logger, {"success_rate": 0.625, "episodes": 8, "kind": "closed loop", "entropy": float("nan")})
-    wait_for(b"eval/success_rate", tmp_path)
+    for text in (b"eval/success_rate", b"planner.steps"):
+        wait_for(text, tmp_path)
     written = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert not any(b"eval/entropy" in path.read_bytes() for path in written)
     assert all(run in path.parents for path in written), written

@@ -21,6 +21,7 @@ from torchrl_koap.reports.pictures import draw_pictures
 from torchrl_koap.reports.rows import as_text, evaluation_rows, training_rows
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
+from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
@@ -96,7 +97,7 @@ class Eval(Command):
             report["report"] = str(write_report(folder, animation=self.animate))
         else:
             (folder / "index.html").unlink(missing_ok=True)  # it tells the numbers of an earlier evaluation
-        with open_logger(self.logger, folder) as logger:
+        with open_logger(self.logger, folder, {"run": self.run} | to_json(self.config)) as logger:
             if logger is not None:
                 rates = {f"{name}_rate": values["rate"] for name, values in result.get("rates", {}).items()}
                 log_scores(logger, result | rates)

@@ -120,11 +120,11 @@ def check_logger(name: str) -> None:
 
 
 @contextlib.contextmanager
-def open_logger(name: str, out: Path) -> Iterator[Any | None]:
+def open_logger(name: str, out: Path, options: Mapping[str, Any]) -> Iterator[Any | None]:
     """Yields a TorchRL logger that writes into the run directory, and closes it at the end of the block.
 
-    For ``"csv"`` it is None. wandb stays offline unless ``WANDB_MODE`` is set. The name must have passed
-    :func:`check_logger`.
+    For ``"csv"`` it is None. ``options``, JSON objects by section, are logged as hyperparameters ``SECTION.NAME``.
+    wandb stays offline unless ``WANDB_MODE`` is set. The name must have passed :func:`check_logger`.
     """
     if name == "csv":
         yield None
@@ -132,9 +132,12 @@ def open_logger(name: str, out: Path) -> Iterator[Any | None]:
     from torchrl.record.loggers import get_logger
 
     title = out.name if name == "wandb" else name
-    options = {"project": "koap", "mode": os.environ.get("WANDB_MODE", "offline")}
-    logger = get_logger(name, str(out), title, wandb_kwargs=options)
+    mode = {"project": "koap", "mode": os.environ.get("WANDB_MODE", "offline")}
+    logger = get_logger(name, str(out), title, wandb_kwargs=mode)
+    sections = {section: held if isinstance(held, dict) else {"": held} for section, held in options.items()}
+    flat = {f"{section}.{key}".rstrip("."): v for section, held in sections.items() for key, v in held.items()}
     try:
+        logger.log_hparams({key: v if isinstance(v, (bool, int, float)) else str(v) for key, v in flat.items()})
         yield logger
     finally:
         logger.close()

@@ -123,7 +123,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         cameras = cameras_of(config.dataset)
         for name, projection in cameras.items():
             projection.save(run.path / CAMERAS / f"{name}.safetensors")
-        with open_logger(config.run.logger, config.out) as logger:
+        with open_logger(config.run.logger, config.out, to_json(config)) as logger:
             began = time.perf_counter()
             loop, planner, losses = Phases(run, logger, config.run.resume), None, dict[str, float]()
             torch.manual_seed(config.run.seed)
