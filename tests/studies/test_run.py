@@ -309,7 +309,6 @@ def begun(tmp_path):
 
 def test_fewer_seeds_remove_no_cells(begun):
     assert run_module._together(replace(begun, seeds=1)) == begun
-    assert run_module._together(replace(begun, first_seed_only=(2,))) == begun
 
 
 def test_another_shared_planner_is_another_study(begun):

@@ -120,15 +120,6 @@ def test_presets_name_methods_tasks_and_levels_that_exist(name, tmp_path):
     assert set(PRESETS[name]["methods"]) <= set(METHODS) and set(PRESETS[name]["tasks"]) <= set(TASKS)
 
 
-@pytest.mark.parametrize(("asked", "even"), [({}, [0]), ({"first_seed_only": ()}, [0, 1, 2])])
-def test_levels_two_and_four_of_a_table_have_one_seed_unless_told_otherwise(asked, even, tmp_path):
-    study = complete(Study(out=tmp_path, preset="table1", tasks=("avoiding",), methods=("koap",), **asked))
-    seeds = {level: [] for level in get_task("avoiding").label_levels}
-    for cell in study.cells():
-        seeds[cell.labels].append(cell.seed)
-    assert list(seeds.values()) == [[0, 1, 2], even, [0, 1, 2], even, [0, 1, 2]]
-
-
 def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
     study = complete(Study(out=tmp_path, preset="table1", tasks=("aligning", "sorting"), methods=("koap",), seeds=1))
     assert (study.label_unit, study.labels, study.planner) == ("window", (), PlannerConfig())

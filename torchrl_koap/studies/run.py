@@ -32,7 +32,7 @@ from torchrl_koap.training.datasets import fingerprint
 _FILE = "study.json"
 # options to which a later call may add; all others must stay the same
 _LISTS = ("tasks", "datasets", "planners", "methods", "labels", "levels", "demonstrations")
-_MAY_CHANGE = (*_LISTS, "seeds", "first_seed_only", "out", "run.plugins")
+_MAY_CHANGE = (*_LISTS, "seeds", "out", "run.plugins")
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,7 @@ def _together(study: Study) -> Study:
     lists: dict[str, Any] = {name: union(vars(earlier)[name], vars(study)[name]) for name in _LISTS}
     others = [text for text in earlier.datasets if text.partition("=")[0] not in study.tasks]
     lists["datasets"] = union(others, study.datasets)  # present folders: a data set may have moved
-    first_seed_only = tuple(level for level in study.first_seed_only if level in earlier.first_seed_only)
-    return replace(study, **lists, seeds=max(study.seeds, earlier.seeds), first_seed_only=first_seed_only)
+    return replace(study, **lists, seeds=max(study.seeds, earlier.seeds))
 
 
 def _check_folder(study: Study) -> None:

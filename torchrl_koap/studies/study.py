@@ -35,7 +35,6 @@ USUAL: dict[str, Any] = {
         *("relabel", "nonlinear", "pretrain"),
     ),
     "labels": (0.01, 0.02, 0.05, 0.1, 0.25),
-    "first_seed_only": (),
     "label_unit": "trajectory",
     "demonstrations": (1.0,),
     "seeds": 3,
@@ -45,7 +44,6 @@ _TABLE_1: dict[str, Any] = {
     "methods": ("koap", "koap_paper", "koap_untrained", "linear_steps", "pca", "dd", "vae", "lapo", "dp"),
     "labels": (),
     "levels": (1, 2, 3, 4, 5),
-    "first_seed_only": (2, 4),
     "label_unit": "window",
 }
 PRESETS: dict[str, dict[str, Any]] = {
@@ -106,7 +104,6 @@ class Study:
         methods: names in torchrl_koap.training.methods.METHODS.
         labels: shares of the units that keep their labels; 1 is all of them, not one as for `koap train`.
         levels: label levels of the paper for every task (1: fewest labels), instead of or with labels.
-        first_seed_only: levels that are trained with seed 0 only (default: those of the preset).
         label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
         demonstrations: shares of the demonstrations that planner and controller each use (default: 1). The controller's
             include all with labels, the planner's are the same for every draw of labels.
@@ -128,7 +125,6 @@ class Study:
     methods: tuple[str, ...] = ()
     labels: tuple[float, ...] = ()
     levels: tuple[int, ...] = ()
-    first_seed_only: tuple[int, ...] | None = None
     label_unit: str | None = None
     demonstrations: tuple[float, ...] = ()
     seeds: int | None = None
@@ -181,21 +177,21 @@ class Study:
         return [
             Cell(task, method, labels, share, seed)
             for task in dict.fromkeys(self.tasks)
+            for shares in [self._labels_of(self.task(task))]
             for seed in range(self.seeds)
             for share in dict.fromkeys(self.demonstrations)
-            for labels in self._labels_of(self.task(task), seed)
+            for labels in shares
             for method in dict.fromkeys(self.methods)
         ]
 
-    def _labels_of(self, task: Task, seed: int) -> tuple[float, ...]:
-        """Returns the shares of labels for a seed: the given ones, and those of the levels."""
+    def _labels_of(self, task: Task) -> tuple[float, ...]:
+        """Returns the shares of labels for a task: the given ones, and those of the levels."""
         shares = task.label_levels
         for level in self.levels:
             if not 1 <= level <= len(shares):
                 has = f"its levels 1 to {len(shares)} are {', '.join(f'{100 * share:g}' for share in shares)} %"
                 raise ValueError(f"task {task.name!r} has no label level {level}: {has}")
-        levels = [level for level in self.levels if seed == 0 or level not in self.first_seed_only]
-        return union(self.labels, [shares[level - 1] for level in levels])
+        return union(self.labels, [shares[level - 1] for level in self.levels])
 
     def planner_config(self, cell: Cell) -> TrainConfig:
         """Returns the options for training the planner that all cells of a seed share, which sees no labels."""
@@ -296,8 +292,6 @@ def check_study(study: Study) -> list[Cell]:
     for name, number in (("seeds", study.seeds), ("record", study.record)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be >= 1, got {number}")
-    if any(level < 1 for level in study.first_seed_only or ()):
-        raise ValueError(f"first_seed_only must be label levels >= 1, got {list(study.first_seed_only or ())}")
     for name, why in DECIDED.items():
         section, field = name.split(".")
         config = getattr(study, section)
