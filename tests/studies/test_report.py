@@ -66,7 +66,8 @@ def test_page_says_what_was_run_and_what_was_not(folder):
         "avoiding, koap, 1 % labels, seed 0: failed: RuntimeError: <loss> is not finite",
         "avoiding, ridge, 1 % labels, seed 1: missing",
         "1 of 2",
-        "One planner is shared by all cells that plan",
+        "One planner is shared by all cells that plan, for each task, share of the trajectories and seed.",
+        "The seeds vary planner, controller and labels.",
         "resamples both contexts and training seeds",
     ):
         assert wanted in text
@@ -89,6 +90,9 @@ def test_the_paper_stands_beside_labelled_windows(tmp_path):
     assert re.search(r"avoiding 3 \(10 %\) \d+\.\d \(\d+-\d+\) \[97\.2 \+- \d\.\d\]", text)
     assert "Hollow, dashed: the paper" in text and re.search("in [12] of 2 cells", text)
     assert (tmp_path / "paper_table.md").exists()
+    absent = {"ridge": 0.6}  # not in the paper
+    own = make_cells(outcomes := {}, methods=absent, labels=(0.02, 0.1), label_unit="window")
+    assert "Hollow" not in Page(write_study_report(tmp_path, own, outcomes, title="t")).text
 
 
 def test_pictures_exist_and_nothing_comes_from_elsewhere(folder):

@@ -130,6 +130,7 @@ def _draw(folder: Path, summaries: Sequence[Summary], methods: Sequence[str]) ->
         shares = sorted({item.demonstrations for item in items})
         main = [item for item in items if item.demonstrations == shares[-1]]
         points = paper_points(task) if items[0].label_unit == "window" else {}
+        points = {item.method: points[item.method] for item in items if item.method in points}
         error = "relative_action_error" if any(item.mean("relative_action_error") for item in main) else "action_error"
         wanted: dict[str, dict[str, Any]] = {
             "success": {"by": ("labels", "labelled_transitions"), "paper": points},
