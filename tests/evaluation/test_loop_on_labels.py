@@ -47,6 +47,13 @@ def test_labels_of_first_steps_alone_show_no_change(trained):
     assert check_loop(model, first, first) == {"note": "no command changes in the labels", "faults": []}
 
 
+def test_scattered_labels_are_not_called_wrong_actions(trained):
+    model, data = trained
+    pairs = data.clone().set("has_action", data["has_action"] & (data["step_count"].reshape(-1, 1) % 3 != 0))
+    note = "no recording has three labelled steps in a row, so no actions can be replayed"
+    assert check_loop(model, pairs, pairs) == {"note": note, "faults": []}
+
+
 def test_replayed_actions_do_not_continue_behind_a_gap_in_the_labels(trained, monkeypatch):
     monkeypatch.setattr(loop_on_labels, "STEPS", 30)
     model, data = trained

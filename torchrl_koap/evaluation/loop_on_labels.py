@@ -60,11 +60,14 @@ def check_loop(
     ranges = varied(command_ranges(task, labelled))
     if not any(ranges) or not (data[HAS_ACTION] & ~begins(data).unsqueeze(-1)).any():
         return {"note": "no command changes in the labels", "faults": []}
+    if not (stretches := _labelled_stretches(data)):
+        return {"note": "no recording has three labelled steps in a row, so no actions can be replayed", "faults": []}
     response, explained = _fit(data)
     if explained < _EXPLAINED:
         share = f"{max(explained, 0):.0%} of how all state columns change, which is too little"
         return {"note": f"a linear model explains {share}", "faults": []}
-    if not _replay_error(response, data) < _DRIFT:
+    spread = _spread(data)
+    if not _replay_error(response, stretches, spread) < _DRIFT:
         return {"note": "in the linear model, recorded actions do not reproduce their recordings", "faults": []}
     asked = (execution or ExecutionConfig()).on(trained.execution)
     trained = replace(trained, cameras={})  # data hold embeddings, not pictures
@@ -75,7 +78,7 @@ def check_loop(
     if late > UNSTABLE:
         # an expert acts on states without sensor noise: its actions reveal the noise and bias a fit on noisy states
         without_states, its_share = _fit(data, by_states=False)
-        if its_share >= _EXPLAINED and _replay_error(without_states, data) < _DRIFT:
+        if its_share >= _EXPLAINED and _replay_error(without_states, stretches, spread) < _DRIFT:
             again = _roll(free, without_states, data, steps, seed)
             other_growth = _growth(again[0], ends_of(ranges), steps)
             if other_growth[1] < late:
@@ -140,27 +143,28 @@ def _fit(data: TensorDictBase, *, by_states: bool = True) -> tuple[Response, flo
     return step, 1 - fit.error**2
 
 
-def _replay_error(response: Response, data: TensorDictBase) -> float:
-    """Returns how far replayed actions end from their recordings (median of trajectories, standard deviations).
-
-    Replays the longest unbroken stretch of labels of each trajectory.
-    """
-    spread = _spread(data)
-    apart = []
+def _labelled_stretches(data: TensorDictBase) -> list[TensorDictBase]:
+    """Returns the longest unbroken stretch of labels of each trajectory, of at least three steps."""
+    longest = []
     for number in labelled_episodes(data)[:ROBOTS].tolist():
         rows = data[data[EPISODE] == number]
         labelled, lengths = rows[HAS_ACTION].squeeze(-1).unique_consecutive(return_counts=True)
         stretches = zip(labelled.tolist(), rows.split(lengths.tolist()), strict=True)
-        rows = max((part for known, part in stretches if known), key=len)[:STEPS]
+        longest.append(max((part for known, part in stretches if known), key=len)[:STEPS])
+    return [rows for rows in longest if len(rows) >= 3]
+
+
+def _replay_error(response: Response, stretches: list[TensorDictBase], spread: Tensor) -> float:
+    """Returns how far replayed actions end from their recordings (median of stretches, standard deviations)."""
+    apart = []
+    for rows in stretches:
         frames, action = rows[OBSERVATION].double(), rows[ACTION].double()
-        if len(rows) < 3:
-            continue
         now, change = frames[1], frames[1] - frames[0]
         for step in range(1, len(rows) - 1):
             change = response(now, change, action[step])
             now = now + change
         apart.append(float(((now - frames[-1]) / spread).square().mean().sqrt()))
-    return statistics.median_high(apart) if apart else math.inf
+    return statistics.median_high(apart)
 
 
 def _roll(
