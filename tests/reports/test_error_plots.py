@@ -29,6 +29,7 @@ def test_losses_get_a_panel_each_and_zero_is_said():
     assert raw.get_xdata().tolist() == [1, 2] and raw.get_ydata().tolist() == [1.0, 0.1]
     assert planner.get_yscale() == "log"
     assert not action.lines and "no label" in action.texts[0].get_text()
+    assert action.dataLim.intervalx.tolist() == [3, 4]  # the updates of its part
     fitted = draw_losses(rows[:1] + rows[2:], replace(NOTHING, summary={"decoder_fit": {"penalty": 0.1}})).axes
     assert "fitted in closed form" in fitted[1].texts[0].get_text()
     assert fitted[0].lines[1].get_marker() == "o" and fitted[2].lines[1].get_marker() == ""  # one value, two values

@@ -1,12 +1,17 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests plots of spectrum, latent space and experiments against their numbers."""
 
+import math
+from pathlib import Path
+
 import pytest
 from run_files import run_of, titles
 
 from torchrl_koap.evaluation.findings import EXPERIMENTS, MODELS, OUTSIDE_THE_BUDGET
 from torchrl_koap.reports.inspection_plots import draw_experiments, draw_latent
 from torchrl_koap.reports.pictures import NothingToDraw
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.tasks import Action, Task
 
 RUN = run_of("avoiding")
 
@@ -29,6 +34,29 @@ def test_latent_space(outside, panels, said):
     assert len(figure.axes) == panels and figure.get_suptitle().endswith(said)
     assert titles(figure)[0] == "6 eigenvalues, radius 1.006\n2 inside, 3 on, 1 outside the unit circle"
     assert titles(figure)[1] == "Error of the predicted measured xy\non 3 demonstrations"
+
+
+def test_numbers_of_many_actions_stay_below_the_title_and_one_without_a_value_keeps_its_place():
+    names = tuple(f"finger_{index}" for index in range(6))
+    task = Task(
+        name="hand", observation_parts={"hand": names}, actions={name: Action() for name in names}, position="hand"
+    )
+    explained = [1.0] * 5 + [math.nan]
+    latent = {
+        "multi_step": {name: {"hand": [0.1]} for name in MODELS} | {"steps": 1, "held_out_trajectories": 3},
+        OUTSIDE_THE_BUDGET: {
+            "probe_r2": explained,
+            "decoder_r2": explained,
+            "labels_read": 9,
+            "held_out_trajectories": 3,
+        },
+        "eigenvalues": {"real": [0.9], "imag": [0.0]},
+    }
+    figure = draw_latent({"latent": latent}, RunFacts(Path("run"), task))
+    figure.draw_without_rendering()
+    axes = figure.axes[2]
+    assert len(axes.texts) == 10 and max(text.get_window_extent().y1 for text in axes.texts) < axes.bbox.y1
+    assert axes.get_xlim()[1] == pytest.approx(5.6)
 
 
 def test_experiments():

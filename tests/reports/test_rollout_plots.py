@@ -180,6 +180,8 @@ def test_plans_are_drawn_over_time_without_planar_positions():
     heads = [axes.get_title(loc="left") for axes in figure.axes[:3]]
     assert heads == ["episode 2: out of time", "episode 3: collision", "episode 0: success"]
     np.testing.assert_allclose(figure.axes[5].lines[0].get_ydata(), state[0, :, 1])
+    figure.axes[5].set_xlim(0, 3)
+    assert set(figure.axes[5].get_xticks()) <= set(range(-1, 5))  # whole control steps
     planned = figure.axes[5].collections[0].get_segments()[0]
     np.testing.assert_allclose(planned, np.stack([np.arange(1, 15), state[0, 1:15, 1]], 1))
     assert "columns that actions move" in all_pictures()["plans.png"].caption_for(run)

@@ -104,6 +104,8 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
             fitted = name == "loss_action" and "decoder_fit" in run.summary
             why = "it is fitted in closed form\nafter the last update" if fitted else "this loss used no label"
             axes.text(0.5, 0.5, f"0 throughout: {why}", transform=axes.transAxes, ha="center", color=MUTED)
+            axes.update_datalim(np.column_stack([x, y]))  # the updates of its part, as in the other panels
+            axes.autoscale_view()
             axes.set_yticks([])
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=_ROUND))
         tidy(axes)

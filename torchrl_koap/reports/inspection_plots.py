@@ -179,7 +179,8 @@ def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> Non
             if np.isfinite(value):
                 style = {"ha": "center", "fontsize": 7, "color": INK, "rotation": 90 if len(names) > 4 else 0}
                 axes.annotate(f"{value:.3f}", (place, max(value, 0) + 0.01), **style)
-    axes.set_ylim(0, 1.12)
+    axes.set_ylim(0, 1.3 if len(names) > 4 else 1.12)  # room for the upright numbers
+    axes.set_xlim(-0.6, len(names) - 0.4)  # an action without a value has its place too
     axes.set_xticks(places, [shorten(name) for name in names], fontsize=8, rotation=45 if len(names) > 4 else 0)
     axes.set_yticks((0, 0.25, 0.5, 0.75, 1))
     axes.set_ylabel("share of variance explained (R²)")

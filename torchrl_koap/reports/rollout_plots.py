@@ -305,6 +305,7 @@ def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
             tidy(axes)
         set_title(down[0], f"episode {index}: {OUTCOMES[outcome[index]]}")
         down[-1].set_xlabel("control step")
+        down[-1].xaxis.set_major_locator(MaxNLocator(6, integer=True))
     return figure
 
 
