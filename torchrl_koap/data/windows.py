@@ -100,7 +100,8 @@ class WindowTable:
             raise ValueError(
                 f"{int(short.sum())} of {len(lengths)} trajectories are shorter than a window"
                 f" ({window - pad_before - pad_after} steps):"
-                f" {some([f'{number} ({length} steps)' for number, length in named])}"
+                f" {some([f'{number} ({length} steps)' for number, length in named])}; leave them out"
+                " (`koap convert --drop-short`)"
             )
         trajectory = torch.arange(len(first), device=device).repeat_interleave(windows)
         number = torch.arange(len(trajectory), device=device) - (windows.cumsum(0) - windows)[trajectory]
