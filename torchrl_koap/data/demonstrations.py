@@ -7,7 +7,6 @@ import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +15,16 @@ from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
 from torchrl_koap.data.formats.kinds import kind_of
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings, one_each, resolves_coarsely, wrong_rate
-from torchrl_koap.data.formats.resampling import ADDS_UP, resampled
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings, resolves_coarsely, wrong_rate
+from torchrl_koap.data.formats.resampling import resampled
 from torchrl_koap.data.planner_choices import observed_frames, planner_updates
 from torchrl_koap.data.quality import find_warnings
+from torchrl_koap.data.roles import COMMAND, Roles, check_kinds, find_roles
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state
 from torchrl_koap.files import option, refuse
-from torchrl_koap.lookup import lookup, unknown
-from torchrl_koap.tasks import Action, Defaults, Task
-from torchrl_koap.tasks.action_rules import ActionKind
+from torchrl_koap.tasks import Defaults, Task
 
-# the kind of an action as a user names it -> as stored, once resampling is done
-ACTION_KINDS: dict[str, ActionKind] = {**dict.fromkeys(ADDS_UP, "delta"), "absolute": "absolute", "raw": "raw"}
 _SMALLEST, _LARGEST = 1e-18, 1e18  # range that a column may span: float32 can hold the squares
 _SLACK = 1.5  # episodes may last this many times the longest demonstration
 
@@ -145,13 +141,12 @@ def make_demonstrations(
         >>> task.observation_dim, task.action_dim, task.robot, bool(data["has_action"].any())
         (3, 2, (0, 1), False)
     """
-    for kind in (action_kind,) if isinstance(action_kind, str) else action_kind:
-        lookup(ACTION_KINDS, kind, "kind of action")
+    check_kinds(action_kind)
     if isinstance(states, Recordings):
         held = {"actions": actions, "state_names": state_names, "action_names": action_names, "action_dim": action_dim}
         if given := [argument for argument, value in held.items() if value is not None]:
             raise ValueError(f"recordings already hold their actions and names; {', '.join(given)} must be None")
-        recordings = states
+        recordings, problems = states, []
     else:
         recordings = make_recordings(
             states,
@@ -162,85 +157,42 @@ def make_demonstrations(
             control_hz=control_hz,
         )
         _warn_of(recordings.skipped)
-    problems = [
-        f"state column {column!r} is a clock, a counter or a flag by its name: leave it out, or rename it"
-        for column in recordings.state_names
-        if recordings is not states and kind_of(column)[0]
-    ]
-    names, acting = recordings.state_names, recordings.action_names
+        problems = [
+            f"state column {column!r} is a clock, a counter or a flag by its name: leave it out, or rename it"
+            for column in recordings.state_names
+            if kind_of(column)[0]
+        ]
     named = recordings is states or resample is not None
     recordings = _at_rate(recordings, control_hz, resample, action_kind)
     rate = recordings.control_hz
-    if rate is None:
-        problems.append(f"{option('control_hz')} is missing: frames per second")
-    else:
-        problems += wrong_rate(rate, "control_hz")
+    problems += [f"{option('control_hz')} is missing: frames per second"] if rate is None else []
+    problems += [] if rate is None else wrong_rate(rate, "control_hz")
     if max_steps is not None and (isinstance(max_steps, (bool, str)) or not max_steps >= 1 or max_steps % 1):
         problems.append(f"{option('max_steps')} must be a positive whole number, got {max_steps!r}")
-    commanded = _columns(command, names, "command", problems)
-    others = [column for column in range(len(names)) if column not in commanded]
-    if robot is None:
-        moving = recordings.moving
-        own = [column for column in others if moving[column]] or others
-    else:
-        own = _columns(robot, names, "robot", problems)
-    problems += [f"column {names[column]!r} is both robot and command" for column in own if column in commanded]
-    if commanded and commanded != list(range(min(commanded), min(commanded) + len(commanded))):
-        problems.append(f"command columns must be adjacent, got {', '.join(names[c] for c in commanded)}")
-    if not others:
-        problems.append("every column is a command: no state column is left")
-    kinds = [ACTION_KINDS[kind] for kind in one_each(action_kind, len(acting), "action_kind", problems)]
-    reached = _targets(kinds, targets, own, names, problems)
-    if targets is not None:
-        problems += [f"column {names[index]!r} is both target and command" for index in reached if index in commanded]
-    units = one_each(action_units, len(acting), "action_units", problems)
-    own_units = one_each(state_units, len(names), "state_units", problems)
-    origin = _origin(np.concatenate(recordings.states), names, "state", problems)
-    problems += [
-        f"command column {names[column]!r} is at {origin[column]:.3g}: subtract this value, here and on the robot"
-        for column in commanded
-        if origin[column]
-    ]
-    added, absolute = np.zeros(len(acting)), [index for index, kind in enumerate(kinds) if kind == "absolute"]
-    if len(reached) == len(absolute):
-        added[absolute] = origin[reached]
-    actions = [steps - added for steps in recordings.actions]
-    problems += [
-        f"action column {acting[column]!r} is at {at:.3g}: subtract this value, here and on the robot"
-        for column, at in enumerate(_origin(np.concatenate(actions), acting, "action", problems))
-        if at
-    ]
-    labelled = [
-        frames[:, own]
-        for frames, steps in zip(recordings.states, recordings.actions, strict=True)
-        if np.isfinite(steps).all(-1).any()
-    ]
-    if not own and robot is not None and not problems:
-        problems.append(f"{option('robot')} names no column")
-    elif own and labelled and not any(np.ptp(frames, axis=0).any() for frames in labelled):
-        which = ", ".join(names[column] for column in own)
-        problems.append(
-            f"robot: {which} never move in labelled trajectories, so the effect of actions is unknown: name others in"
-            f" {option('robot')}"
-        )
+    roles = find_roles(
+        recordings,
+        problems,
+        robot=robot,
+        command=command,
+        action_kind=action_kind,
+        targets=targets,
+        state_units=state_units,
+        action_units=action_units,
+    )
+    origin, shifted = _without_origin(recordings, roles, problems)
     refuse(f"task {name!r}", problems)
-    data = flatten_trajectories([frames - origin for frames in recordings.states], actions)
-    moved = dict(zip(absolute, map(others.index, reached), strict=True))
-    parts = _parts(names, set(own), set(commanded))
+    data, parts = flatten_trajectories([frames - origin for frames in recordings.states], shifted), roles.parts()
     task = Task(
         name=name,
         observation_parts=parts,
-        observation_units=own_units,
+        observation_units=roles.state_units,
         observation_origin=tuple(origin.tolist()) if origin.any() else (),
-        actions={
-            name: Action(unit, kind, moved.get(index))
-            for index, (name, unit, kind) in enumerate(zip(acting, units, kinds, strict=True))
-        },
-        position=next(part for part in parts if part != _COMMAND),
+        actions=roles.actions(),
+        position=next(part for part in parts if part != COMMAND),
         max_steps=round(_SLACK * max(map(len, recordings.states))) if max_steps is None else int(max_steps),
         control_hz=float(rate),
-        command=_COMMAND if commanded else None,
-        robot=tuple(others.index(column) for column in own),
+        command=COMMAND if roles.command else None,
+        robot=tuple(roles.state.index(column) for column in roles.robot),
     )
     known = select_state(data, task.state_of)
     for said in find_warnings(known, task, recordings.sources if named else ()):
@@ -249,7 +201,24 @@ def make_demonstrations(
     return data, replace(task, defaults=Defaults(planner=planner))
 
 
-_COMMAND = "command"
+def _without_origin(recordings: Recordings, roles: Roles, problems: list[str]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Returns what to subtract from states ``[d]``, and actions without the origins of their targets; adds problems."""
+    origin = _origin(np.concatenate(recordings.states), roles.state_names, "state", problems)
+    problems += [
+        f"command column {roles.state_names[column]!r} is at {origin[column]:.3g}: subtract this value, here and on the"
+        " robot"
+        for column in roles.command
+        if origin[column]
+    ]
+    added = np.zeros(len(roles.action_names))
+    added[list(roles.targets)] = origin[list(roles.targets.values())]
+    actions = [steps - added for steps in recordings.actions]
+    problems += [
+        f"action column {roles.action_names[column]!r} is at {at:.3g}: subtract this value, here and on the robot"
+        for column, at in enumerate(_origin(np.concatenate(actions), roles.action_names, "action", problems))
+        if at
+    ]
+    return origin, actions
 
 
 def _at_rate(
@@ -267,63 +236,6 @@ def _at_rate(
 def _warn_of(left_out: Sequence[str]) -> None:
     for said in left_out:
         warnings.warn(f"left out: {said}", stacklevel=3)
-
-
-def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str, tuple[str, ...]]:
-    """Groups neighbouring columns with the same role into parts."""
-
-    def role(column: int) -> str:
-        return _COMMAND if column in commanded else "robot" if column in own else "surroundings"
-
-    parts: dict[str, tuple[str, ...]] = {}
-    for kind, columns in groupby(range(len(names)), role):
-        number = sum(part.partition("_")[0] == kind for part in parts)
-        parts[f"{kind}_{number + 1}" if number else kind] = tuple(names[column] for column in columns)
-    return parts
-
-
-def _columns(given: Any, names: Sequence[str], what: str, problems: list[str]) -> list[int]:
-    """Returns the numbers of columns given by name or number, one or several."""
-    given = [given] if isinstance(given, (str, int, slice)) else list(given)
-    odd = [column for column in given if isinstance(column, bool) or not isinstance(column, (str, int, np.integer))]
-    if odd:
-        problems.append(f"{option(what)} takes columns by name or number, got {odd[0]!r}")
-        return []
-    problems += unknown([column for column in given if isinstance(column, str)], names, f"column in {option(what)}:")
-    numbers = [names.index(column) if column in names else column for column in given]
-    found = [int(number) for number in numbers if not isinstance(number, str) and 0 <= number < len(names)]
-    problems += [
-        f"{option(what)}: there is no column {number}, only 0..{len(names) - 1}"
-        for number in numbers
-        if not isinstance(number, str) and number not in found
-    ]
-    repeated = sorted({names[column] for column in found if found.count(column) > 1})
-    if repeated:
-        problems.append(f"{option(what)} holds {', '.join(repeated)} more than once")
-    return found
-
-
-def _targets(
-    kinds: Sequence[str],
-    given: Sequence[str | int] | None,
-    own: Sequence[int],
-    names: Sequence[str],
-    problems: list[str],
-) -> list[int]:
-    """Returns the target columns of absolute actions."""
-    number = kinds.count("absolute")
-    if not number:
-        if given is not None:
-            problems.append(f"{option('targets')} requires {option('action_kind')} 'absolute'")
-        return []
-    columns = list(own) if given is None else _columns(given, names, "targets", problems)
-    if len(columns) != number:
-        what = "columns of the robot" if given is None else "targets"
-        problems.append(
-            f"absolute actions: {number}, {what}: {len(columns)}; name in {option('targets')} the column that each"
-            f" action is a target for (known: {', '.join(names)}); an action without such a column is 'raw'"
-        )
-    return columns
 
 
 def _origin(rows: np.ndarray, names: Sequence[str], kind: str, problems: list[str]) -> np.ndarray:
