@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -45,21 +45,7 @@ def assemble(
         raise DataError(source, "there are no trajectories")
     seen = dict.fromkeys(name for piece in pieces for name in piece.states)
     skipped = [*(name for piece in pieces for name in piece.unread), *skipped]
-    every = dict.fromkeys(name for piece in pieces for name in (*piece.states, *(piece.actions or ()), *piece.cameras))
-    problems = unknown(state_columns, [*seen], f"column in {option('state_columns')}:")
-    problems += unknown(drop_columns, [*every], f"column in {option('drop_columns')}:")
-    used = {name for name in seen if not state_columns or name in state_columns or kind_of(name)[0] is not None}
-    pieces = [
-        replace(
-            piece,
-            states={name: values for name, values in piece.states.items() if name in used - {*drop_columns}},
-            actions=_without(piece.actions or {}, drop_columns) or None,
-            cameras=_without(piece.cameras, drop_columns),
-        )
-        for piece in pieces
-    ]
-    refuse(source, problems + gathered([*_other_names(pieces), *_other_lengths(pieces)]))
-    refuse(source, list(_camera_faults(pieces)))
+    pieces, problems = _chosen(pieces, source, [*seen], state_columns, drop_columns)
     parts = [part for piece in pieces for part in split_episodes(piece, problems)]
     short = [f"{part.name} (fewer than two frames)" for part in parts if part.frames < 2]
     pieces = [part for part in parts if part.frames > 1]
@@ -67,36 +53,27 @@ def assemble(
         raise DataError(source, problems or [f"none of its {len(parts)} trajectories has two frames"])
     names = list(pieces[0].states)
     acting = next((list(piece.actions) for piece in pieces if piece.actions is not None), [])
-    unclear = dict.fromkeys(name for piece in pieces for name in piece.unclear if name not in drop_columns)
-    if unclear and not state_columns:
-        problems.append(
-            f"{', '.join(map(repr, unclear))} may be the episode of each frame, or the ends of episodes: if so, name it"
-            " episode_index, timeouts or episode_ends; if it is a column of the states or the actions, store it there;"
-            f" otherwise name the state's columns in {option('state_columns')}, or drop it with"
-            f" {option('drop_columns')}"
-        )
+    if not state_columns:
+        problems += _unclear(pieces, drop_columns)
     even = set() if state_columns else _even(pieces)
     usable = [name for name in names if kind_of(name)[0] is None and name not in even]
     observed = [name for name in state_columns or usable if name not in drop_columns]
-    about = dict.fromkeys(even, " (it rises evenly: a clock)")
-    clocks, rate = clocks_of([piece.clocks for piece in pieces], [piece.name for piece in pieces]), control_hz
-    counting = clocks.pop(0) if clocks and control_hz is None else None
-    if counting is not None:
-        rate = find_rate(counting, declared_hz, problems) if resample is None else usual_rate(counting, problems)
+    about = dict.fromkeys(even, " (it rises evenly: a clock)") | _failures(pieces, seen)
+    clock, others = None, clocks_of([piece.clocks for piece in pieces], [piece.name for piece in pieces])
+    if others and control_hz is None:
+        clock = others.pop(0)
+        rate = find_rate(clock, declared_hz, problems) if resample is None else usual_rate(clock, problems)
     else:
         problems += gathered(_lost_frames(pieces))
-        rate = declared_hz if rate is None else rate
+        rate = declared_hz if control_hz is None else control_hz
         problems += [f"{no_rate}: pass {option('control_hz')}"] if rate is None else []
-    about |= {clock.name: told_rate(clock, rate) for clock in clocks if rate is not None}
-    if clocks and control_hz is not None and (against := about[clocks[0].name]) not in ("", NOT_READ):
+    about |= {other.name: told_rate(other, rate) for other in others if rate is not None}
+    if others and control_hz is not None and (against := about[others[0].name]) not in ("", NOT_READ):
         warnings.warn(
-            f"column {clocks[0].name!r}{against} is overridden by {option('control_hz')} {control_hz:g}: if its stamps"
+            f"column {others[0].name!r}{against} is overridden by {option('control_hz')} {control_hz:g}: if its stamps"
             f" are right, pass only {option('resample')} {resample or control_hz:g}",
             stacklevel=2,
         )
-    for name in (name for name in seen if "success" in name.lower() and kind_of(name)[0] == "other"):
-        failed = sum(not piece.states[name].any() for piece in pieces if name in piece.states)
-        about |= {name: f" (0 throughout {failed} trajectories, which are kept)"} if failed else {}
     left_out = [*skipped, *short, *(name + about.get(name, "") for name in seen if name not in observed)]
     left_out += [name for name in drop_columns if name not in left_out]
     if not observed:
@@ -104,12 +81,8 @@ def assemble(
     refuse(source, problems)
     times = None
     if resample is not None:
-        pieces = [piece if _labelled(piece) else replace(piece, actions=None) for piece in pieces]
-        times = [np.arange(piece.frames) / rate for piece in pieces] if counting is None else counting.times
-        seen_in = [np.isfinite(_stack(piece.states, observed)).all(1) | bool(piece.actions) for piece in pieces]
-        times = [at[rows] for at, rows in zip(times, seen_in, strict=True)]
-        pieces = [piece.taken(np.flatnonzero(rows)) for piece, rows in zip(pieces, seen_in, strict=True)]
-        lost = sum(int((~rows).sum()) for rows in seen_in)
+        times = [np.arange(piece.frames) / rate for piece in pieces] if clock is None else clock.times
+        pieces, times, lost = _with_states(pieces, times, observed)
         left_out += [f"{lost} frames with states that are NaN"] if lost else []
     recordings = make_recordings(
         [_stack(piece.states, observed) for piece in pieces],
@@ -124,6 +97,62 @@ def assemble(
         source=source,
     )
     return recordings if resample is None else resampled(recordings, resample, action_kind, times=times)
+
+
+def _chosen(
+    pieces: Sequence[Piece],
+    source: str,
+    seen: Sequence[str],
+    state_columns: Sequence[str],
+    drop_columns: Sequence[str],
+) -> tuple[list[Piece], list[str]]:
+    """Returns pieces with the columns that are used, and problems of options; refuses pieces that differ."""
+    every = dict.fromkeys(name for piece in pieces for name in (*piece.states, *(piece.actions or ()), *piece.cameras))
+    problems = unknown(state_columns, seen, f"column in {option('state_columns')}:")
+    problems += unknown(drop_columns, [*every], f"column in {option('drop_columns')}:")
+    used = {name for name in seen if not state_columns or name in state_columns or kind_of(name)[0] is not None}
+    chosen = [
+        replace(
+            piece,
+            states={name: values for name, values in piece.states.items() if name in used - {*drop_columns}},
+            actions=_without(piece.actions or {}, drop_columns) or None,
+            cameras=_without(piece.cameras, drop_columns),
+        )
+        for piece in pieces
+    ]
+    refuse(source, problems + gathered([*_other_names(chosen), *_other_lengths(chosen)]))
+    refuse(source, list(_camera_faults(chosen)))
+    return chosen, problems
+
+
+def _unclear(pieces: Sequence[Piece], drop_columns: Sequence[str]) -> list[str]:
+    """Returns a list with a message if the user must state what columns mean, else an empty list."""
+    unclear = dict.fromkeys(name for piece in pieces for name in piece.unclear if name not in drop_columns)
+    if not unclear:
+        return []
+    return [
+        f"{', '.join(map(repr, unclear))} may be the episode of each frame, or the ends of episodes: if so, name it"
+        " episode_index, timeouts or episode_ends; if it is a column of the states or the actions, store it there;"
+        f" otherwise name the state's columns in {option('state_columns')}, or drop it with {option('drop_columns')}"
+    ]
+
+
+def _failures(pieces: Sequence[Piece], names: Iterable[str]) -> dict[str, str]:
+    """Returns, for flags of success by name, a note on how many trajectories have none."""
+    flags = [name for name in names if "success" in name.lower() and kind_of(name)[0] == "other"]
+    failed = {name: sum(not part.states[name].any() for part in pieces if name in part.states) for name in flags}
+    return {name: f" (0 throughout {count} trajectories, which are kept)" for name, count in failed.items() if count}
+
+
+def _with_states(
+    pieces: Sequence[Piece], times: Sequence[np.ndarray], observed: Sequence[str]
+) -> tuple[list[Piece], list[np.ndarray], int]:
+    """Leaves out frames without states in pieces without labels; returns pieces, times and how many were left out."""
+    pieces = [piece if _labelled(piece) else replace(piece, actions=None) for piece in pieces]
+    kept = [np.isfinite(_stack(piece.states, observed)).all(1) | bool(piece.actions) for piece in pieces]
+    times = [at[rows] for at, rows in zip(times, kept, strict=True)]
+    pieces = [piece.taken(np.flatnonzero(rows)) for piece, rows in zip(pieces, kept, strict=True)]
+    return pieces, times, sum(int((~rows).sum()) for rows in kept)
 
 
 def _labelled(piece: Piece) -> bool:
