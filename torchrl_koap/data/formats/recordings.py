@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -139,41 +139,17 @@ def make_recordings(
         None if value is None else _table(value, "actions", STEPS, name, faults)
         for value, name in zip(actions, what, strict=True)
     ]
-    wide = next((array.shape[1] for array in known if array is not None), action_dim)
-    if wide is None and action_names is not None:
-        wide = len(action_names)
     problems: list[str] = []
-    whole = isinstance(action_dim, (int, np.integer)) and not isinstance(action_dim, bool)
-    if action_dim is not None and not (whole and action_dim > 0):
-        raise DataError(source, f"{option('action_dim')} must be a positive whole number, got {action_dim!r}")
-    if wide is None:
-        wide = 1
-        cure = f"give the number of action columns in {option('action_dim')}, or the action columns of tables in"
-        problems += [] if faults else [f"no trajectory has actions: {cure} {option('action_columns')}"]
-    elif action_dim is not None and action_dim != wide:
-        problems.append(f"actions have {wide} columns, {option('action_dim')} says {action_dim}")
+    wide = _action_width(known, action_dim, action_names, source, problems, told=bool(faults))
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
     lost: list[tuple[str, str]] = []
     for name, state, action in zip(what, frames, known, strict=True):
-        if state is not None and state.shape[1] != width:
-            faults.append((name, f"states have {state.shape[1]} columns, those before have {width}"))
-        elif state is not None and len(state) < 2:
-            faults.append((name, f"{len(state)} frames; a transition needs two"))
-        elif state is not None and not np.isfinite(state).all():
+        faults += [(name, said) for said in (*_state_faults(state, width), *_action_faults(action, state, wide))]
+        if state is not None and state.shape[1] == width and not np.isfinite(state).all():
             frame, column = np.argwhere(~np.isfinite(state))[0]
             called = repr(given_states[column]) if len(given_states) == width else column
             lost.append((name, f"frame {frame} in column {called}"))
-        if action is None:
-            continue
-        infinite = np.isinf(action).any(-1)
-        if action.shape[1] != wide:
-            faults.append((name, f"actions have {action.shape[1]} columns, those before have {wide}"))
-        elif state is not None and len(action) not in (len(state) - 1, len(state)):
-            wanted = f"wanted one per frame ({len(state)}) or one per transition ({len(state) - 1})"
-            faults.append((name, f"{len(action)} actions for {len(state)} frames; {wanted}"))
-        elif infinite.any():
-            faults.append((name, f"the action of step {infinite.argmax()} is infinite; mark unknown actions by NaN"))
     if lost:
         said = f"{some([name for name, _ in lost])}: states are not finite, first at {lost[0][1]}"
         problems.append(f"{said}: fill them, or {option('resample')} recordings without actions, which skips them")
@@ -200,6 +176,50 @@ def make_recordings(
         tuple(dict.fromkeys(skipped)),
         dict(cameras or {}),
     )
+
+
+def _action_width(
+    actions: Sequence[np.ndarray | None],
+    action_dim: Any,
+    names: Sequence[str] | None,
+    source: str,
+    problems: list[str],
+    *,
+    told: bool,
+) -> int:
+    """Returns the number of action columns; adds a problem if it differs, or is unknown and no faults were ``told``."""
+    whole = isinstance(action_dim, (int, np.integer)) and not isinstance(action_dim, bool)
+    if action_dim is not None and not (whole and action_dim > 0):
+        raise DataError(source, f"{option('action_dim')} must be a positive whole number, got {action_dim!r}")
+    wide = next((array.shape[1] for array in actions if array is not None), action_dim)
+    if wide is None and names is None:
+        cure = f"give the number of action columns in {option('action_dim')}, or the action columns of tables in"
+        problems += [] if told else [f"no trajectory has actions: {cure} {option('action_columns')}"]
+        return 1
+    wide = len(names) if wide is None else wide
+    if action_dim not in (None, wide):
+        problems.append(f"actions have {wide} columns, {option('action_dim')} says {action_dim}")
+    return wide
+
+
+def _state_faults(state: np.ndarray | None, width: int) -> Iterator[str]:
+    if state is not None and state.shape[1] != width:
+        yield f"states have {state.shape[1]} columns, those before have {width}"
+    elif state is not None and len(state) < 2:
+        yield f"{len(state)} frames; a transition needs two"
+
+
+def _action_faults(action: np.ndarray | None, state: np.ndarray | None, wide: int) -> Iterator[str]:
+    if action is None:
+        return
+    infinite = np.isinf(action).any(-1)
+    if action.shape[1] != wide:
+        yield f"actions have {action.shape[1]} columns, those before have {wide}"
+    elif state is not None and len(action) not in (len(state) - 1, len(state)):
+        wanted = f"wanted one per frame ({len(state)}) or one per transition ({len(state) - 1})"
+        yield f"{len(action)} actions for {len(state)} frames; {wanted}"
+    elif infinite.any():
+        yield f"the action of step {infinite.argmax()} is infinite; mark unknown actions by NaN"
 
 
 def wrong_rate(value: Any, name: str) -> list[str]:
