@@ -2,6 +2,7 @@
 """Tests demonstrations as a TorchRL data set."""
 
 import pytest
+from raw_episodes import write_folder
 from torchrl.data.datasets import load_dataset
 
 from torchrl_koap.data import D3ILExperienceReplay, LabelBudget, open_dataset, save_ted
@@ -22,6 +23,12 @@ def test_data_sets_of_this_library(demonstrations, tmp_path):
     data, task = open_dataset(demonstrations)
     save_ted(data, tmp_path / "demos" / "ted", task)
     assert (D3ILExperienceReplay("avoiding", tmp_path / "demos").data == data).all()
+
+
+def test_a_task_that_shares_the_demonstrations_of_another(tmp_path):
+    write_folder(tmp_path, "sorting")
+    dataset, task = D3ILExperienceReplay("po_sorting", tmp_path), get_task("po_sorting")
+    assert dataset.task is task and dataset.data["state"].shape[-1] == task.state_dim < task.observation_dim
 
 
 def test_label_budget_at_loading(demonstrations):

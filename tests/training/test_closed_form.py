@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_networks import controller_of
+from small_networks import controller_of, plain_task
 
 from torchrl_koap.data import LabelBudget, cut_windows, flatten_trajectories, select_state
 from torchrl_koap.modules.ridge import INPUT_NOISE, ridge
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, get_task
 from torchrl_koap.training.closed_form import action_facts, fit_closed_form
 
 LENGTHS = (25, 18, 31, 40, 22)
@@ -122,6 +122,10 @@ def test_columns_are_guessed_for_robots_without_a_simulator_alone():
     robot = replace(stacking, env=None, expert=None)
     assert action_facts(robot, range(8)) == {"axes": [*range(8)], "guessed": True, "alike": True}
     assert action_facts(robot, range(7))["axes"] == []
+    # efforts move no column by a known amount
+    raw = replace(plain_task(2, 2), robot=(0, 1), actions={"a": Action(kind="raw"), "b": Action(kind="raw")})
+    assert action_facts(raw, range(2)) == {"axes": [], "guessed": True, "alike": False}
+    assert action_facts(replace(raw, actions=raw.actions | {"b": Action()}), range(2))["alike"]
 
 
 def test_of_very_many_labels_some_are_fitted_spread_over_all(fits, monkeypatch):

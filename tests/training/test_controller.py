@@ -27,8 +27,11 @@ def test_a_short_recording_is_refused_before_the_planner_is_trained(preset, monk
         fit(data, task, controller={"preset": preset})
 
 
-@pytest.mark.parametrize(("method", "behind"), [("koap", 5), ("linear", 8), ("dd", 1), ("vae", 1)])
-def test_labels_that_no_controller_can_use_are_refused_before_the_planner_is_trained(method, behind, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "preset", "behind"),
+    [("koap", None, 5), ("koap", "paper", 8), ("linear", None, 8), ("dd", None, 1), ("vae", None, 1)],
+)
+def test_labels_that_no_controller_can_use_are_refused_before_any_training(method, preset, behind, monkeypatch):
     monkeypatch.setattr("torchrl_koap.training.in_memory.learn_planner", pytest.fail)
     data, task = make_demonstrations(**few_labels())
     left = torch.cat([torch.arange(n - 1, -1, -1) for n in data["episode"].unique(return_counts=True)[1].tolist()])
@@ -37,7 +40,7 @@ def test_labels_that_no_controller_can_use_are_refused_before_the_planner_is_tra
         labelled = data["has_action"] & chosen.unsqueeze(-1)
         action = torch.where(labelled, data["action"], torch.nan)
         few = data.clone().update({"has_action": labelled, "action": action})
-        return fit(few, task, method=method, controller={"steps": 2}, **options)
+        return fit(few, task, method=method, controller={"steps": 2, "preset": preset}, **options)
 
     fit_where(left == behind, planner=False)
     with pytest.raises(ValueError, match=f"no label is followed by the {behind} recorded steps that method '{method}'"):

@@ -2,10 +2,11 @@
 """Tests the fit of the response on labelled steps: known systems, hidden labels, prediction errors."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from small_networks import a_system, controller_of
+from small_networks import a_system, controller_of, plain_task
 from tensordict import TensorDict
 
 from torchrl_koap.data import flatten_trajectories, select_state
@@ -24,14 +25,19 @@ def columns(**options) -> ResponseModel:
     return ResponseModel([0, 1], [0, 1], [0, 1], **options)
 
 
-def recordings(episodes: int = 6, length: int = 60, noise: float = 0.0) -> TensorDict:
-    """Fully labelled flat data of the system, each episode at a place of its own: observation is command, position."""
+def recordings(episodes: int = 6, length: int = 60, noise: float = 0.0, across: float = 0.0) -> TensorDict:
+    """Fully labelled flat data of the system, each episode at a place of its own: observation is command, position.
+
+    The second axis also pulls the first one, by ``across``.
+    """
     torch.manual_seed(0)
+    system = a_system()
+    system.weight[0, 1, 2] = across
     frames, actions = [], []
     for _ in range(episodes):
         action = (0.01 * torch.randn(length, 2, dtype=torch.float64)).cumsum(0) * 0.3
         start = torch.randn(1, 2, dtype=torch.float64)
-        moved = a_system().predict(start.expand(3, 2), start[0], torch.zeros(2, 2, dtype=torch.float64), action)
+        moved = system.predict(start.expand(3, 2), start[0], torch.zeros(2, 2, dtype=torch.float64), action)
         position, command = torch.cat([start, moved]), torch.cat([start, start + action.cumsum(0)])
         frames.append(torch.cat([command, position + noise * torch.randn_like(position)], -1))
         actions.append(action)
@@ -46,6 +52,11 @@ def test_the_system_is_found_from_one_labelled_trajectory():
     assert not found["coupled"] and not response.weight[0, 1].any() and not response.weight[1, 0].any()
     # the coordinates are nearly dependent: what counts is the answer to a command
     torch.testing.assert_close(response.double().impulse_matrix(8), a_system().impulse_matrix(8), atol=5e-3, rtol=0)
+
+
+def test_axes_are_coupled_only_if_one_pulls_the_other():
+    found = [fit_response(columns(), recordings(across=across))["coupled"] for across in (0.0, 0.05)]
+    assert found == [False, True]
 
 
 def test_segments_with_hidden_commands_have_their_own_offsets():
@@ -68,6 +79,22 @@ def test_the_error_is_that_of_stretches_left_out():
     steps, changes = labelled_steps(response, data)
     stretches = response_fit._stretches(response, data, steps, changes)
     assert found["held_out_error"] > 2 * prediction_errors(response, stretches).square().mean().sqrt()
+
+
+def test_only_hidden_commands_are_known_up_to_a_constant():
+    data, response = recordings(episodes=2, noise=0.01), columns()
+    fit_response(response, data)
+    stretches = response_fit._stretches(response, data, *labelled_steps(response, data))
+    assert stretches.future.shape[1] == response_fit.AHEAD
+    errors = []
+    for known in (torch.arange(len(stretches)) % 2 == 0, torch.tensor(True), torch.tensor(False)):
+        stretches.known = known.expand(len(stretches))
+        errors.append(prediction_errors(response, stretches))
+    mixed, all_known, all_hidden = errors
+    torch.testing.assert_close(
+        mixed, torch.where(torch.arange(len(mixed))[:, None, None] % 2 == 0, all_known, all_hidden)
+    )
+    assert all_hidden.square().sum() < all_known.square().sum()
 
 
 def test_absolute_commands_give_the_same_model():
@@ -108,6 +135,7 @@ def test_too_few_labels_in_a_row_are_refused():
     data["has_action"][::2] = False
     with pytest.raises(ValueError, match="2 labelled steps in a row"):
         fit_response(columns(), data)
+    assert fit_response(columns(), recordings(episodes=1, length=40))["held_out_error"] is None  # for five blocks
 
 
 def test_predictions_that_are_worse_than_standing_still_are_refused():
@@ -122,6 +150,12 @@ def test_columns_of_the_tasks():
     assert tracked_columns(get_task("aligning"))["states"] == [0, 1, 2]
     stacking = tracked_columns(get_task("stacking"))
     assert stacking["actions"] == list(range(7)) == stacking["commands"] and len(stacking["states"]) == 7
+
+
+def test_targets_are_told_from_changes():
+    for kind in ("absolute", "delta"):
+        task = replace(plain_task(2, 2), actions={f"a{n}": Action(kind=kind, column=n) for n in range(2)})
+        assert tracked_columns(task)["absolute"] == (kind == "absolute")
 
 
 def test_a_task_without_commands_is_refused_before_any_work():

@@ -54,7 +54,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         self.label_report: LabelReport | None = None
         if label_budget is not None:
             data, self.label_report = label_budget.apply(data, command=self.task.command_columns)
-        super().__init__(storage=TensorStorage(data), **{"writer": ImmutableDatasetWriter(), **kwargs})
+        super().__init__(storage=TensorStorage(data), writer=ImmutableDatasetWriter(), **kwargs)
 
     @property
     def data(self) -> TensorDictBase:

@@ -74,6 +74,14 @@ def test_the_yaw_of_a_tilted_box_is_the_original_s():
     assert 1 < 50 - np.degrees(yaw) < 3
 
 
+def test_the_box_that_never_moves_is_not_read(tmp_path):
+    robot, objects = made_up("stacking")
+    still = {"target-box": pose(np.zeros((5, 3)), np.zeros((5, 4)))}
+    write_raw_episode(tmp_path / "env_000_00.pkl", robot, objects | still)
+    (frames,), _ = read_raw(CONVERTERS["stacking"], tmp_path)
+    same(frames, CONVERTERS["stacking"].convert(robot, objects)[0])
+
+
 FOLDERS = {  # where D3IL keeps the files
     "avoiding": "avoiding/data",
     "aligning": "aligning/all_data/state",
@@ -88,7 +96,12 @@ FOLDERS = {  # where D3IL keeps the files
 def test_the_folders_of_d3il(tmp_path, task):
     folder = tmp_path / "environments/dataset/data" / FOLDERS[task]
     files = write_folder(folder, task)
-    for other in ("train_files.pkl", "4_boxes_eval_files.pkl", "test_contexts.pkl"):  # lists are no demonstrations
+    for other in (
+        "train_files.pkl",
+        "4_boxes_eval_files.pkl",
+        "test_contexts.pkl",
+        "._env_000_00.pkl",
+    ):  # no demonstrations
         (folder / other).write_bytes(pickle.dumps([files[0].name]))
     for root in {tmp_path, *folder.parents[: len(Path(FOLDERS[task]).parts)], folder}:
         assert find_raw_files(CONVERTERS[task], root) == files, root
@@ -120,6 +133,7 @@ def test_faults_of_all_files_come_together(tmp_path):
         write_raw_episode(tmp_path / f"env_{number:03d}_00.pkl", robot)
     (tmp_path / "env_003_00.pkl").write_bytes(pickle.dumps(os.system))
     (tmp_path / "env_004_00.pkl").touch()
+    (tmp_path / "env_006_00.pkl").mkdir()
     (tmp_path / "env_007_00.pkl").write_bytes(pickle.dumps({"robot": {"c_pos": np.full((4, 3), np.nan)}}))
     calls = []
     with pytest.raises(DataError) as error:
@@ -129,10 +143,11 @@ def test_faults_of_all_files_come_together(tmp_path):
         "003_00.pkl: asks for",
         "004_00.pkl: not a complete pickle",
         "005_00.pkl: too short",
+        "006_00.pkl: cannot be read",
         "007_00.pkl: missing",
     ):
         assert part in text
-    assert len(error.value.problems) == 5 and "env_000" not in text and calls[-1] == (4, 5)
+    assert len(error.value.problems) == 6 and "env_000" not in text and calls[-1] == (5, 6)
 
 
 def broken(**arrays):
@@ -153,7 +168,10 @@ def with_nan(robot):
         (broken(c_pos=lambda r: r["c_pos"] / 0), ["'robot/c_pos' is NaN or infinite"]),
         (lambda c: c["red-box1"].update(quat=np.zeros((5, 3))), ["'red-box1/quat' must have shape (T, 4), got (5, 3)"]),
         (lambda c: c["red-box1"].update(quat=np.zeros((5, 4))), ["'red-box1/quat' has norm 0 in row 0, wanted 1"]),
-        (lambda c: c["red-box1"]["quat"].__imul__([[1]] * 3 + [[2]] * 2), ["'red-box1/quat' has norm 2 in row 3"]),
+        (
+            lambda c: c["red-box1"]["quat"].__imul__([[1.005]] * 3 + [[1.02]] * 2),
+            ["'red-box1/quat' has norm 1.02 in row 3"],
+        ),
         (broken(gripper_width=lambda r: r["c_pos"]), ["'robot/gripper_width' must have shape (T,), got (5, 3)"]),
         (broken(c_pos=lambda r: r["c_pos"].tolist()), ["'robot/c_pos' must be an array (T, 3), got list"]),
         (broken(c_pos=lambda r: r["c_pos"].astype("U8")), ["'robot/c_pos' must hold real numbers, got dtype <U8"]),

@@ -194,6 +194,8 @@ def test_declared_sizes_never_allocate():
         loads_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 2**60) + b"abc.")
     with pytest.raises(UnsafePickleError, match="memory"):
         loads_pickle(b"\x80\x02]r" + struct.pack("<I", 2**31) + b".")  # slot 2^31 of the memo
+    with pytest.raises(UnsafePickleError, match="memory"):
+        loads_pickle(b"]p2147483648\n.")
 
 
 def test_exponential_and_cyclic_containers():

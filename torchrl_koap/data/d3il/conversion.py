@@ -137,7 +137,7 @@ def read_raw(
     actions: list[np.ndarray] = []
     files = find_raw_files(converter, root)
     for index, file in enumerate(files):
-        if progress is not None and index:
+        if progress is not None:
             progress(index, len(files))
         try:
             observed, acted = converter.convert(*_read_episode(file, converter))

@@ -162,14 +162,12 @@ def _view(content, element_type, shape, order) -> np.ndarray:
         content = content.encode("latin1")
     if not isinstance(element_type, _ElementType) or not isinstance(content, (bytes, bytearray)):
         raise _RefusedError("an array is not made of bytes and a numpy element type")
-    if not isinstance(shape, tuple) or not all(type(size) is int and size >= 0 for size in shape):
+    if not isinstance(shape, tuple) or not all(type(size) is int for size in shape):
         raise ValueError(f"array shape {shape!r}")
     needed = math.prod(shape) * element_type.dtype.itemsize
     if needed != len(content):
         raise ValueError(f"an array of shape {shape} needs {needed} bytes, the file holds {len(content)}")
-    array = np.frombuffer(content, element_type.dtype).reshape(shape, order=order)
-    array.flags.writeable = False
-    return array
+    return np.frombuffer(content, element_type.dtype).reshape(shape, order=order)
 
 
 def _reconstruct(array_class, shape, code):
@@ -179,7 +177,7 @@ def _reconstruct(array_class, shape, code):
 
 
 def _from_buffer(content, element_type, shape, order, *_axis_order):
-    if order not in ("C", "F") or _axis_order:
+    if order not in ("C", "F"):
         raise ValueError(f"array order {order!r}")
     array = _Array()
     array.value = _view(content, element_type, shape, order)
@@ -228,8 +226,6 @@ def _finish(value, *, depth: int, finished: dict, open_containers: set) -> Any:
     finish = functools.partial(_finish, depth=depth + 1, finished=finished, open_containers=open_containers)
     if isinstance(value, _Array) and value.value is not None:
         result = value.value
-    elif isinstance(value, _ElementType):
-        result = value.dtype
     elif type(value) is dict:
         for key, entry in value.items():
             if not isinstance(key, (*_PLAIN, np.generic, tuple)):
@@ -241,10 +237,7 @@ def _finish(value, *, depth: int, finished: dict, open_containers: set) -> Any:
         result = value
     elif type(value) is tuple:
         result = tuple(finish(entry) for entry in value)
-    elif type(value) is bytearray:
-        result = bytes(value)
     else:
         raise _asks_for(f"{value.name if isinstance(value, _StandIn) else type(value).__name__} as a value")
-    open_containers.discard(id(value))
     finished[id(value)] = result
     return result
