@@ -39,7 +39,6 @@ COVERED_BY = {
     "reports/run_facts.py": "reports/test_run_report.py",
     "reports/style.py": "reports/test_run_report.py",
     "runs/config.py": "runs/test_config_files.py",
-    "studies/plots.py": "studies/test_report.py",
     "tasks/aligning.py": "tasks/test_registry.py",
     "tasks/avoiding.py": "tasks/test_registry.py",
     "tasks/scooping.py": "tasks/test_registry.py",

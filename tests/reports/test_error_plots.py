@@ -10,7 +10,13 @@ import pytest
 from matplotlib.colors import to_hex
 from run_files import run_of, titles
 
-from torchrl_koap.reports.error_plots import draw_action_errors, draw_actions, draw_losses, running_mean
+from torchrl_koap.reports.error_plots import (
+    draw_action_errors,
+    draw_actions,
+    draw_losses,
+    draw_plan_errors,
+    running_mean,
+)
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import BLUE, PALE_BLUE, RED
 from torchrl_koap.tasks import Action, Task
@@ -20,17 +26,19 @@ NOTHING = run_of(None)
 
 def test_losses_get_a_panel_each_and_zero_is_said():
     names = ("step", "loss_planner", "loss_action", "loss_new_term", "loss_koopman", "learning_rate")
-    logged = ("1 1.0 - - - 1", "2 0.1 - - - 1", "3 - 0 4 - 1", "4 - 0 2 - 1")
+    logged = ("1 1.0 - - - 1", "2 0.1 - - - 1", "3 0.1 - - - 1", "4 - 0 4 - 1", "5 - 0 2 - 1")
     rows = [dict(zip(names, row.replace("-", "").split(" "), strict=True)) for row in logged]
     figure = draw_losses(rows, NOTHING)
     assert titles(figure) == ["planner", "action decoder (labelled steps)", "new term"]
     planner, action, _ = figure.axes
     raw = planner.lines[0]
-    assert raw.get_xdata().tolist() == [1, 2] and raw.get_ydata().tolist() == [1.0, 0.1]
+    assert raw.get_xdata().tolist() == [1, 2, 3] and raw.get_ydata().tolist() == [1.0, 0.1, 0.1]
+    assert planner.lines[1].get_ydata() == pytest.approx([10 ** (-1 / 2), 10 ** (-2 / 3), 0.1])  # geometric means
+    assert planner.texts[0].get_text() == "0.1"
     assert planner.get_yscale() == "log"
     assert not action.lines and "no label" in action.texts[0].get_text()
-    assert action.dataLim.intervalx.tolist() == [3, 4]  # the updates of its part
-    fitted = draw_losses(rows[:1] + rows[2:], replace(NOTHING, summary={"decoder_fit": {"penalty": 0.1}})).axes
+    assert action.dataLim.intervalx.tolist() == [4, 5]  # the updates of its part
+    fitted = draw_losses(rows[:1] + rows[3:], replace(NOTHING, summary={"decoder_fit": {"penalty": 0.1}})).axes
     assert "fitted in closed form" in fitted[1].texts[0].get_text()
     assert fitted[0].lines[1].get_marker() == "o" and fitted[2].lines[1].get_marker() == ""  # one value, two values
 
@@ -43,6 +51,7 @@ def test_the_dot_marks_the_weights_that_were_kept_not_the_best_score():
     dot = scores.lines[0]
     assert (dot.get_xdata()[0], dot.get_ydata()[0]) == (30, 0.52)
     assert scores.texts[0].get_text() == "kept: 0.52, update 30; last: 0.6"
+    assert draw_losses(rows[:4], NOTHING).axes[0].texts[0].get_text() == "kept: 0.52, update 30"
 
 
 def test_a_running_mean_skips_what_is_missing():
@@ -74,11 +83,12 @@ def test_actions_of_another_robot():
     assert titles(draw_actions(data, RunFacts(Path("run"), arm)))[6:] == ["torque 6: RMSE 0.5 N m"]
     figure = draw_actions(data, NOTHING)
     assert titles(figure)[0] == "action 1: RMSE 0.5" and figure.axes[0].get_xlabel().endswith("(per step)")
-    speeds = {"forward": Action("m/s"), "a_very_long_name_of_a_turn": Action("rad")}
+    speeds = {"forward": Action("m/s"), "a_very_long_name_of_a_turn": Action("rad"), "grip": Action("m", "gripper")}
     base = Task(name="base", observation_parts={"q": 7}, actions=speeds, position="q")
-    drawn = draw_actions({name: value[:, :2] for name, value in data.items()}, RunFacts(Path("run"), base)).axes
+    drawn = draw_actions({name: value[:, :3] for name, value in data.items()}, RunFacts(Path("run"), base)).axes
     assert drawn[0].get_xlabel() == "recorded forward (m/s)"  # no second "per"
     assert drawn[1].get_xlabel() == "recorded a_very_l…f_a_turn (mrad per step)"
+    assert drawn[2].get_xlabel() == "recorded grip (mm)"  # a width, not a change
 
 
 def test_actions_that_do_not_belong_together():
@@ -86,9 +96,24 @@ def test_actions_that_do_not_belong_together():
         draw_actions({"predicted": np.zeros((3, 2)), "true": np.zeros((4, 2))}, NOTHING)
 
 
+def test_errors_of_plans_by_planned_step():
+    row = {"unit": "m", "columns": ["x", "y"]}
+    for place, name in enumerate(("planner", "standing_still", "constant_velocity")):
+        row[name] = {
+            "energy_score": {"per_step": [0.001, 0.002 + place]},
+            "best_of": {"per_step": [0.003 + place, 0.004]},
+        }
+    left, right = draw_plan_errors({"plan_errors": {"unit": [row], "samples": 8}}, run_of("avoiding")).axes
+    assert [line.get_xdata().tolist() for line in left.lines] == [[1, 2]] * 3
+    assert left.lines[1].get_ydata() == pytest.approx([1, 1002]) and right.lines[2].get_ydata() == pytest.approx(
+        [2003, 4]
+    )
+    assert (left.get_ylabel(), left.get_xlabel()) == ("distance (mm)", "planned step, 35 ms each")
+
+
 def test_errors_of_actions_are_shares_so_that_small_ones_can_be_read():
     rows = [
-        {"name": "dx", "unit": "m", "controller": 0.0005, "ridge": 0.001, "mean_action": 0.002},
+        {"name": "dx", "unit": "m", "controller": 0.0005, "ridge": 0.003, "mean_action": 0.002},
         {"name": "gripper", "unit": "", "controller": 0.6, "mean_action": 0.5},
         {"name": "still", "unit": "", "controller": 0.0, "ridge": 0.0, "mean_action": 0.0},
     ]
@@ -97,7 +122,7 @@ def test_errors_of_actions_are_shares_so_that_small_ones_can_be_read():
     )
     (axes,) = figure.axes
     heights = [bar.get_height() for bar in axes.patches]
-    assert heights == pytest.approx([0.25, 1.2, math.nan, 0.5, math.nan, math.nan], nan_ok=True)
+    assert heights == pytest.approx([0.25, 1.2, math.nan, 1.5, math.nan, math.nan], nan_ok=True)
     colors = [to_hex(bar.get_facecolor()) for bar in axes.patches]
     assert [colors[0], colors[1], colors[3]] == [BLUE.lower(), RED.lower(), PALE_BLUE.lower()]
     assert axes.lines[0].get_ydata() == [1, 1]  # always the mean action

@@ -4,6 +4,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from run_files import run_of, titles
 
@@ -19,7 +20,11 @@ RUN = run_of("avoiding")
 @pytest.mark.parametrize(
     ("outside", "panels", "said"),
     [
-        ({"labels_read": 50, "held_out_trajectories": 4}, 3, "reads 50 labels, also outside the budget"),
+        (
+            {"labels_read": 50, "held_out_trajectories": 4, "held_out_in_budget": 2},
+            3,
+            "reads 50 labels, also outside the budget",
+        ),
         ({"labels_read": 50, "held_out_trajectories": 4, "held_out_in_budget": 4}, 3, "the decoder has seen"),
         ({"note": "no label lies outside the budget"}, 2, ""),
     ],
@@ -28,12 +33,19 @@ def test_latent_space(outside, panels, said):
     errors = {name: {"measured_xy": [0.001, 0.002]} for name in MODELS} | {"steps": 2, "held_out_trajectories": 3}
     outside = outside if "note" in outside else {"probe_r2": [0.9, 0.8], "decoder_r2": [0.7, 0.6]} | outside
     size = [1.006, 1.0009, 1.00001, 0.9995, 0.995, 0.981]  # some nearer to 1 than the tolerance
-    facts = {"real": size, "imag": [0.0] * 6}
+    turn = np.array([0, 0, 0.1, 0, 0, 0])  # rad
+    facts = {"real": (size * np.cos(turn)).tolist(), "imag": (size * np.sin(turn)).tolist()}
     result = {"latent": {"multi_step": errors, OUTSIDE_THE_BUDGET: outside, "eigenvalues": facts}}
     figure = draw_latent(result, RUN)
     assert len(figure.axes) == panels and figure.get_suptitle().endswith(said)
     assert titles(figure)[0] == "6 eigenvalues, radius 1.006\n2 inside, 3 on, 1 outside the unit circle"
     assert titles(figure)[1] == "Error of the predicted measured xy\non 3 demonstrations"
+    for line in figure.axes[1].lines:
+        np.testing.assert_allclose(line.get_xydata(), [[1, 1], [2, 2]])  # steps, mm
+    if panels == 3:
+        assert [bar.get_height() for bar in figure.axes[2].patches] == [0.9, 0.8, 0.7, 0.6]
+    facts |= {"real": [9.0], "imag": [0.0]}
+    assert draw_latent(result, RUN).axes[0].get_xlim() == pytest.approx((-4.4, 4.4))
 
 
 def test_numbers_of_many_actions_stay_below_the_title_and_one_without_a_value_keeps_its_place():

@@ -9,6 +9,7 @@ import pytest
 from run_files import drawn_lines, make_object_rollouts, make_rollouts, run_of, titles
 from safetensors.numpy import save_file
 
+from torchrl_koap.evaluation.statistics import expected_entropy
 from torchrl_koap.reports import scenes
 from torchrl_koap.reports.animation import animate_rollouts
 from torchrl_koap.reports.pictures import NothingToDraw, all_pictures
@@ -22,6 +23,7 @@ from torchrl_koap.reports.rollout_plots import (
     recorded_modes,
 )
 from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.style import INK
 from torchrl_koap.tasks import TASKS, Action, Modes, Task, get_task
 
 
@@ -39,7 +41,9 @@ def test_modes_histogram(tmp_path):
     axes = figure.axes[0]
     assert [bar.get_height() for bar in axes.patches] == [2] + [0] * 22 + [2]
     assert titles(figure)[0].startswith(f"2 of 24 modes, entropy {math.log(2, 24):.2f};")
-    assert titles(figure)[0].endswith("; 1 without a mode")
+    even = f"{expected_entropy(4, 24):.2f} on average at n = 4"
+    assert titles(figure)[0].endswith(f"; a uniform choice gives {even}; 1 without a mode")
+    assert [axes.texts[group].get_text() for group in (0, 1, 5)] == ["left / left", "left / middle", "right / right"]
     levels = [line[0][1] for line in drawn_lines(axes)]
     assert levels[5] == pytest.approx(4 * 2 / 3) and sum(levels) == pytest.approx(4)
     np.testing.assert_allclose(
@@ -95,7 +99,7 @@ def test_rollouts_are_cut_coloured_and_counted():
     np.testing.assert_allclose(lines.get_segments(), ROLLOUTS["position"][:2])
     np.testing.assert_allclose(lines.get_colors()[:, :3], mode_colors(get_task("avoiding").modes)[:2])
     late, hit = axes.lines[1:]  # the first line is the finish
-    assert len(late.get_xdata()) == 20 and len(hit.get_xdata()) == 10
+    assert len(late.get_xdata()) == 20 and len(hit.get_xdata()) == 10 and late.get_color() == hit.get_color() == INK
     np.testing.assert_allclose(axes.collections[-1].get_offsets()[0], ROLLOUTS["position"][3, 9])
 
 
@@ -118,13 +122,29 @@ def test_objects_get_a_panel(task):
 
 
 def test_plans_lie_over_their_path():
-    figure = draw_plans(ROLLOUTS, run_of("avoiding"))
+    aside, along = np.full((14, 1), 0.001), ROLLOUTS["position"][1, -1] - ROLLOUTS["position"][1, 0]
+    normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    plan = ROLLOUTS["plan"].copy()
+    plan[1] += aside * normal
+    plan[1, 0, 0] += 0.01 * normal  # one of 16 points
+    figure = draw_plans(ROLLOUTS | {"plan": plan}, run_of("avoiding"))
     assert {(axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes} == {("x (m)", "y (m)")}
     axes = figure.axes[3]
-    assert axes.get_title(loc="left") == "episode 1: left, left, gap 2\noff the path: median 0.0, 95 % within 0.0 mm"
+    assert axes.get_title(loc="left") == "episode 1: left, left, gap 2\noff the path: median 1.0, 95 % within 3.5 mm"
+    assert titles(figure)[:2] == [
+        f"episode {n}: {end}\noff the path: median 0.0, 95 % within 0.0 mm"
+        for n, end in ((2, "out of time"), (3, "collision"))
+    ]
     lines = drawn_lines(axes)
     assert len(lines) == 4 and all(len(line) == 4 for line in lines)
     np.testing.assert_allclose(axes.collections[1].get_offsets(), ROLLOUTS["position"][1, [0, 4, 8, 12]])
+
+
+def test_plans_stand_beside_the_starts_of_their_own_episode():
+    rollouts = make_object_rollouts("sorting")
+    for axes, episode in zip(draw_plans(rollouts, run_of("sorting")).axes, (2, 3, 0, 1), strict=True):
+        centres = [line[:4].mean(0) for line in drawn_lines(axes) if len(line) == 5]  # of outlines
+        np.testing.assert_allclose(centres, rollouts["context"][episode, :, :2])
 
 
 def test_plan_deviation_is_the_distance_to_the_polyline():

@@ -9,8 +9,7 @@ from html_pages import Page
 from PIL import Image
 from tiny_runs import read_csv
 
-from torchrl_koap.studies import plots, report
-from torchrl_koap.studies.plots import method_styles
+from torchrl_koap.studies import report
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.table import summarise
 
@@ -174,41 +173,6 @@ def test_success_and_errors_of_one_study_are_told_apart(tmp_path):
     assert "success above 0: koap succeeds more often. Difference of errors below 0: koap errs less." in text
     assert "evaluated on recorded data or rolled out on fixed evaluation contexts." in text
     assert "avoiding 1 % ridge +30.0 +0.0 to +60.0" in text and "arm 1 % ridge – +0.000 to +0.600" in text
-
-
-def test_methods_differ_without_colour():
-    styles = list(method_styles([f"method {number}" for number in range(27)]).values())
-    assert len({str(style) for style in styles}) == 27 and len({style["marker"] for style in styles[:12]}) == 12
-    assert len({(style["color"], str(style["linestyle"])) for style in styles[:12]}) == 12
-
-
-def test_intervals_are_drawn_side_by_side_on_any_axis(monkeypatch, tmp_path):
-    rows = make_cells(methods=dict.fromkeys("abcde", 0.5), seeds=1)
-    for row in rows:
-        row["labelled_transitions"] = 880 if row["labels"] == 0.1 else 800
-    drawn = []
-    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
-    plots.plot_measure(summarise(rows), tmp_path / "x.png", by=("labels", "labelled_transitions"))
-    drawn[0].draw_without_rendering()
-    for axes in drawn[0].axes:
-        left, right = (line.get_transform().transform(line.get_xydata()[0])[0] for line in axes.lines[::4])
-        assert 0.05 < (right - left) / drawn[0].dpi < 0.15  # inches
-
-
-@pytest.mark.parametrize("errors", [(0.6, 0.7), (2.8, 3.1), (0.9, 5.0), (0.3, 30.0)])
-def test_every_line_across_errors_has_its_number_and_there_are_two(errors, monkeypatch, tmp_path):
-    rows = make_cells(methods={"koap": 1.0}, seeds=1)
-    for row, error in zip(rows, errors, strict=True):
-        row["action_error"] = error
-    drawn = []
-    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
-    plots.plot_measure(summarise(rows), tmp_path / "x.png", "action_error")
-    drawn[0].draw_without_rendering()
-    axes = drawn[0].axes[0]
-    low, high = axes.get_ylim()
-    named = [tick for tick in axes.yaxis.get_major_ticks() if low <= tick.get_loc() <= high]
-    assert len(named) >= 2 and all(tick.label1.get_text() for tick in named)
-    assert not any(tick.gridline.get_visible() for tick in axes.yaxis.get_minor_ticks())
 
 
 def test_the_unit_of_the_errors_does_not_depend_on_the_first_cell(monkeypatch, tmp_path):

@@ -292,7 +292,7 @@ def _draw_plans_over_time(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     figure = Figure(figsize=(3.8 * len(episodes) + 0.3, 1.9 * len(columns) + 0.5), layout="constrained")
     grid = figure.subplots(len(columns), len(episodes), squeeze=False, sharex="col", sharey="row")
     for index, down in zip(episodes, grid.T, strict=True):
-        made = np.flatnonzero((plan_step[index] >= 0) & (plan_step[index] < length[index]))
+        made = np.flatnonzero(plan_step[index] >= 0)
         steps = plan_step[index, made, None] + 1 + np.arange(plan.shape[2])
         for place, (axes, column) in enumerate(zip(down, columns, strict=True)):
             lines = np.stack([steps, plan[index, made, :, place]], -1)
@@ -320,9 +320,9 @@ def choose_episodes(mode: np.ndarray, outcome: np.ndarray, count: int) -> list[i
     firsts = [int(good[mode[good] == value][0]) for value in np.unique(mode[good])]
     room = count - len(chosen)
     if len(firsts) > room:
-        firsts = [firsts[int(index)] for index in np.linspace(0, len(firsts) - 1, max(room, 0)).round()]
+        firsts = [firsts[int(index)] for index in np.linspace(0, len(firsts) - 1, room).round()]
     rest = [int(index) for index in good if index not in firsts]
-    return chosen + (firsts + rest + spare)[: max(room, 0)]
+    return chosen + (firsts + rest + spare)[:room]
 
 
 def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
