@@ -33,6 +33,10 @@ def actions(own, ridge):
     return {"action_errors_on": "left_out", "action_errors": errors}
 
 
+def labelled(count):
+    return {"summary": {"labels": {"labelled_transitions": count}}, "config": {"method": "koap"}}
+
+
 def commands(**numbers):
     return [item.command for item in found(**numbers)]
 
@@ -50,6 +54,11 @@ FEW = rates(0.95) | {"mode_entropy": 0.3}
         ({"evaluation": rates(0.5)}, ["koap inspect {run}"]),
         ({"evaluation": rates(0.5) | {"env": "mine:Base-v0"}}, ["koap eval {run} --out {run}_recorded"]),
         ({"evaluation": rates(0.5), "summary": {"planner_parameters": 0}}, []),  # a policy of its own
+        ({"evaluation": rates(0.0) | {"env": "mine:Walker-v0"}}, []),  # success is not defined
+        ({"evaluation": rates(0.5), **labelled(299)}, ["koap inspect {run}", "koap suggest {run} --count 5"]),
+        ({"evaluation": rates(0.5), **labelled(300)}, ["koap inspect {run}"]),
+        ({"evaluation": FEW, "task": AVOIDING, "summary": {"planner_parameters": 0}}, [""]),  # another method
+        ({"inspection": inspected(0.95, 0.95, 0.9)}, []),  # the loop is hardly worse than its parts
         ({"evaluation": FEW, "task": AVOIDING}, ["koap inspect {run}"]),
         ({"evaluation": FEW | {"mode_entropy": 0.8}, "task": AVOIDING}, []),
         ({"evaluation": FEW | {"pooled_mode_entropy": 0.9}, "task": AVOIDING}, []),  # few rollouts per context
@@ -83,9 +92,7 @@ def test_a_controller_that_stays_near_recorded_tool_paths_is_not_what_fails():
 
 
 def test_more_labels_are_not_proposed_where_the_planner_fails():
-    numbers = {"summary": {"labels": {"labelled_transitions": 80}}, "evaluation": rates(0.5)}
-    numbers["config"] = {"method": "koap"}
-    assert "koap suggest {run} --count 5" in commands(**numbers)
+    numbers = labelled(80) | {"evaluation": rates(0.5)}
     assert "koap suggest {run} --count 5" not in commands(**numbers, inspection=inspected(0.6, 0.9, 0.5))
 
 

@@ -12,7 +12,7 @@ from toy_gym import Drawn
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.reports import animation
 from torchrl_koap.reports.animation import animate_rollouts
-from torchrl_koap.reports.pictures import NotFilmed, NothingToDraw, save_film
+from torchrl_koap.reports.pictures import Film, NotFilmed, NothingToDraw, save_film
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
@@ -21,7 +21,11 @@ RUN = run_of("avoiding")
 
 def test_animation_shows_every_step_and_holds_the_end(tmp_path):
     path = tmp_path / "a.gif"
-    save_film(animate_rollouts(make_rollouts(), RUN), path)
+    film = animate_rollouts(make_rollouts(), RUN)
+    frames = list(film.frames)
+    save_film(Film(frames, film.seconds), path)
+    dark = np.diff([(frame < 60).all(-1).sum() for frame in frames])
+    assert dark.argmax() == 9  # the square of what ran out of time
     with Image.open(path) as film:
         assert film.n_frames == 11 and film.info["duration"] == 70  # steps 0, 2, ..., 18, 19; 2 x 35 ms
         first = np.asarray(film.convert("L")).astype(int)
@@ -29,6 +33,12 @@ def test_animation_shows_every_step_and_holds_the_end(tmp_path):
         assert film.info["duration"] == 1500
         assert (np.abs(np.asarray(film.convert("L")).astype(int) - first) > 60).sum() > 500
     assert path.stat().st_size < 2e6
+
+
+def test_the_line_ahead_of_a_dot_is_the_latest_plan_without_its_executed_part():
+    plan, made = np.arange(24.0).reshape(3, 4, 2), np.array([0, 4, -1])
+    for step, line in ((0, plan[0]), (3, plan[0, 3:]), (4, plan[1]), (6, plan[1, 2:])):
+        np.testing.assert_array_equal(animation._latest_plan(plan, made, step), line)
 
 
 def test_objects_move_in_the_animation():
@@ -66,10 +76,10 @@ def frames_of(actions, task, monkeypatch, size, **more):
 
 
 def test_film_of_recorded_actions(monkeypatch):
-    actions = np.full((6, 2), 0.008)
-    actions[5] = np.nan
+    actions = np.full((7, 2), 0.008)
+    actions[6] = np.nan
     frames = frames_of(actions, "avoiding", monkeypatch, (96, 72))
-    assert len(frames) == 4 and frames[0].shape == (72, 96, 3)  # the start, and after 2, 4, 5 steps
+    assert len(frames) == 4 and frames[0].shape == (72, 96, 3)  # the start, and after 2, 4, 6 steps
 
 
 @pytest.mark.parametrize("task", ["aligning", "po_sorting"])
@@ -104,8 +114,8 @@ def test_the_first_success_is_filmed(monkeypatch):
     assert of.name == "stacking_1" and stride == 2
     np.testing.assert_array_equal(context, rollouts["context"][2:3])
     assert context.dtype == np.float64
-    film_of({"action": np.zeros((1, 60, 2)), "outcome": [1]}, "avoiding")
-    assert made[1][3] == 3  # a long rollout has few frames
+    film = film_of({"action": np.zeros((1, 60, 2)), "outcome": [1]}, "avoiding")
+    assert made[1][3] == 3 and film.seconds == pytest.approx(0.07)  # a long rollout has few frames, and is fast
 
 
 def test_a_rollout_in_gymnasium_is_played_again_from_its_seed():

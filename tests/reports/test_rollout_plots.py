@@ -101,6 +101,7 @@ def test_rollouts_are_cut_coloured_and_counted():
     late, hit = axes.lines[1:]  # the first line is the finish
     assert len(late.get_xdata()) == 20 and len(hit.get_xdata()) == 10 and late.get_color() == hit.get_color() == INK
     np.testing.assert_allclose(axes.collections[-1].get_offsets()[0], ROLLOUTS["position"][3, 9])
+    assert [len(mark.get_paths()[0]) for mark in axes.collections[-2:]] == [5, 13]  # corners of a square, of a cross
 
 
 @pytest.mark.parametrize("task", ["aligning", "sorting", "stacking", None])

@@ -63,3 +63,20 @@ def test_numbers_without_a_unit_are_in_units_of_the_data():
     (found,) = evaluation_rows(run_of(None, evaluation={"action_errors_on": "left_out", "action_errors": errors}))
     note = "root mean square in units of the data; ridge on raw frames 0.6, always the mean action 2"
     assert found == Row("action error, q", "0.5", f"{note}; 1,200 labels of recordings left out of the fit")
+
+
+def test_the_largest_commands_of_a_closed_loop():
+    loop = {"largest_command": 1.5, "largest_command_late": 1.25, "steps": 90, "limited_commands": 3, "commands": 1800}
+    (found,) = evaluation_rows(run_of(None, evaluation={"loop": loop | {"distance_to_demonstrations": 0.5}}))
+    assert found.value == "1.5 times" and "; 1.25 times in the last third; 3 of 1,800 commands limited" in found.note
+
+
+def test_in_a_simulator_errors_that_were_not_measured_are_no_row():
+    errors = {"outside_budget": {"note": "no labels outside the budget"}}
+    assert evaluation_rows(run_of("avoiding", evaluation={"action_errors": errors})) == []
+
+
+def test_successes_are_counted_and_have_modes_in_the_simulator_of_the_task_alone():
+    evaluation = {"rates": {"success": {"rate": 0.29, "episodes": 100}}}  # 0.29 * 100 is below 29 in floating point
+    run, elsewhere = (run_of("avoiding", evaluation=evaluation | more) for more in ({}, {"env": "mine:Base-v0"}))
+    assert run.successes == 29 and run.expected_entropy and elsewhere.expected_entropy is None

@@ -9,6 +9,7 @@ import pytest
 from html_pages import Page
 from run_files import LABELS, make_demonstrations, make_object_rollouts, write_run
 from safetensors.numpy import save_file
+from small_networks import plain_task
 
 from torchrl_koap.evaluation.statistics import expected_entropy
 from torchrl_koap.reports import pictures
@@ -111,6 +112,15 @@ def test_commands_to_try_next_roll_out_in_the_environment_of_the_last_rollouts(t
     assert f"koap eval {tmp_path} --episodes 60 --seed 100 {where} is_success" in text
 
 
+def test_a_run_without_a_simulator_is_evaluated_on_recordings(tmp_path):
+    about = {"task": "plain", "task_definition": plain_task(2, 2).definition()}
+    (tmp_path / "config.json").write_text(json.dumps(about))
+    page = Page(write_report(tmp_path))
+    assert f"koap eval {tmp_path}" in page.text and "--episodes" not in page.text
+    (tmp_path / "eval.json").write_text(json.dumps({"trajectory": [{"name": "seventh", "labels": 3}]}))
+    assert "seventh 3" in Page(write_report(tmp_path)).text
+
+
 def test_a_picture_that_no_evaluation_could_leave_says_why(tmp_path):
     errors = {"outside_budget": {"note": "no labels outside the budget"}}
     (tmp_path / "eval.json").write_text(json.dumps({"action_errors": errors}))
@@ -186,7 +196,7 @@ def test_tiles_of_a_task_with_contexts(tmp_path):
         "Outside the budget, for evaluation only: 20 labels",
     ):
         assert wanted in text
-    assert "two boxes" not in text
+    assert "two boxes" not in text and "3 of 4 rollouts in" not in text
 
 
 @pytest.mark.parametrize("task", ["aligning", "stacking"])

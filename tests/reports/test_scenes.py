@@ -47,7 +47,9 @@ def test_sorting_is_that_of_the_environment(task, models):
         walls = [(*body.pos[:2] + model.geom_pos[geom][:2], *model.geom_size[geom][:2]) for geom in geoms]
         found = [(*shape.center, *shape.half) for shape in shapes(task, "wall") if shape.color == name]
         np.testing.assert_allclose(sorted(walls), sorted(found), atol=1e-12)
-    colors = {patch.get_facecolor()[:3] for patch in scenes.draw_scene(Figure().add_subplot(), TASKS[task]).patches[1:]}
+    ground, *patches = scenes.draw_scene(Figure().add_subplot(), TASKS[task]).patches
+    np.testing.assert_allclose(ground.get_bbox().get_points(), [centre - half, centre + half])
+    colors = {patch.get_facecolor()[:3] for patch in patches}
     assert colors == {to_rgb(scenes.RED), to_rgb(scenes.BLUE)}
 
 
@@ -95,6 +97,27 @@ def test_orientation_is_drawn(number):
         assert len(lines) == 42
         np.testing.assert_allclose(lines[0], [[0.5, -0.2], [0.5, -0.15]])
         np.testing.assert_allclose(lines[21], [[0.5, 0.3], [0.45, 0.3]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("end", "limit"), [(0.9, 1), (1.2, 1.236), (4, 1.5)])
+def test_a_panel_is_widened_by_half_at_most(end, limit):
+    axes, path = Figure().add_subplot(), np.array([[0.0, 0.5], [end, 0.5]])
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    scenes.keep_inside(axes, [path])
+    assert axes.get_xlim()[1] == pytest.approx(limit) and axes.get_ylim() == (0, 1)
+    free = Figure().add_subplot()
+    scenes.keep_inside(free, [path])
+    assert free.get_xlim() == pytest.approx((-0.03 * end, 1.03 * end))
+
+
+def test_ends_of_bodies_are_dots_and_those_of_failures_crosses():
+    position = np.stack([np.full((8, 1, 2), 0.1), np.full((8, 1, 2), 0.2)])
+    paths = scenes.body_paths({"object_position": position, "length": [5, 3]})
+    assert [len(path) for path in paths] == [6, 4]  # with the last state
+    axes = Figure().add_subplot()
+    scenes.draw_bodies(axes, paths, None, [True, False])
+    _, dots, crosses = axes.collections
+    assert (dots.get_offsets().tolist(), crosses.get_offsets().tolist()) == ([[0.1, 0.1]], [[0.2, 0.2]])
 
 
 def test_objects_of_an_unknown_task_are_grey():

@@ -118,7 +118,7 @@ def _latest_plan(plan: np.ndarray, plan_step: np.ndarray, step: int) -> np.ndarr
     made = np.flatnonzero((plan_step >= 0) & (plan_step <= step))
     if not len(made):
         return np.zeros((0, 2))
-    points = plan[made[-1], max(step - int(plan_step[made[-1]]), 0) :]  # without the executed part
+    points = plan[made[-1], step - int(plan_step[made[-1]]) :]  # without the executed part
     return points[np.isfinite(points).all(1)]
 
 

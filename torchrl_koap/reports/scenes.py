@@ -115,7 +115,7 @@ def body_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
 def _paths(rollouts: Mapping[str, Any], key: str, shape: Sequence[int | None], last: int = 0) -> list[np.ndarray]:
     position = entry(rollouts, key, shape)
     length = entry(rollouts, "length", [len(position)])
-    paths = [row[: max(int(number), 0) + last] for row, number in zip(position, length, strict=True)]
+    paths = [row[: int(number) + last] for row, number in zip(position, length, strict=True)]
     return [path[np.isfinite(path).all(tuple(range(1, path.ndim)))] for path in paths]
 
 
