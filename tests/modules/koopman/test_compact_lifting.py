@@ -7,7 +7,12 @@ import pytest
 import torch
 
 from torchrl_koap.modules import make_koopman_inverse_dynamics
-from torchrl_koap.modules.koopman.compact_lifting import CompactLifting, NoiseAdjustedComponents, isomap
+from torchrl_koap.modules.koopman.compact_lifting import (
+    CompactLifting,
+    NoiseAdjustedComponents,
+    isomap,
+    noise_covariance,
+)
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 
@@ -33,6 +38,15 @@ def train(lifting, windows, steps=250):
         optimiser.zero_grad()
         lifting.reconstruction_error(lifting.encode(batch), batch).mean().backward()
         optimiser.step()
+
+
+def test_noise_is_told_from_a_smooth_motion():
+    speed = torch.randn(4000, 1, 2, generator=torch.Generator().manual_seed(2))
+    windows = (3 * speed + 0.5 * torch.arange(12)[:, None]).sin()
+    assert noise_covariance(windows).abs().max() < 1e-3
+    spread = torch.tensor([[0.3, 0.0], [0.2, 0.1]])
+    noise = torch.randn(windows.shape, generator=torch.Generator().manual_seed(3)) @ spread.mT
+    torch.testing.assert_close(noise_covariance(windows + noise).float(), spread @ spread.mT, rtol=0, atol=0.02)
 
 
 class TestNoiseAdjustedComponents:
@@ -89,6 +103,8 @@ class TestCompactLifting:
         assert (lifted.flatten(0, 1).std(0) > 1e-3).sum() == kept
         error = (lifting.decode(lifted) - windows).square().mean() / windows.var()
         assert error < 0.2
+        lifting.prepare(windows)
+        assert lifting.kept.all()  # the next training chooses anew
 
     def test_a_folded_state_is_unfolded_before_training(self):
         place = torch.linspace(0, 1, 120)[:, None, None] + 0.004 * torch.arange(15)[:, None]  # [120, 15, 1]

@@ -231,6 +231,20 @@ def test_an_axis_with_too_few_labels_is_decoded_like_the_other():
     assert answers[0, 1] < 0.4
 
 
+def test_the_shared_filter_reads_raw_steps_in_the_units_of_the_actions():
+    model, state, axes = (
+        make_koopman_inverse_dynamics(3, 2, num_features=4, **base.normalizers()),
+        torch.randn(20, 10, 3),
+        [2, 0],
+    )
+    model.prepare(state)
+    latent = model.infer(state, range(4, 5))[:, 0].double()
+    basis = model._shared_filter(latent.shape[-1], axes, *model.latent_action.axis_features(axes)).basis
+    steps = torch.einsum("nm,sam->nsa", latent, basis) * base.ACTION["scale"]
+    read = state[:, [0, 1, 2, 3, 4, 6, 7, 8, 9]].double()
+    torch.testing.assert_close(steps, read.diff(dim=1)[..., axes], rtol=1e-4, atol=1e-5)
+
+
 def test_guessed_axes_are_used_only_where_held_out_labels_agree():
     state = torch.randn(300, 16, 2, generator=torch.Generator().manual_seed(3)).cumsum(1) * 0.01
     ahead = torch.cat([state[:, 3:] - state[:, 2:-1], torch.zeros(300, 3, 2)], 1)

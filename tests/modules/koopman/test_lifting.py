@@ -14,7 +14,8 @@ def test_states_are_the_first_observables():
     lifted = lifting.encode(state)
     assert torch.equal(lifted[..., :3], state)
     torch.testing.assert_close(lifted[..., 3:], lifting.encoder(state))
-    assert torch.equal(KoopmanLifting(3, 3, include_state=True).encode(state), state)
+    same = KoopmanLifting(3, 3, include_state=True)
+    assert torch.equal(same.encode(state), state) and same.keeps_state and not lifting.keeps_state
 
 
 def test_bad_liftings_are_refused():

@@ -12,7 +12,7 @@ from torchrl_koap.objectives import KOAPLoss
 def test_paper_is_the_paper():
     model = make_koopman_inverse_dynamics(2, 2, preset="paper")
     assert isinstance(model.latent_action, LatentActionLSTM) and model.reader.look_ahead == (8,)
-    assert model.operator.input is None
+    assert model.operator.input is None and model.reader.clamped and model.penalty == 0.15
     assert isinstance(model.lifting.encoder, torch.nn.Sequential) and not model.lifting.include_state
     assert isinstance(model.action_decoder.linear, torch.nn.Linear)
 
@@ -50,6 +50,8 @@ def test_options_override_the_preset_and_reach_the_parts():
     fourier = make_koopman_inverse_dynamics(2, 2, num_features=32, kernels=kernels).latent_action
     assert fourier.kernel == pytest.approx(((2 * 0.5 / 32) ** 0.5, 2.0, 3.0))
     assert fourier.blocks == ("one",) and fourier.phase.numel() == 32
+    compact = make_koopman_inverse_dynamics(9, 2, preset="semi_supervised", hidden_dim=16).lifting
+    assert compact.coordinates == 2 and compact.small.encoder[0].out_features == 16  # one for each action entry
 
 
 @pytest.mark.parametrize(
@@ -61,8 +63,9 @@ def test_options_override_the_preset_and_reach_the_parts():
         ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
         ({"normalization": {"state": "minmax"}}, "option .* preset 'default': 'normalization'"),
         ({"preset": "paper", "kernels": {}}, "option .* preset 'paper': 'kernels'"),
+        ({"include_state": True}, "include_state needs latent_dim >= state_dim, got 32 < 33"),
     ],
 )
-def test_unknown_names_are_refused(options, message):
+def test_unknown_names_and_impossible_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        make_koopman_inverse_dynamics(2, 2, **options)
+        make_koopman_inverse_dynamics(33, 2, **options)

@@ -256,7 +256,6 @@ class CompactLifting(TensorDictModuleBase):
     @torch.no_grad()
     def finish(self, windows: Tensor) -> None:
         """Chooses, after training, one network by the reconstruction errors of both on windows ``[*B, T, d]``."""
-        self.kept.fill_(1.0)
         sums = torch.zeros(2, dtype=torch.float64)
         for part in windows.reshape(-1, *windows.shape[-2:]).split(BATCH):
             target = self.components(part)
