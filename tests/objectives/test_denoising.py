@@ -83,6 +83,9 @@ def test_features_and_an_encoder_before_the_planner_are_trained():
     data = batch_of(5).update({"state": encoder(windows(5))})
     PlannerLoss(planner)(data)["loss_planner"].backward()
     assert planner.features.weight.grad.abs().max() > 0 and encoder.weight.grad.abs().max() > 0
+    state = windows(5).requires_grad_()
+    PlannerLoss(planner)(batch_of(5).update({"state": state}))["loss_planner"].backward()
+    assert state.grad[:, :2].any() and not state.grad[:, 2:].any()  # the target does not move towards its prediction
 
 
 class Narrow(torch.nn.Linear):

@@ -160,6 +160,8 @@ def test_single_losses_are_the_terms_of_the_sum_and_read_no_more(loss_class, red
     assert list(found.keys()) == single.out_keys and len(single.out_keys) == 1
     for key, value in found.items():
         assert torch.equal(value, together(batch)[key])
+        together.select_out_keys(key)
+        assert set(together(batch).keys()) == {key} and torch.equal(together(batch)[key], value)
     with pytest.raises(KeyError, match="state.*there are"):
         single(batch.exclude("state"))
 

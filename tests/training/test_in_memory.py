@@ -118,20 +118,28 @@ def test_a_planner_learns_nothing_of_what_is_held_out_and_a_controller_all_label
 def test_a_policy_without_plans_sees_trajectories_with_labels_alone():
     data, task = make_demonstrations(**few_labels())
     data["has_action"][9], data["action"][9] = False, torch.nan
+    data["action"] += 50
     options = {"method": "dp", "planner": {"steps": 2, **SMALL}, "progress": False}
     trained, other = fit(data, task, **options), data.clone()
     other["observation"][data["episode"] > 1] += 9.0
     assert same_weights(fit(other, task, **options).controller, trained.controller)
     assert not trained.controller.training and trained.planner is None
+    assert (trained.controller.action_normalizer.offset - 50).abs().max() < 5
 
 
-def test_a_policy_without_plans_learns_from_the_last_steps_too(monkeypatch):
+def test_a_policy_without_plans_learns_from_the_last_steps_too_and_from_augmented_windows(monkeypatch):
+    def moved(task, states, *, actions):
+        assert actions
+        return lambda batch: batch.update({"state": batch["state"] + 1000})
+
+    monkeypatch.setattr("torchrl_koap.training.controller.augmentation", moved)
     batches, line = [], np.arange(41.0)[:, None]
     monkeypatch.setattr(DiffusionPolicyLoss, "forward", observed(DiffusionPolicyLoss.forward, batches))
     data, task = make_demonstrations([line] * 2, [line[:-1]] * 2, control_hz=10, action_kind="raw")
     fit(data, task, method="dp", planner={"steps": 2, "width": 8, "batch_size": 512}, progress=False)
     first = torch.cat([batch["action"][:, 1] for batch in batches])
     assert first.unique().tolist() == [*range(39)]  # steps that another one follows
+    assert min(batch["state"].min() for batch in batches) == 1000
 
 
 def test_a_teacher_predicts_targets_if_actions_are_targets():
