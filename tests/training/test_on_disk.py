@@ -278,6 +278,9 @@ def test_a_planner_is_shared_between_folders_of_the_same_columns(tmp_path):
     assert Trained.load(tmp_path / "other").task.name == "two"
     with pytest.raises(CheckpointError, match="was trained on task 'one', not on 'slow'"):
         train(TrainConfig(out=tmp_path / "wrong", dataset=str(tmp_path / "slow"), **shared))
+    simulated = replace(other.task, env=TASK.env)
+    with pytest.raises(CheckpointError, match="was trained on task 'one', not on 'two'"):
+        on_disk.planner_of_source(simulated, other.config)
     save_demonstrations(tmp_path / "mm", states, actions, control_hz=30, name="one", state_units="mm")
     with pytest.raises(CheckpointError, match="with another state_units than the demonstrations"):
         train(TrainConfig(out=tmp_path / "wrong", dataset=str(tmp_path / "mm"), **shared))
