@@ -209,6 +209,8 @@ def test_a_share_of_the_trajectories_is_used_those_with_labels_first(demonstrati
     labels = LabelConfig(count=2, trajectories=0.5)
     found = train_tiny(tmp_path / "run", demonstrations, planner, "linear", labels=labels).results
     assert found["trajectories_used"] == 4 and found["labels"]["trajectories_touched"] == 2
+    drawn = load_tensors(tmp_path / "run" / "demonstrations.safetensors")[0]
+    assert torch.equal(drawn["position"], drawn["state"])  # in Avoiding the state is the measured position
 
 
 def test_a_planner_for_a_curve_knows_the_labelled_trajectories_and_holds_few_out(tmp_path, monkeypatch):
