@@ -211,8 +211,10 @@ def test_a_clock_or_counter_that_starts_again_and_flags_of_starts():
             np.testing.assert_array_equal(np.stack(read(**column, **numbers).states)[..., 0], X.reshape(2, 3))
     for flags in ([1, 0, 0, 1, 0, 0], [1, 1, 0, 1, 1, 0], [0, 0, 0, 1, 1, 1]):  # a flag may stay 1
         assert [len(frames) for frames in read(is_first=flags).states] == [3, 3]
-    with pytest.raises(DataError, match="time stamps do not increase"):  # set back, not started again
-        read(control_hz=None, time=[0.0, 0.1, 0.2, 0.3, 0.2, 0.3])
+    for stamps in ([0.0, 0.1, 0.2, 0.3, 0.2, 0.3], [0.0, 0.1, 0.2, 0.0, 0.4, 0.5], [0.0, 0.1, 0.2, 0.3, 0.4, 0.0]):
+        with pytest.raises(DataError, match="time stamps do not increase"):  # set back or wrong, not started again
+            read(control_hz=None, time=stamps)
+        assert len(read(time=stamps, episode=[0] * 6).states) == 1
 
 
 def test_a_camera_with_more_frames_than_rows_is_named():

@@ -148,11 +148,14 @@ def _by_clock(parts: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]
 
 
 def _restarts(times: np.ndarray) -> np.ndarray:
-    """Returns in which rows of a clock ``[T]`` an episode begins: the first, and those that go back to its time."""
-    back = np.r_[True, np.diff(times) < 0]
-    steps = np.abs(np.diff(times))
-    near = np.abs(times[back] - times[0]) < 0.5 * np.median(steps) if len(steps) else np.array([True])
-    return back if near.all() and (np.diff(np.flatnonzero(back)) > 1).all() else _first(times)
+    """Returns in which rows of a clock ``[T]`` an episode begins: the first, and those where all begin again.
+
+    A clock begins again if it goes back to its first time and runs on from there. A single wrong stamp does not.
+    """
+    back, steps = np.r_[True, np.diff(times) < 0], np.diff(times, append=times[-1:])
+    usual = np.median(np.abs(steps[:-1])) if len(times) > 1 else 0.0
+    again = (np.abs(times[back] - times[0]) < usual / 2) & (steps[back] > 0) & (steps[back] < 2 * usual)
+    return back if again.all() else _first(times)
 
 
 def _first(rows: np.ndarray) -> np.ndarray:
