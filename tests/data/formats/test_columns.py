@@ -37,6 +37,7 @@ def test_a_counter_splits_and_sorts():
     np.testing.assert_array_equal(np.stack(mixed.states)[..., 0], [X[::2], X[1::2]])
     with pytest.raises(DataError, match="episode_id 0 returns"):
         read(episode_id=[0, 0, 1, 1, 0, 0])
+    assert [len(frames) for frames in read(episode_id=[0, 0, 1, 1, 0, 0], time=np.arange(6) / 20).states] == [4, 2]
     rows = np.random.default_rng(1).permutation(30)
     few = read(episode=[0] * 6, x=[0, 1, 2, 3, 5, 4], time=np.array([0, 1, 2, 3, 5, 4]) / 20)
     np.testing.assert_array_equal(few.states[0][:, 0], np.arange(6))
@@ -211,7 +212,12 @@ def test_a_clock_or_counter_that_starts_again_and_flags_of_starts():
             np.testing.assert_array_equal(np.stack(read(**column, **numbers).states)[..., 0], X.reshape(2, 3))
     for flags in ([1, 0, 0, 1, 0, 0], [1, 1, 0, 1, 1, 0], [0, 0, 0, 1, 1, 1]):  # a flag may stay 1
         assert [len(frames) for frames in read(is_first=flags).states] == [3, 3]
-    for stamps in ([0.0, 0.1, 0.2, 0.3, 0.2, 0.3], [0.0, 0.1, 0.2, 0.0, 0.4, 0.5], [0.0, 0.1, 0.2, 0.3, 0.4, 0.0]):
+    for stamps in (
+        [0.0, 0.1, 0.2, 0.3, 0.2, 0.3],
+        [0.0, 0.1, 0.2, 0.15, 0.25, 0.35],
+        [0.0, 0.1, 0.2, 0.0, 0.4, 0.5],
+        [0.0, 0.1, 0.2, 0.3, 0.4, 0.0],
+    ):
         with pytest.raises(DataError, match="time stamps do not increase"):  # set back or wrong, not started again
             read(control_hz=None, time=stamps)
         assert len(read(time=stamps, episode=[0] * 6).states) == 1
