@@ -228,7 +228,8 @@ def test_what_lerobot_writes_is_read_without_loss(tmp_path):
         written.save_episode()
     written.finalize()
     found = read_recordings(tmp_path / "set")
-    assert found.control_hz == 10 and found.skipped == ("timestamp",)
+    assert found.control_hz == 10
+    assert found.skipped == ("task_index (2 tasks become one: name the episodes (--episodes) of one)", "timestamp")
     assert found.state_names == ("x", "y", *(f"environment_state_point_{index}" for index in range(16)))
     for (state, points, action), frames, steps in zip(kept, found.states, found.actions, strict=True):
         np.testing.assert_array_equal(frames, np.concatenate([state, points], 1))

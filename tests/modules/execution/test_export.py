@@ -3,6 +3,8 @@
 
 import importlib.util
 import json
+import logging
+import warnings
 
 import numpy as np
 import pytest
@@ -77,10 +79,13 @@ def exported(tmp_path_factory):
 
 
 def test_a_policy_comes_back_from_its_file(exported):
-    what, _, loaded = exported
+    what, path, loaded = exported
     other = [value + 0.1 for value in what.batch(7)]  # the batch is dynamic
     with torch.no_grad():
-        torch.testing.assert_close(loaded(*other), what.module(*other), atol=1e-5, rtol=1e-5)
+        expected = what.module(*other)
+    torch.testing.assert_close(loaded(*other), expected, atol=1e-5, rtol=1e-5)
+    assert not torch.export.load(path).module()(*other)[0].requires_grad  # .numpy() needs no torch.no_grad()
+    assert what.module(*other)[0].requires_grad
 
 
 def test_an_origin_is_exported(tmp_path):
@@ -111,7 +116,9 @@ def test_onnx_is_called_as_its_metadata_say(tmp_path):
         usual = 0.99 * float(policy(candidates=3).decode_ahead(frames, noise)[0][..., 0].abs().median())
         whole = policy(ranges=[(-usual / 2, usual / 2), None, None], replan_interval=3, candidates=3)  # widened by half
         expected, held = whole.decode_ahead(frames, noise)
-    export_policy(exportable(whole, columns=COLUMNS), tmp_path / "policy.onnx", kind="onnx")
+    with warnings.catch_warnings(action="error"):
+        export_policy(exportable(whole, columns=COLUMNS), tmp_path / "policy.onnx", kind="onnx")
+    assert not logging.getLogger("torch.onnx._internal").isEnabledFor(logging.WARNING)  # "torchvision is not installed"
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
     facts = session.get_modelmeta().custom_metadata_map
     inputs, outputs = json.loads(facts["inputs"]), json.loads(facts["outputs"])

@@ -55,6 +55,7 @@ def _read_stored(source: str) -> Recordings:
         action_names=task.action_names,
         sources=source_names(folder) or np.arange(len(lengths)).astype(str),
         control_hz=task.control_hz,
+        skipped=["units, kinds of actions and roles of columns"],  # other formats do not hold them
         cameras=stored_clips(folder),
         source=source,
     )

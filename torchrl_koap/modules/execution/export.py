@@ -8,9 +8,12 @@ observations and counts steps. Every file describes its inputs and outputs (:att
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
-from collections.abc import Callable, Mapping, Sequence
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -125,13 +128,26 @@ def export_policy(
     write, read = lookup(_KINDS, kind, "export format")
     file = Path(file)
     with torch.no_grad():
-        write(what, file)
+        with _frozen(what.module), warnings.catch_warnings(action="ignore"):  # exporters warn of their own internals
+            write(what, file)
         loaded = read(what, file)
         gaps = [relative_gap(loaded(*batch), what.module(*batch)) for batch in map(what.batch, _BATCHES)]
     for gap in gaps:
         if not gap <= tolerance:  # NaN, too
             raise ExportError(f"{file} differs from the policy by {gap:.1e}, at most {tolerance:.0e} is allowed")
     return loaded
+
+
+@contextlib.contextmanager
+def _frozen(module: nn.Module) -> Iterator[None]:
+    """Takes no gradients by the parameters inside the block: a file that does is called under ``torch.no_grad()``."""
+    learned = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    module.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learned:
+            parameter.requires_grad_()
 
 
 def relative_gap(found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
@@ -153,6 +169,7 @@ def _write_onnx(what: Exportable, file: Path) -> None:
     for name in ("onnx", "onnxscript", "onnxruntime"):
         if importlib.util.find_spec(name) is None:
             raise ExportError(f"{name} is not installed: pip install 'torchrl_koap[onnx]'")
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of packages that no policy needs
     program = torch.onnx.export(
         _program(what),
         input_names=list(what.inputs),
