@@ -40,7 +40,8 @@ class Clock:
         """The median step in seconds; the mean of the steps near it if the clock is rounded, as 33 and 34 ms are."""
         steps = np.concatenate(self.steps)
         median = float(np.median(steps))
-        mean = float(steps[np.abs(steps - median) <= UNEVEN * abs(median)].mean())
+        near = steps[np.abs(steps - median) <= UNEVEN * abs(median)]  # none between two rates
+        mean = float(near.mean()) if len(near) else median
         return mean if abs(mean - median) > _SAME * abs(median) else median
 
 
