@@ -116,7 +116,8 @@ def _decode(content: bytes, what: object) -> np.ndarray:
         image = Image.open(io.BytesIO(content))
         return np.asarray(image.convert("RGB") if image.mode == "P" else image)
     except Exception as error:  # damaged images may raise any exception
-        raise ValueError(f"frame {what} is no readable image: {error}") from None
+        said = str(error).partition(" <")[0]  # Pillow adds the address of the bytes
+        raise ValueError(f"frame {what} is no readable image: {said}") from None
 
 
 def _array(clip: Clip) -> Iterator[np.ndarray]:
