@@ -123,7 +123,7 @@ def export_policy(
 
     Kinds are ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) and ``"aoti"`` (AOTInductor;
     needs a C++ compiler). The tolerance is relative to the largest number of the original's output. Raises an
-    ExportError if a package or compiler is missing, or the numbers differ.
+    ExportError if a package or compiler is missing, or if the numbers differ; the file is then removed.
     """
     write, read = lookup(_KINDS, kind, "export format")
     file = Path(file)
@@ -134,6 +134,7 @@ def export_policy(
         gaps = [relative_gap(loaded(*batch), what.module(*batch)) for batch in map(what.batch, _BATCHES)]
     for gap in gaps:
         if not gap <= tolerance:  # NaN, too
+            file.unlink()
             raise ExportError(f"{file} differs from the policy by {gap:.1e}, at most {tolerance:.0e} is allowed")
     return loaded
 
