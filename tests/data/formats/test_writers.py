@@ -50,7 +50,10 @@ def test_numbers_that_float32_rounds_coarsely_are_written_in_float64(tmp_path, o
     np.testing.assert_allclose(found.actions[0], actions, rtol=0, atol=1e-6)
 
 
-def test_archives_are_read_in_the_order_in_which_they_were_written(tmp_path):
+@pytest.mark.parametrize(("source", "file"), [(None, "trajectory_03"), ("b/{}.csv[1]", "trajectory_03_b_7_csv_1")])
+def test_archives_are_read_in_the_order_in_which_they_were_written(source, file, tmp_path):
     states = [np.full((2, 1), number) for number in range(11)]
-    write_npz(make_recordings(states, action_dim=1, control_hz=30.0), tmp_path / "arm")
+    names = None if source is None else [source.format(10 - number) for number in range(11)]
+    write_npz(make_recordings(states, action_dim=1, control_hz=30.0, sources=names), tmp_path / "arm")
     np.testing.assert_array_equal(read_recordings(tmp_path / "arm").states, states)
+    assert (tmp_path / f"arm/{file}.npz").exists()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ _INDEX = {  # LeRobot reads tasks by pandas and finds their descriptions in its 
 
 
 def write_npz(recordings: Recordings, out: Path) -> None:
-    """Writes a folder of ``*.npz`` files, one per trajectory."""
+    """Writes a folder of ``*.npz`` files, one per trajectory, named by its number and source."""
     out.mkdir(parents=True)
     digits = len(str(len(recordings.states)))
     about: dict[str, Any] = {"state_names": recordings.state_names, "action_names": recordings.action_names}
@@ -36,7 +37,9 @@ def write_npz(recordings: Recordings, out: Path) -> None:
         about["control_hz"] = recordings.control_hz
     for index, (states, actions) in enumerate(zip(recordings.states, recordings.actions, strict=True)):
         labelled = {} if np.isnan(actions).all() else {"actions": actions}
-        np.savez(out / f"trajectory_{index:0{digits}}.npz", states=states, **labelled, **about)
+        source = re.sub(r"\W+", "_", recordings.sources[index]).strip("_")[-100:]  # of up to 255 letters
+        name = f"trajectory_{index:0{digits}}" + (f"_{source}" if source != str(index) else "")
+        np.savez(out / f"{name}.npz", states=states, **labelled, **about)
 
 
 def write_lerobot(recordings: Recordings, out: Path) -> None:
