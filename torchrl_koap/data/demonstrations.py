@@ -165,8 +165,10 @@ def make_demonstrations(
     named = recordings is states or resample is not None
     recordings = _at_rate(recordings, control_hz, resample, action_kind)
     rate = recordings.control_hz
-    problems += [f"{option('control_hz')} is missing: frames per second"] if rate is None else []
-    problems += [] if rate is None else wrong_rate(rate, "control_hz")
+    if rate is None:
+        problems.append(f"{option('control_hz')} is missing: frames per second")
+    else:
+        problems += wrong_rate(rate, "control_hz")
     if max_steps is not None and (isinstance(max_steps, (bool, str)) or not max_steps >= 1 or max_steps % 1):
         problems.append(f"{option('max_steps')} must be a positive whole number, got {max_steps!r}")
     roles = find_roles(
@@ -192,7 +194,7 @@ def make_demonstrations(
         max_steps=round(_SLACK * max(map(len, recordings.states))) if max_steps is None else int(max_steps),
         control_hz=float(rate),
         command=COMMAND if roles.command else None,
-        robot=tuple(roles.state.index(column) for column in roles.robot),
+        robot=tuple(map(roles.places.__getitem__, roles.robot)),
     )
     known = select_state(data, task.state_of)
     for said in find_warnings(known, task, recordings.sources if named else ()):

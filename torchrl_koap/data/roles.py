@@ -36,9 +36,10 @@ class Roles:
     action_units: tuple[str, ...]
 
     @property
-    def state(self) -> list[int]:
-        """Columns that models see: all but commands."""
-        return [column for column in range(len(self.state_names)) if column not in self.command]
+    def places(self) -> dict[int, int]:
+        """Place in the state of every column that models see: all but commands."""
+        seen = (column for column in range(len(self.state_names)) if column not in self.command)
+        return {column: place for place, column in enumerate(seen)}
 
     def parts(self) -> dict[str, tuple[str, ...]]:
         """Groups the names of neighbouring columns with the same role."""
@@ -54,7 +55,7 @@ class Roles:
 
     def actions(self) -> dict[str, Action]:
         """Returns the meaning of every action."""
-        places = {column: place for place, column in enumerate(self.state)}
+        places = self.places
         described = zip(self.action_names, self.action_units, self.kinds, strict=True)
         return {
             name: Action(unit, kind, places[self.targets[index]] if index in self.targets else None)

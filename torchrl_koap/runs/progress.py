@@ -134,13 +134,22 @@ def open_logger(name: str, out: Path, options: Mapping[str, Any]) -> Iterator[An
     title = out.name if name == "wandb" else name
     mode = {"project": "koap", "mode": os.environ.get("WANDB_MODE", "offline")}
     logger = get_logger(name, str(out), title, wandb_kwargs=mode)
-    sections = {section: held if isinstance(held, dict) else {"": held} for section, held in options.items()}
-    flat = {f"{section}.{key}".rstrip("."): v for section, held in sections.items() for key, v in held.items()}
     try:
-        logger.log_hparams({key: v if isinstance(v, (bool, int, float)) else str(v) for key, v in flat.items()})
+        logger.log_hparams(_flat(options))
         yield logger
     finally:
         logger.close()
+
+
+def _flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
+    """Returns options by their names with sections; what is no number becomes text."""
+    flat: dict[str, bool | int | float | str] = {}
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value if isinstance(value, (bool, int, float)) else str(value)
+    return flat
 
 
 def log_scores(logger: Any, scores: Mapping[str, Any]) -> None:

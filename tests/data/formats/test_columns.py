@@ -240,6 +240,9 @@ def test_episodes_of_one_frame_are_left_out_and_listed():
     assert [len(frames) for frames in found.states] == [3, 2] and found.skipped[0] == "run[0] (fewer than two frames)"
     with pytest.raises(DataError, match="none of its 6 trajectories has two frames"):
         read(episode=np.arange(6))
+    for order in ("time", "frame_index", "episode", "done"):  # an empty file
+        with pytest.raises(DataError, match="none of its 1 trajectories has two frames"):
+            read(x=np.zeros(0), **{order: np.zeros(0)})
 
 
 @pytest.mark.parametrize(

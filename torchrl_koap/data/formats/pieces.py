@@ -152,8 +152,10 @@ def _restarts(times: np.ndarray) -> np.ndarray:
 
     A clock begins again if it goes back to its first time and runs on from there. A single wrong stamp does not.
     """
-    back, steps = np.r_[True, np.diff(times) < 0], np.diff(times, append=times[-1:])
-    usual = np.median(np.abs(steps[:-1])) if len(times) > 1 else 0.0
+    if len(times) < 2:
+        return _first(times)
+    back, steps = np.r_[True, np.diff(times) < 0], np.diff(times, append=times[-1])
+    usual = np.median(np.abs(steps[:-1]))
     again = (np.abs(times[back] - times[0]) < usual / 2) & (steps[back] > 0) & (steps[back] < 2 * usual)
     return back if again.all() else _first(times)
 
