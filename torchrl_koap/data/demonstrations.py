@@ -194,7 +194,7 @@ def make_demonstrations(
         max_steps=round(_SLACK * max(map(len, recordings.states))) if max_steps is None else int(max_steps),
         control_hz=float(rate),
         command=COMMAND if roles.command else None,
-        robot=tuple(map(roles.places.__getitem__, roles.robot)),
+        robot=tuple(map(roles.state_columns.__getitem__, roles.robot)),
     )
     known = select_state(data, task.state_of)
     for said in find_warnings(known, task, recordings.sources if named else ()):

@@ -36,10 +36,10 @@ class Roles:
     action_units: tuple[str, ...]
 
     @property
-    def places(self) -> dict[int, int]:
-        """Place in the state of every column that models see: all but commands."""
+    def state_columns(self) -> dict[int, int]:
+        """Number in the state of every column that models see: all but commands."""
         seen = (column for column in range(len(self.state_names)) if column not in self.command)
-        return {column: place for place, column in enumerate(seen)}
+        return {column: number for number, column in enumerate(seen)}
 
     def parts(self) -> dict[str, tuple[str, ...]]:
         """Groups the names of neighbouring columns with the same role."""
@@ -55,10 +55,10 @@ class Roles:
 
     def actions(self) -> dict[str, Action]:
         """Returns the meaning of every action."""
-        places = self.places
+        columns = self.state_columns
         described = zip(self.action_names, self.action_units, self.kinds, strict=True)
         return {
-            name: Action(unit, kind, places[self.targets[index]] if index in self.targets else None)
+            name: Action(unit, kind, columns[self.targets[index]] if index in self.targets else None)
             for index, (name, unit, kind) in enumerate(described)
         }
 
