@@ -7,7 +7,7 @@ import contextlib
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -117,8 +117,8 @@ def train_phase(
         with warnings.catch_warnings():  # CudaGraphModule warns that it takes tensordicts out of torch's pytrees
             warnings.simplefilter("ignore", UserWarning)
             update = CudaGraphModule(update)
-    done = start
-    began, mark, marked = time.perf_counter(), time.perf_counter(), start
+    done, began = start, time.perf_counter()
+    log = _Log(phase, run, logger, start, began)
     ended = ends(done)
     while not ended:
         rate = learning_rate * warmup_cosine(done, num_steps, WARMUP)
@@ -133,19 +133,7 @@ def train_phase(
             scores = {} if best is None else best.check(done) if scored else best.kept()
         ended = ends(done)
         if scored or done % log_every == 0 or ended:
-            values = {key: value.item() for key, value in terms.items()}
-            bad = [key for key, value in values.items() if not math.isfinite(value)]
-            if bad:
-                raise DivergedError(f"{phase}: {', '.join(bad)} is not finite at step {done}; lower the learning rate")
-            now = time.perf_counter()
-            values |= {"learning_rate": rate, "iterations_per_second": (done - marked) / max(now - mark, 1e-9)}
-            values |= scores
-            mark, marked = now, done
-            if run is not None:
-                run.log(phase, done, values)
-            if logger is not None:
-                for key, number in values.items():
-                    logger.log_scalar(f"{phase}/{key}", number, step=done)
+            values = log(done, terms, rate, scores)
         if progress is not None:
             progress(done, values)
         if checkpoint is not None and (done % CHECKPOINT_EVERY == 0 or ended):
@@ -156,6 +144,33 @@ def train_phase(
     if done > start:
         values["iterations_per_second"] = (done - start) / (time.perf_counter() - began)
     return values
+
+
+@dataclass
+class _Log:
+    """Writes the values of a phase, and measures its speed between two calls."""
+
+    phase: str
+    run: RunDirectory | None
+    logger: Any
+    step: int  # of the last call
+    called: float  # its time
+
+    def __call__(self, step: int, terms: TensorDictBase, rate: float, scores: Mapping[str, float]) -> dict[str, float]:
+        values = {key: value.item() for key, value in terms.items()}
+        bad = [key for key, value in values.items() if not math.isfinite(value)]
+        if bad:
+            raise DivergedError(f"{self.phase}: {', '.join(bad)} is not finite at step {step}; lower the learning rate")
+        now = time.perf_counter()
+        speed = (step - self.step) / max(now - self.called, 1e-9)
+        self.step, self.called = step, now
+        values |= {"learning_rate": rate, "iterations_per_second": speed, **scores}
+        if self.run is not None:
+            self.run.log(self.phase, step, values)
+        if self.logger is not None:
+            for key, number in values.items():
+                self.logger.log_scalar(f"{self.phase}/{key}", number, step=step)
+        return values
 
 
 @dataclass
