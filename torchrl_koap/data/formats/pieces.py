@@ -124,9 +124,10 @@ def _by_counter(name: str, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.argsort(frame), _first(frame)
     starts = np.r_[True, np.diff(frame) < 0]
     if not (frame[starts] == frame[0]).all():
+        back = starts.nonzero()[0][frame[starts] != frame[0]][0]
         raise ValueError(
-            f"column {name!r} neither continues nor restarts: add a column 'episode' that says which rows belong"
-            f" together, or drop the counter with {option('drop_columns')}"
+            f"column {name!r} goes back from {frame[back - 1]:g} to {frame[back]:g}, not to its first number: end an"
+            f" episode there (a column 'episode_index'), or drop the counter with {option('drop_columns')}"
         )
     return np.arange(len(frame)), starts
 
