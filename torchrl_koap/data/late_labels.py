@@ -15,7 +15,7 @@ from torchrl_koap.tasks import Task
 
 REACH = 3  # frames before and after a label; a longer lag is not found
 CLEAR, NEAR = 0.15, 0.05  # shares of the error without labels: least gain by late labels; gains that are ignored
-FOLDS, MOST, PENALTY = 5, 4000, 1e-6  # of the cross-validation; most rows; relative ridge
+FOLDS, MOST, PENALTY = 5, 4000, 1e-9  # of the cross-validation; most rows; relative ridge
 INNOVATION = 3e-4  # share of the changes' variance that past states must leave unexplained; analytic paths leave less
 LARGEST_GAIN = 1.03  # largest coefficient of a target: a robot goes no farther than its target
 
