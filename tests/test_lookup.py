@@ -33,6 +33,11 @@ def test_without_a_near_name_all_are_listed(name):
     assert str(error.value) == f"unknown thing {name!r}; known: dense, diagonal, dpm++2m"
 
 
+def test_the_columns_of_an_entry_are_suggested():
+    with pytest.raises(ValueError, match=r"unknown column 'eef'; did you mean eef_0 eef_1\?"):
+        lookup(["eef_pos", "eef_0", "eef_1"], "eef", "column")
+
+
 def test_a_file_may_define_dataclasses_and_its_objects_can_be_pickled(tmp_path):
     code = "from __future__ import annotations\nfrom dataclasses import dataclass\n\n"
     for folder, number in (("a", 1), ("b", 2)):  # files of the same name

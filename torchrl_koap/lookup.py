@@ -8,6 +8,7 @@ import functools
 import importlib
 import importlib.metadata
 import importlib.util
+import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
@@ -42,6 +43,8 @@ def unknown(asked: Iterable[str], known: Collection[str], what: str) -> list[str
 def _unknown(known: Collection[str], name: object, what: str) -> str:
     near = nearest(known, name) if isinstance(name, str) else None
     hint = f"known: {', '.join(known)}" if near is None else f"did you mean {near!r}?"
+    if parts := [each for each in known if re.fullmatch(rf"{re.escape(str(name))}_\d+", each)]:
+        hint = f"did you mean {' '.join(parts)}?"
     return f"unknown {what} {name!r}; {hint}"
 
 

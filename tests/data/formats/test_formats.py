@@ -59,8 +59,12 @@ def test_nothing_to_read(tmp_path):
     with pytest.raises(ValueError, match="holds no recordings that can be read; there are readers for minari:NAME"):
         read_recordings(tmp_path)
     np.save(tmp_path / "run_0.npy", np.zeros((5, 2)))
-    with pytest.raises(ValueError, match=r"holds \*.npy files: save each recording with np.savez\(file, states="):
+    with pytest.raises(ValueError, match=r"\*.npy files are not read: save each recording with np.savez\(file, s"):
         read_recordings(tmp_path)
+    (tmp_path / "hopper.pkl").touch()
+    for source in (tmp_path, tmp_path / "hopper.pkl"):
+        with pytest.raises(ValueError, match=r"pickles are not read: save .* by np.savez\(file, observations="):
+            read_recordings(source)
     with pytest.raises(FileNotFoundError, match="none does not exist"):
         read_recordings(tmp_path / "none")
 

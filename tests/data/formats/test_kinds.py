@@ -16,8 +16,8 @@ from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, leav
         "start": "is_first trajectory_starts new_episode is_reset start",
         "length": "lengths episode_length",
         "frame": "timestep stepIndex frame_number",
-        "other": "discount cumulative_reward return_to_go next.success __index_level_0__ dt cost success_rate",
-        None: "q s restart length return_spring left_arm_time_constant step_height q_s run_speed take_off trial_force",
+        "other": "discount cumulative_reward return_to_go next.success __index_level_0__ dt cost infos/x",
+        None: "q s restart length return_spring left_arm_time_constant step_height q_s run_speed take_off info_x",
     }.items(),
 )
 def test_names_identify_columns_that_are_not_states(kind, names):

@@ -29,6 +29,12 @@ def test_what_has_no_label():
     assert recordings.actions[0].shape == (4, 2)
 
 
+@pytest.mark.parametrize("empty", [[], np.zeros((0, 2)), torch.zeros(0)])
+def test_empty_actions_are_none(empty):
+    recordings = make_recordings([FRAMES, FRAMES], [np.ones((4, 2)), empty])
+    assert recordings.num_labels == 4 and np.isnan(recordings.actions[1]).all()
+
+
 def test_no_labels_at_all_needs_their_width():
     for number in (7, np.int64(7)):
         assert make_recordings([FRAMES], action_dim=number).actions[0].shape == (4, 7)

@@ -139,11 +139,28 @@ def test_time_stamps_beside_the_observations(file):
 
 def test_ends_of_episodes_beside_the_observations(file):
     with h5py.File(file, "a") as stream:
-        stream["data/demo_2/dones"] = np.array([False, True, False, True])
-        stream["data/demo_10/dones"] = np.zeros(5)
+        stream["data/demo_2/timeouts"] = np.array([False, True, False, True])
+        stream["data/demo_10/timeouts"] = np.zeros(5)
     recordings = read_robomimic(file)
-    assert recordings.sources == ("demo_2[0]", "demo_2[1]", "demo_10") and recordings.skipped == ("dones",)
+    assert recordings.sources == ("demo_2[0]", "demo_2[1]", "demo_10") and recordings.skipped == ("timeouts",)
     assert [frames[:, 3].tolist() for frames in recordings.states[:2]] == [[0, 1], [2, 3]]
+
+
+def test_a_success_that_is_lost_again_ends_no_demonstration(file):
+    """Robomimic's ``dones`` are 1 in every state of success."""
+    with h5py.File(file, "a") as stream:
+        stream["data/demo_2/dones"] = np.array([0, 1, 0, 1])
+    recordings = read_robomimic(file)
+    assert recordings.sources == ("demo_2", "demo_10") and recordings.skipped == ("dones",)
+    assert recordings.num_labels == 3
+
+
+@pytest.mark.parametrize("shape", [(0, 7), (0,)])
+def test_empty_actions_are_none(shape, file):
+    with h5py.File(file, "a") as stream:
+        stream["data/demo_10/actions"] = np.zeros(shape)
+    recordings = read_robomimic(file)
+    assert recordings.num_labels == 3 and np.isnan(recordings.actions[1]).all()
 
 
 @pytest.mark.parametrize("layout", ["data/demo_0/obs", "observations"])
@@ -177,6 +194,11 @@ def test_frames_do_not_replace_numbers_of_their_name(tmp_path):
     ("entries", "message"),
     [
         ({"observations": 3, "actions": 2, "timeouts": 1}, "wanted the layout of .*holds actions, observations, time"),
+        ({"observations": 3}, r"as in D4RL, np.savez\('arm.npz', .*h5py.File\('other.hdf5'\)"),
+        (
+            {"data/demo_0/states": 3},
+            "data/demo_0: it has no group 'obs' yet; robomimic's dataset_states_to_obs.py adds",
+        ),
         ({"observations/images": 9}, "no entry is a table of numbers; there are images"),
         ({"data/demo_0/obs/top": 9, "data/demo_0/actions": 2}, "no entry is a table of numbers; there are top"),
     ],

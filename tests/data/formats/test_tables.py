@@ -208,7 +208,24 @@ def test_what_is_not_read_is_named(tmp_path):
     extra = {"obs": np.ones((6, 3)), "reward": np.zeros(5)}
     np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((5, 1)), control_hz=30.0, **extra)
     recordings = read_tables(tmp_path)
-    assert recordings.skipped == ("obs", "reward") and recordings.states[0].shape == FRAMES.shape
+    joined = "obs (a row per frame: join it to 'states' if the policy needs it)"
+    assert recordings.skipped == (joined, "reward") and recordings.states[0].shape == FRAMES.shape
+
+
+@pytest.mark.parametrize("name", ["state", "observations"])
+def test_next_observations_say_where_episodes_end(name, tmp_path):
+    """D4RL's ``qlearning_dataset`` leaves out ``timeouts``: all episodes would be one."""
+    frames, rows = np.random.default_rng(0).normal(size=(13, 2)), np.r_[:6, 7:12]  # no transition from 6 to 7
+    entries = {name: frames[rows], f"next_{name}": frames[rows + 1].astype(np.float32), "actions": np.ones((11, 1))}
+    np.savez(tmp_path / "a.npz", terminals=np.arange(11) == 2, **entries)
+    found = read_tables(tmp_path, control_hz=20)
+    assert [len(each) for each in found.states] == [3, 3, 5]
+    np.testing.assert_array_equal(np.concatenate(found.states), frames[rows])
+    assert any(said.startswith(f"next_{name} (an episode ends where") for said in found.skipped)
+    shuffled = np.random.default_rng(1).permutation(11)
+    np.savez(tmp_path / "a.npz", **{key: values[shuffled] for key, values in entries.items()})
+    with pytest.raises(DataError, match=rf"next_{name} is not the next row of {name} in \d+ of 11 rows: sort"):
+        read_tables(tmp_path, control_hz=20)
 
 
 def test_faults_of_all_files_are_named(tmp_path):

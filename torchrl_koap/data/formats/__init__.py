@@ -63,7 +63,12 @@ def _read_stored(source: str) -> Recordings:
 
 # files that are no recordings -> advice
 _ELSEWHERE = {
-    "*.npy": "it holds *.npy files: save each recording with np.savez(file, states=..., actions=...)",
+    "*.npy": "*.npy files are not read: save each recording with np.savez(file, states=..., actions=...)",
+    **dict.fromkeys(
+        ("*.pkl", "*.pickle", "*.p"),
+        "pickles are not read: save the arrays of each recording, or of all with the ends of their"
+        " episodes, by np.savez(file, observations=..., actions=..., timeouts=...)",
+    ),
     "*.tsv": "it holds *.tsv files: rename them to *.csv",
     **dict.fromkeys(
         (f"{below}*.{kind}" for below in ("*/", "*/*/") for kind in ("npz", "csv", "parquet")),
@@ -163,7 +168,9 @@ def read_recordings(
     if name is None and not Path(source).exists():
         raise FileNotFoundError(f"{source} does not exist")
     if name is None:
-        said = [*dict.fromkeys(hint for ending, hint in _ELSEWHERE.items() if any(Path(source).glob(ending)))]
+        here = Path(source)
+        holds = Path(here.name).match if here.is_file() else lambda ending: any(here.glob(ending))
+        said = [*dict.fromkeys(hint for ending, hint in _ELSEWHERE.items() if holds(ending))]
         said.append("there are readers for " + ", ".join(form.what for form in FORMATS.values()))
         raise ValueError(f"{source} holds no recordings that can be read; {'; '.join(said)}")
     form = FORMATS[name]

@@ -31,7 +31,7 @@ _KINDS = {
     "length": rf"lengths|{_ONE}_len(gth)?s?",
     "frame": rf"(frame|step|time_?step)s?{_NUMBERED}",
     "other": r"index|task_index|row|_*index_level_0_*|unnamed:_0|(.+_)?(rewards?|success)(_(rate|flag))?"
-    r"|rew|returns?(_to_go)?|discounts?|costs?|scores?|dt|delta_time",
+    r"|infos_.+|rew|returns?(_to_go)?|discounts?|costs?|scores?|dt|delta_time",
 }
 _KIND = {kind: re.compile(pattern) for kind, pattern in _KINDS.items()}
 _ACTING = re.compile(r"actions?(\d*|[^a-z\d].*)", re.IGNORECASE)

@@ -13,7 +13,8 @@ from torchrl_koap.data.formats.frames import Clip
 from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.files import option
 
-SHUFFLED = 0.25  # rows are out of order if their clock goes back in more than this share of them
+SHUFFLED = 0.25  # rows are out of order if their clock goes back, or the next row is another, in more than this share
+_SAME, _ROUNDED = 1e-3, 1e-6  # rounding errors: share of a column's range, and of its largest number
 
 
 @dataclass(frozen=True)
@@ -184,3 +185,29 @@ def _flagged(piece: Piece, order: np.ndarray) -> np.ndarray:
         elif kind == "end" or kind == "length" and switch:
             starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]
     return starts
+
+
+def other_frames(frames: np.ndarray, following: np.ndarray) -> np.ndarray:
+    """Returns which rows of the next observations ``[T, d]`` are not the next frame, bool ``[T - 1]``."""
+    frames, following = (part.reshape(len(part), -1).astype(np.float64) for part in (frames, following))
+    room = _SAME * np.ptp(frames, axis=0) + _ROUNDED * np.abs(frames).max() if len(frames) > 1 else 0.0
+    return (np.abs(following[:-1] - frames[1:]) > room).any(-1)
+
+
+def counted_ends(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:
+    """Converts lengths, ends or starts of episodes, by the kind of an entry, to flags ``[length]`` of last frames.
+
+    An entry without kind is converted if its numbers could be any of these; returns None if they could not.
+    """
+    if values.ndim != 1 or values.dtype.kind not in "iu" or not 0 < len(values) < length:
+        return None
+    rises = bool((np.diff(values.astype(np.int64)) > 0).all())
+    if kind in ("end", None) and rises and values[-1] in (length, length - 1):
+        last = values - (values[-1] == length)
+    elif kind in ("length", None) and values.sum() == length and values.all():
+        last = values.cumsum() - 1
+    elif kind in ("start", None) and rises and values[0] == 0:
+        last = np.append(values[1:], length) - 1
+    else:
+        return None
+    return np.isin(np.arange(length), last).astype(np.float64)

@@ -99,7 +99,8 @@ def make_recordings(
     Args:
         states (sequence of array): frames of every trajectory ``[T_i, d]``.
         actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, or
-            None for one without actions; None for no labels at all. Columns of data frames are matched by name.
+            None or an empty array for one without; None for no labels at all. Columns of data frames are matched by
+            name.
 
     Keyword Args:
         action_dim (int, optional): number of action columns; required if no trajectory has actions.
@@ -289,6 +290,8 @@ def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str
         if isinstance(value, (list, tuple)) and len(widths := sorted({np.size(row) for row in value})) > 1:
             said = f"{what} are lists of different lengths: rows of {' and '.join(map(str, widths))} numbers"
         faults.append((name, said))
+        return None
+    if what == "actions" and array.shape[:1] == (0,):  # none were recorded
         return None
     if array.ndim != 2 or not array.shape[-1]:
         faults.append((name, f"{what} must be {wanted}, got {list(array.shape)}"))

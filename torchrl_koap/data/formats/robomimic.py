@@ -8,7 +8,8 @@
                              or JPEG or PNG files [T, bytes]; <name> may be a path, such as arm/joints
     data/demo_0/actions      [T, a]; may be missing
     data/demo_0/next_obs     optional; its last row is the frame after the last action, the others repeat obs
-    data/demo_0/dones        optional, like time stamps, counters and numbers of episodes: [T] beside obs
+    data/demo_0/timeouts     optional, like time stamps, counters and numbers of episodes: [T] beside obs; dones are
+                             not read: they mark success, so they may change several times
 
     observations/<name>      [T, d] in ALOHA's layout, a demonstration per file
     observations/images/<name>   frames of a camera
@@ -30,14 +31,13 @@ from torchrl_koap.data.formats.clocks import declared_rate
 from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.frames import MAGIC, Clip
 from torchrl_koap.data.formats.kinds import as_numbers, kind_of, named_twice, numbered, spread
-from torchrl_koap.data.formats.pieces import Piece
+from torchrl_koap.data.formats.pieces import Piece, other_frames
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, gathered, option, refuse
 from torchrl_koap.lookup import import_extra
 
 NEXT = "next_obs"
 BESIDE = ("episode", "frame", "start", "end")  # kinds of entries that are read beside obs
-_SAME, _ROUNDED = 1e-3, 1e-6  # rounding errors: share of a column's range, and of its largest number
 
 
 def hdf5_files(source: str | Path) -> list[Path]:
@@ -94,10 +94,14 @@ def _read(
         wanted = (
             "wanted the layout of robomimic (data/demo_0/obs, data/demo_0/actions), or ALOHA's (observations, action)"
         )
-        raise DataError(file, f"no group 'data', {wanted}; the file holds {', '.join(stream) or 'nothing'}")
+        cure = "; for one table of all episodes, as in D4RL, np.savez('arm.npz', **{name: part[()] for name, part in"
+        cure += f" h5py.File({file.name!r}).items() if isinstance(part, h5py.Dataset)}})"
+        cure = cure if _is_table(stream.get("observations")) else ""
+        raise DataError(file, f"no group 'data', {wanted}; the file holds {', '.join(stream) or 'nothing'}{cure}")
     demos = sorted((name for name in data if isinstance(data.get(name), Mapping)), key=_number)
     lacking = [name for name in demos if not isinstance(data[name].get("obs"), Mapping)]
-    faults = [(f"data/{name}", "it has no group 'obs'") for name in lacking]
+    cures = {name: " yet; robomimic's dataset_states_to_obs.py adds it" for name in lacking if "states" in data[name]}
+    faults = [(f"data/{name}", f"it has no group 'obs'{cures.get(name, '')}") for name in lacking]
     if faults or not demos:
         raise DataError(file, gathered(faults) or "'data' holds no trajectories")
     entries = {name: part for demo in demos for name, part in _entries(data[demo]["obs"]).items()}
@@ -147,7 +151,8 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
             said = f"obs/{entry} is {_shape(part)}, no table of numbers: it cannot be part of the state"
         elif _shape(last) != _shape(part):
             said = f"next_obs/{entry} is {_shape(last)}, obs/{entry} is {_shape(part)}"
-        elif has_next and (odd := _other_frame(part[()], last[()])) is not None:
+        elif has_next and (other := other_frames(part[()], last[()])).any():
+            odd = int(other.argmax())
             said = (
                 f"row {odd} of next_obs/{entry} is not row {odd + 1} of obs/{entry}: are frames missing, or out of"
                 f" order? if next_obs is unused, drop it with {option('drop_columns')} next_obs"
@@ -162,7 +167,7 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
         frames = len(next(iter(states.values()), ()))
         for entry, part in group.items():
             kind, single = kind_of(entry)[0], len(_shape(part)) > 0 and part.size == len(part)
-            if single and (kind == "clock" or kind in BESIDE and len(part) == frames):
+            if single and entry != "dones" and (kind == "clock" or kind in BESIDE and len(part) == frames):
                 beside = as_numbers(entry, part[()].ravel())
                 states = states if beside is None else {entry: beside} | states
     cameras: dict[str, Clip] = {}
@@ -177,17 +182,8 @@ def _piece(group: Any, name: str, chosen: Sequence[str], faults: list[tuple[str,
     actions = group.get("actions")
     if actions is not None and not _is_table(actions):
         faults.append((f"data/{name}", f"actions must be numbers [T, a], got {_shape(actions)}"))
-    steps = numbered("action", actions) if _is_table(actions) else {}
+    steps = numbered("action", actions) if _is_table(actions) and len(actions) else {}
     return Piece(name, states, steps or None, cameras=cameras)
-
-
-def _other_frame(frames: np.ndarray, following: np.ndarray) -> int | None:
-    """Returns the first row of the next observations ``[T, d]`` that differs from the next frame; None if all match."""
-    frames, following = (part.reshape(len(part), -1).astype(np.float64) for part in (frames, following))
-    if len(frames) < 2:
-        return None
-    off = np.abs(following[:-1] - frames[1:]) > _SAME * np.ptp(frames, axis=0) + _ROUNDED * np.abs(frames).max()
-    return int(off.any(-1).argmax()) if off.any() else None
 
 
 def _shape(entry: Any) -> list[int]:

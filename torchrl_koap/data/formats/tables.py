@@ -32,13 +32,14 @@ from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.frames import TIMES, clips_beside
 from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, named_twice, number_of, numbered
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
-from torchrl_koap.data.formats.pieces import Piece
+from torchrl_koap.data.formats.pieces import SHUFFLED, Piece, counted_ends, other_frames
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import unknown
 
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
+_NEXT_END = "next.done"  # flags the rows whose next observation is not the next row
 _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "frame": "a count of frames"}
 
 
@@ -153,10 +154,16 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
         if name in read:
             continue
         kind = kind_of(name)[0]
-        single = values.shape in ((len(frames),), (len(frames), 1)) and values.dtype.kind in "fiub"
-        flags = None if single else _counted(values, len(frames), kind)
+        whole = values.shape[:1] == (len(frames),) and values.ndim < 3 and values.dtype.kind in "fiub"
+        single = whole and values.size == len(frames)
+        flags = None if single else counted_ends(values, len(frames), kind)
+        if name == f"next_{key}" and values.shape == frames.shape and whole:
+            states[_NEXT_END] = _ends_by_next(frames, values, key)
+            unread.append(f"{name} (an episode ends where it is not the next row: {_NEXT_END})")
+            continue
         if kind == "other" or kind is None and not single and flags is None:
-            unread.append(name)
+            joins = whole and kind is None
+            unread.append(f"{name} (a row per frame: join it to {key!r} if the policy needs it)" if joins else name)
             continue
         if flags is not None and kind == "start":
             flags = np.roll(flags, 1)  # the first frame of an episode follows the last one of another
@@ -172,6 +179,17 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
         steps = _named(np.full((len(frames), entries["action_names"].size), np.nan), entries["action_names"], "action")
     rate = _declared(entries.get("control_hz"))
     return Piece(file.name, states, steps, tuple(unclear), declared_hz=rate, unread=tuple(unread))
+
+
+def _ends_by_next(frames: np.ndarray, following: np.ndarray, key: str) -> np.ndarray:
+    """Returns which rows end an episode by the next observations ``[T, d]``, as 0 or 1 ``[T]``."""
+    off = other_frames(frames, following)
+    if off.sum() > SHUFFLED * len(frames):
+        raise ValueError(
+            f"next_{key} is not the next row of {key} in {off.sum()} of {len(frames)} rows: sort the rows, as shuffled"
+            f" ones hold no motion, or leave out next_{key} if it is unused"
+        )
+    return np.append(off, False).astype(np.float64)
 
 
 def _declared(entry: np.ndarray | None) -> float | None:
@@ -214,25 +232,6 @@ def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, 
     if len(names) != len(columns) or len(set(names)) != len(columns):
         raise ValueError(f"{kind}_names must be {len(columns)} different names, got {', '.join(names)}")
     return dict(zip(names, columns.values(), strict=True))
-
-
-def _counted(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:
-    """Converts lengths, ends or starts of episodes, by the kind of an entry, to flags ``[length]`` of last frames.
-
-    An entry without kind is converted if its numbers could be any of these; returns None if they could not.
-    """
-    if values.ndim != 1 or values.dtype.kind not in "iu" or not 0 < len(values) < length:
-        return None
-    rises = bool((np.diff(values.astype(np.int64)) > 0).all())
-    if kind in ("end", None) and rises and values[-1] in (length, length - 1):
-        last = values - (values[-1] == length)
-    elif kind in ("length", None) and values.sum() == length and values.all():
-        last = values.cumsum() - 1
-    elif kind in ("start", None) and rises and values[0] == 0:
-        last = np.append(values[1:], length) - 1
-    else:
-        return None
-    return np.isin(np.arange(length), last).astype(np.float64)
 
 
 def _frame_entry(name: str, values: np.ndarray, length: int) -> np.ndarray:
