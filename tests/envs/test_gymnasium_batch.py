@@ -164,8 +164,8 @@ def test_pictures_go_through_the_policy_s_own_transform(cameras):
 def test_refusals():
     with pytest.raises(ValueError, match="cannot be made: NameNotFound: Environment `NoSuch` .*PACKAGE:NoSuch-v0"):
         GymnasiumBatch("NoSuch-v0", TASK)
-    with pytest.raises(ValueError, match="environment 'no_such_package:Reach-v0' cannot be made: "):
-        GymnasiumBatch("no_such_package:Reach-v0", TASK)
+    with pytest.raises(ValueError, match="environment 'no_such:Reach-v0' cannot be made: "):
+        GymnasiumBatch("no_such:Reach-v0", TASK)
     wide = Task(
         name="wide", observation_parts={"arm": 5}, actions={"a": Action("rad"), "b": Action("rad")}, position="arm"
     )
@@ -173,8 +173,12 @@ def test_refusals():
         ValueError, match=r"observation of environment 'ToyReach-v0' is Box\(.*\(4,\).*, task 'wide' has 5 columns"
     ):
         GymnasiumBatch("ToyReach-v0", wide)
-    with pytest.raises(ValueError, match="the action of environment 'CartPole-v1' is Discrete.*, task 'arm' has 2 col"):
+    with pytest.raises(ValueError, match="'CartPole-v1' is Discrete.*, task 'arm' has 2 columns: .*TransformAction"):
         GymnasiumBatch("CartPole-v1", TASK)
+    whole = gymnasium.spaces.Box(-9, 9, (2,), int)
+    gymnasium.register("ToyWhole-v0", lambda: gymnasium.wrappers.TransformAction(Reach(), None, whole))
+    with pytest.raises(ValueError, match="the action of environment 'ToyWhole-v0' is .*: wanted a flat Box of floats"):
+        GymnasiumBatch("ToyWhole-v0", TASK)
     with pytest.raises(ValueError, match="info of environment 'ToyReach-v0' has no 'arrived', it has is_success"):
         GymnasiumBatch("ToyReach-v0", TASK, success_key="arrived")  # before any episode
     with pytest.raises(ValueError, match="cannot be made: .*unexpected keyword argument 'wide'"):
@@ -220,15 +224,18 @@ def test_arguments_of_the_environment():
 
 def test_columns_of_a_dictionary_are_taken_by_name():
     """Goal and joints have one range: in the order of the dictionary they would be mistaken for each other."""
-    space = gymnasium.spaces.Dict({name: gymnasium.spaces.Box(-9, 9, (2,), np.float64) for name in ("goal", "q")})
+    parts = {name: gymnasium.spaces.Box(-9, 9, (2,), np.float64) for name in ("goal", "q")}
+    space = gymnasium.spaces.Dict(parts | {"text": gymnasium.spaces.Text(9)})
     split = functools.partial(gymnasium.wrappers.TransformObservation, observation_space=space)
-    with_parts = lambda: split(Reach(), lambda row: {"goal": row[2:], "q": row[:2]})  # noqa: E731
+    with_parts = lambda: split(Reach(), lambda row: {"goal": row[2:], "q": row[:2], "text": "reach"})  # noqa: E731
     gymnasium.register("ToyParts-v0", with_parts, max_episode_steps=5)
     task = replace(TASK, observation_parts={"arm": ("q_0", "q_1", "goal_1")})
     seen = run(GymnasiumBatch("ToyParts-v0", task, 1), 3, [4])["observation"]
     plain = run(GymnasiumBatch("ToyReach-v0", TASK, 1), 3, [4])["observation"]
     assert torch.equal(seen, plain[..., [0, 1, 3]])
-    with pytest.raises(ValueError, match="a dictionary of goal_0, goal_1, q_0, q_1; it lacks the columns q1, q2, goal"):
+    with pytest.raises(
+        ValueError, match="a dictionary of goal_0, goal_1, q_0, q_1; it lacks .*: convert .*state_names"
+    ):
         GymnasiumBatch("ToyParts-v0", TASK)
 
 

@@ -65,7 +65,11 @@ class NamedColumns(gymnasium.ObservationWrapper):
         known = self._columns(create_zero_array(env.observation_space))
         if lacks := [name for name in names if name not in known]:
             has = some(list(known)) or "no numbers"
-            raise ObservationError(f"its observation is a dictionary of {has}; it lacks the columns {some(lacks)}")
+            raise ObservationError(
+                f"its observation is a dictionary of {has}; it lacks the columns {some(lacks)}: convert the recordings"
+                " with state_names of the dictionary, or register the environment with a wrapper that gives one flat"
+                " array in the order of the recordings"
+            )
 
     def observation(self, observation: Any) -> np.ndarray:
         """Returns the columns ``[obs]``."""
@@ -74,7 +78,8 @@ class NamedColumns(gymnasium.ObservationWrapper):
 
     @staticmethod
     def _columns(observation: Any) -> dict[str, np.ndarray]:
-        numbers = [(name, values) for name, values in leaves(observation) if values.ndim < 2]
+        held = leaves(observation)
+        numbers = [(name, values) for name, values in held if values.ndim < 2 and values.dtype.kind in "fiub"]
         return {name: column for entry, values in numbers for name, column in spread(entry, values[None]).items()}
 
 
@@ -227,6 +232,11 @@ class GymnasiumBatch(EnvBase):
         super().close(**kwargs)
 
 
+# kind of space -> what it must be, and wrappers of Gymnasium that make it
+_WANTED = {
+    "observation": ("Box", "FlattenObservation, TransformObservation"),
+    "action": ("Box of floats", "TransformAction"),
+}
 _ENDS = ("done", "terminated", "truncated")
 # spawned processes import everything again and lack the environments that plugins have registered
 _FORK = "fork" if sys.platform == "linux" else None
@@ -258,9 +268,10 @@ def _check_entries(env_id: str, space: gymnasium.Space, observe: Observer) -> No
 
 
 def _check_box(env_id: str, what: str, space: gymnasium.Space, task: str, width: int) -> None:
-    if not isinstance(space, gymnasium.spaces.Box) or space.shape != (width,):
+    fits = isinstance(space, gymnasium.spaces.Box) and space.shape == (width,)
+    if not fits or what == "action" and np.dtype(space.dtype).kind != "f":  # whole numbers would be cut off
+        kind, tools = _WANTED[what]
         raise ValueError(
-            f"the {what} of environment {env_id!r} is {space}, task {task!r} has {width} columns: wanted a flat Box of"
-            f" shape ({width},). Register the environment with a wrapper that gives it"
-            " (gymnasium.wrappers.FlattenObservation, TransformObservation)"
+            f"the {what} of environment {env_id!r} is {space}, task {task!r} has {width} columns: wanted a flat {kind}"
+            f" of shape ({width},). Register the environment with a wrapper that gives it (gymnasium.wrappers: {tools})"
         )
