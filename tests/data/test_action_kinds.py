@@ -243,6 +243,21 @@ def test_few_labels_give_no_warning_about_kinds():
     assert not likely_kinds(*demonstrations([PATHS[0][:10]], [TARGETS[0][:9]]))
 
 
+def test_a_column_that_repeats_the_last_action_is_named():
+    """With it, recordings without actions would hold their actions."""
+    pairs = zip(PATHS, DELTAS, strict=True)
+    last = [np.column_stack([path[:, :2], np.vstack([[[0, 0]], steps])]) for path, steps in pairs]
+    described = {"names": ("q", "r", "last a", "last b"), "robot": ["q", "r"]}
+    (said,) = warnings(last, DELTAS, **described)
+    assert said.startswith("columns last a, last b repeat the last action") and "--command" in said
+    assert not warnings(last, DELTAS, command=["last a", "last b"], **described)
+    switched = [np.column_stack([path, np.arange(60) > 30]) for path in PATHS]  # a gripper, measured and commanded
+    steps = [np.column_stack([change, frames[1:, 3]]) for change, frames in zip(DELTAS, switched, strict=True)]
+    assert not warnings(
+        switched, steps, ("x", "y", "z", "open"), ("a", "b", "c"), action_kind=["delta", "delta", "raw"]
+    )
+
+
 def test_a_joystick_column_is_not_a_command():
     """It would be hidden from planner and controller."""
     sticks = [np.column_stack([path[:, :2], np.sin(0.3 * np.arange(len(path)))]) for path in PATHS]

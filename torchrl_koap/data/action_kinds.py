@@ -23,6 +23,8 @@ CLEARER = 2.0  # one reading leaves this many times less unexplained than the ot
 ASTRAY = 5.0  # times as far from its target as in half of the recordings: another order or unit of columns
 FOLLOWS = 0.8  # above this correlation with a change, an action is a delta even if a level correlates as well
 UNLIKE = 0.5  # a command column that correlates less than this with every action repeats no command
+REPEATS = 1e-5  # a column repeats an action within this share of its range
+SPEED = 0.01  # a column is the speed of another within this share of its spread
 FEW, MANY = 20, 20_000  # fewest labels to judge by; most labels that are read
 
 
@@ -62,6 +64,7 @@ def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> It
     * ``"delta"``: near the next value of a state column, following columns more than their changes, or only two values.
     * ``"absolute"``: near the change of their column (per frame or second), or far from it in half or some recordings.
     * ``"raw"``: all near columns, or all following changes.
+    * All but ``"absolute"`` and switches: equal to a state column of the next frame, no speed, in every label.
     """
     labels = _labels(data, task)
     if labels is None:
@@ -93,6 +96,12 @@ def kind_warnings(data: TensorDictBase, task: Task, called: Sequence[str]) -> It
         )
     if switches:
         yield f"{some(switches)}: an action with two values, such as open and close of a gripper: {cure}"
+    told = [levels[name] > 2 and kind != "absolute" and name not in wrong for name, kind in kinds.items()]
+    if repeated := _repeated(labels, told, task.control_hz):
+        yield (
+            f"columns {some(repeated)} repeat the last action, so states without labels hold actions as well: if they"
+            f" are commands, name them in {option('command')}"
+        )
     wrong.update(found)
     changes = [each for name, each in likely.items() if kinds[name] == "delta" and name not in wrong]
     still = [each for each in changes if each.kind == "raw" and _clear(each.follows_column, each.follows_change)]
@@ -234,6 +243,14 @@ def _targets_far_away(
     if astray:
         where = some([called[number] for number in sorted(set().union(*astray.values()))])
         yield f"absolute actions lie far from their targets in {where}, {some([*astray])}: another order or unit?"
+
+
+def _repeated(labels: _Labels, chosen: Sequence[bool], control_hz: float) -> list[str]:
+    """Returns the state columns that equal one of the chosen actions in every label, and are no speed of a column."""
+    actions, level = labels.actions[:, chosen], labels.level[:, :, None]
+    same = (np.abs(level - actions[:, None]).max(0) <= REPEATS * np.ptp(actions, axis=0)).any(1)
+    same &= np.abs(level - control_hz * labels.change[:, None]).mean(0).min(1) > SPEED * labels.level.std(0)
+    return [name for name, repeats in zip(labels.names, same, strict=True) if repeats]
 
 
 def _readings(labels: _Labels, task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
