@@ -1,6 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Tests that the registered Gymnasium environments behave like the batched environments they wrap."""
 
+import sys
 import warnings
 from dataclasses import replace
 
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
 
 from torchrl_koap.envs import AvoidingEnv, ManipulationGymEnv, SortingEnv, StackingEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.registry import make_env
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, Task, get_task
 
 NAMES = ("Avoiding", "Aligning", "Sorting2", "Sorting4", "Sorting6", "Stacking")
 
@@ -96,6 +99,48 @@ def test_bad_options():
         gymnasium.make("torchrl_koap/Avoiding-v0").unwrapped.reset(options={"context": np.zeros((2, 3))})
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
         ManipulationGymEnv("avoiding", render_mode="human")
+
+
+class Reach(EnvBase):
+    """An environment of a user, without a mode if ``lacks`` says so."""
+
+    def __init__(self, num_envs, max_steps, dtype=torch.float32, *, lacks="", columns=4, actions=2, batch=None):
+        super().__init__(batch_size=[num_envs] if batch is None else batch)
+        entries = {"observation": columns, "success": 1, "mode": 1}
+        shown = {name: Unbounded((num_envs, width), dtype=dtype) for name, width in entries.items() if name != lacks}
+        self.observation_spec = Composite(shown, shape=self.batch_size)
+        self.action_spec = Unbounded((num_envs, actions), dtype=dtype)
+        self.max_steps = max_steps
+
+    def _reset(self, tensordict=None, **_):
+        return self.observation_spec.zero()
+
+    def _step(self, tensordict):
+        raise NotImplementedError
+
+    def _set_seed(self, seed):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"lacks": "mode"}, "its observation_spec has no entry 'mode'"),
+        ({"max_steps": None}, "it has no attribute 'max_steps'"),
+        ({"lacks": "success"}, "its observation_spec has no entry 'success'"),
+        ({"batch": []}, r"its batch size is \[\], wanted \[1\]"),
+        ({"columns": 5}, "its observations have 5 columns, the task's 4"),
+        ({"actions": 3}, "its actions have 3 columns, the task's 2"),
+        ({"num_threads": 2}, r"'test_registry:Reach' cannot be made: .* unexpected keyword argument 'num_threads'"),
+    ],
+)
+def test_an_environment_that_lacks_a_part_of_the_interface_is_refused(options, says, monkeypatch):
+    monkeypatch.setitem(sys.modules, "test_registry", sys.modules[__name__])
+    own = {"observation_parts": {"xy": 2, "goal": 2}, "actions": {"dx": Action("m"), "dy": Action("m")}}
+    task = Task(name="reach", position="xy", env="test_registry:Reach", **own)
+    assert make_env(task, 3).batch_size == torch.Size([3])
+    with pytest.raises(ValueError, match=f"^env of task 'reach'.*{says}"):
+        make_env(task, **options)
 
 
 def test_same_episode_as_the_batched_environment():

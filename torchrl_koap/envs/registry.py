@@ -29,6 +29,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap import keys
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.transforms import EndEffectorNoise
+from torchrl_koap.files import refuse
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task, get_task
 
@@ -47,7 +48,7 @@ def make_env(task: Task | str, num_envs: int = 1, *, noisy: bool = False, **opti
         EnvBase: the batched environment.
 
     Raises:
-        ValueError: if the task is unknown, or has no environment.
+        ValueError: if the task is unknown, or has no environment; if its environment lacks a part of the interface.
 
     Examples:
         >>> from torchrl_koap.envs.registry import make_env
@@ -61,8 +62,31 @@ def make_env(task: Task | str, num_envs: int = 1, *, noisy: bool = False, **opti
             " recorded or drawn by a simulator. `koap eval --env ID` takes an environment of Gymnasium"
         )
     options = {"max_steps": task.max_steps, **task.env_options, **options}
-    env = resolve(task.env, f"env of task {task.name!r}")(num_envs, **options)
+    what = f"env of task {task.name!r}"
+    make = resolve(task.env, what)
+    try:
+        env = make(num_envs, **options)
+    except TypeError as error:
+        raise ValueError(f"{what}: {task.env!r} cannot be made: {error}") from error
+    refuse(what, _env_faults(env, task, num_envs))
     return TransformedEnv(env, EndEffectorNoise(task, task.noise)) if noisy and task.noise else env
+
+
+def _env_faults(env: EnvBase, task: Task, num_envs: int) -> list[str]:
+    """Lists what an environment lacks of the interface above."""
+    if list(env.batch_size) != [num_envs]:
+        return [f"its batch size is {list(env.batch_size)}, wanted [{num_envs}]"]
+    if getattr(env, "max_steps", None) is None:
+        return ["it has no attribute 'max_steps'"]
+    wanted = [keys.OBSERVATION, keys.SUCCESS, keys.MODE, *([keys.CONTEXT] if task.objects else [])]
+    entries = set(env.observation_spec.keys())
+    if missing := [name for name in wanted if name not in entries]:
+        return [f"its observation_spec has no entry {name!r}" for name in missing]
+    widths = {
+        "observations": (env.observation_spec[keys.OBSERVATION].shape[-1], task.observation_dim),
+        "actions": (env.action_spec.shape[-1], task.action_dim),
+    }
+    return [f"its {part} have {own} columns, the task's {ours}" for part, (own, ours) in widths.items() if own != ours]
 
 
 IDS = {"Avoiding-v0": "avoiding", "Aligning-v0": "aligning", "Stacking-v0": "stacking"}
