@@ -193,7 +193,8 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     assert used == [(0.5, 3), (1, 1)]  # recordings are no noise
 
 
-def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
+@pytest.mark.parametrize("away", [0.0, 2.0])
+def test_recordings_of_another_embodiment_are_not_followed_nor_those_that_start_elsewhere(away, monkeypatch):
     states = [torch.full((20, 4), float(number)) for number in range(6)]
     actions = [torch.full((19, 2), float("nan") if number < 4 else 0.1) for number in range(6)]
     data = flatten_trajectories(states, actions)
@@ -202,11 +203,15 @@ def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
 
     def noted(policy, make_env, seeds, *, given, **_):
         plans.extend(given(slice(index, index + 1))(TensorDict())[RECORDED_FUTURE] for index in seeds)
-        return [episode(0.0, steps=24) for _ in seeds]
+        played = [episode(0.0, steps=24) for _ in seeds]
+        for plan, rollout in zip(plans, played, strict=True):
+            rollout["observation"][:, 2:] += plan[0, 0] + away  # columns of numbers from 0 to 5
+        return played
 
     monkeypatch.setattr(diagnosis, "roll_out", noted)
     planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8), state_dim=2)
     policy = make_policy(planner, EchoController(), state_of=(0, 1))
     followed = follow_recordings(policy, AVOIDING, data, None, episodes=5)
     assert [future[0, 0, 0].item() for future in plans] == [4.0, 5.0]
-    assert [part["recorded"].sum().item() for part in followed] == [18, 18]  # frames of a path but its first
+    # frames of a path but its first
+    assert [part["recorded"].sum().item() for part in followed] == ([] if away else [18, 18])

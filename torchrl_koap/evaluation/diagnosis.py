@@ -26,6 +26,7 @@ from torchrl_koap.tasks.columns import unit_groups
 
 _WITH_UNITS = ("plain", "plane")  # features that keep the units of their columns
 _MOST_STATES = 4000  # largest number of states whose distances are measured
+_ELSEWHERE = 0.2  # share of the range of a column: noise is below, independent draws of a goal are above
 RECORDED_FUTURE = "recorded_future"
 RECORDED = "recorded"  # marks steps whose next state is recorded; after the end, its last state is repeated
 
@@ -96,7 +97,9 @@ def follow_recordings(
     """Rolls out a policy with recorded states in place of plans, one episode per chosen demonstration.
 
     At most ``episodes`` demonstrations are chosen, spread evenly over the data. Those without actions, for example of
-    another embodiment, are skipped if others have some. Episodes have the entry :data:`RECORDED` ``[T, 1]``.
+    another embodiment, are skipped if others have some. Episodes have the entry :data:`RECORDED` ``[T, 1]``. Returns
+    none if episodes start elsewhere than their demonstrations, on average by more than 20 % of the range of a column:
+    an environment may draw goals that are no bodies of the task.
     """
     lengths = trajectory_lengths(data).tolist()
     own = torch.isin(data[EPISODE].unique_consecutive(), labelled_episodes(data)).nonzero().squeeze(-1)
@@ -121,6 +124,11 @@ def follow_recordings(
         contexts=contexts_of(task, starts.double()).numpy() if task.objects else None,
         given=lambda part: hand_on(futures[part].to(device_of(policy))),
     )
+    span = data[STATE].amax(0) - data[STATE].amin(0)
+    begun = torch.stack([task.state_of(episode[OBSERVATION][0]) for episode in followed])
+    away = (begun - torch.stack([paths[index][0] for index in chosen])).abs().mean(0)
+    if not task.objects and ((away > _ELSEWHERE * span) & (span > 0)).any():
+        return []
     for episode, index in zip(followed, chosen, strict=True):
         episode[RECORDED] = (torch.arange(len(episode)) < len(paths[index]) - 1).unsqueeze(-1)
     return followed

@@ -42,7 +42,8 @@ from torchrl_koap.training.trained import Trained
 class InspectConfig(EvalConfig):
     """Which part of a trained run fails, and what its latent actions hold.
 
-    A Gymnasium environment cannot start where a recording did; there, the controller is not tested alone.
+    The controller is tested alone only where an environment starts as recordings did: not in Gymnasium, and not if it
+    draws goals that are no bodies of the task.
 
     Attributes:
         latent_only: analyse the latent space only, which takes seconds, without experiments in the simulator.
@@ -125,8 +126,9 @@ def _experiments(
             "plan_to_execution": tracking_errors(task, closed, interval),
             "distance_to_demonstrations": distance_to_demonstrations(task, closed, data),
         }
-        if config.env is None:  # needs an environment that starts where a recording did
-            followed = follow_recordings(policy, task, data, where.make_env, episodes=config.episodes)
+        if config.env is None and (
+            followed := follow_recordings(policy, task, data, where.make_env, episodes=config.episodes)
+        ):
             tracked = tracking_errors(task, followed, interval)
             if task.objects and of_position(task, tracked):
                 left = left_recordings(task, followed, interval, beyond=NEAR)
