@@ -10,7 +10,7 @@ from toy_policies import EchoController
 
 from torchrl_koap import TrainConfig, fit
 from torchrl_koap.data import LabelBudget, flatten_trajectories, make_demonstrations, select_state
-from torchrl_koap.modules import LinearInverseDynamics, make_koopman_inverse_dynamics
+from torchrl_koap.modules import InverseDynamics, LinearInverseDynamics, make_koopman_inverse_dynamics
 from torchrl_koap.training import METHODS, Method
 from torchrl_koap.training.controller import check_lengths, relabel
 from torchrl_koap.training.defaults import resolve
@@ -52,9 +52,24 @@ class Failing(LinearInverseDynamics):
         return {}["speed"]
 
 
+class OfAllFrames(LinearInverseDynamics):
+    def predict(self, state, frames=None):
+        return super().predict(state)
+
+
+class WithoutDecoder(LinearInverseDynamics):
+    fit_labels = InverseDynamics.fit_labels
+
+
 @pytest.mark.parametrize(
     ("network", "says"),
     [
+        (None, "method 'odd': build gave None, wanted an InverseDynamics"),
+        (
+            OfAllFrames(4, 2),
+            r"method 'odd': its network gave for the frames range\(.*\) \[1, 16, 2\], wanted \[1, 7, 2\]",
+        ),
+        (WithoutDecoder(4, 2), r"method 'odd': closed_form needs fit_labels\(\), which its controller lacks"),
         (LinearInverseDynamics(4, 3), r"method 'odd': its network gave \[1, 16, 3\], wanted \[1, 16, 2\]"),
         (Failing(4, 2), r"method 'odd': its network failed on .* \[1, 16, 4\]: KeyError: 'speed'"),
     ],

@@ -76,7 +76,12 @@ def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None
         WindowTable.build(data, WINDOW, pad_before=1)
         return
     with torch.random.fork_rng(devices=[]):
-        controller = build_controller(task, method, config.controller).eval()
+        controller = build_controller(task, method, config.controller)
+        if not isinstance(controller, InverseDynamics):
+            raise ValueError(f"method {config.method!r}: build gave {controller!r}, wanted an InverseDynamics")
+        if method.closed_form and type(controller).fit_labels is InverseDynamics.fit_labels:
+            raise ValueError(f"method {config.method!r}: closed_form needs fit_labels(), which its controller lacks")
+        controller.eval()
         shortest, past = controller.num_window_frames, controller.num_past
         window = max(WINDOW, shortest)
         _check_actions(task, config, controller, window)
@@ -92,17 +97,27 @@ def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None
 
 def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, window: int) -> None:
     """Runs a controller once on a window of zeros; raises a ValueError if it fails or gives another shape."""
-    states, wanted = torch.zeros(1, window, state_reader(task, config.controller).width), [1, window, task.action_dim]
-    try:
-        with torch.no_grad():
-            given = controller.predict(states)  # in normalised units: denormalising would broadcast a width of 1
-            if list(given.shape) == wanted:
-                given = controller(TensorDict({controller.in_key: states}, [1]))[controller.out_key]
-    except Exception as error:
-        said = f"its network failed on a window of states {list(states.shape)}: {type(error).__name__}: {error}"
-        raise ValueError(f"method {config.method!r}: {said}") from error
-    if list(given.shape) != wanted:
-        raise ValueError(f"method {config.method!r}: its network gave {list(given.shape)}, wanted {wanted}")
+    states, frames = (
+        torch.zeros(1, window, state_reader(task, config.controller).width),
+        controller.valid_frames(window),
+    )
+    calls = {  # in normalised units first: denormalising would broadcast a width of 1
+        "gave": (lambda: controller.predict(states), window),
+        f"gave for the frames {frames}": (lambda: controller.predict(states, frames), len(frames)),
+        "gave as a module": (
+            lambda: controller(TensorDict({controller.in_key: states}, [1]))[controller.out_key],
+            window,
+        ),
+    }
+    for how, (call, count) in calls.items():
+        try:
+            with torch.no_grad():
+                given = list(call().shape)
+        except Exception as error:
+            said = f"its network failed on a window of states {list(states.shape)}: {type(error).__name__}: {error}"
+            raise ValueError(f"method {config.method!r}: {said}") from error
+        if given != (wanted := [1, count, task.action_dim]):
+            raise ValueError(f"method {config.method!r}: its network {how} {given}, wanted {wanted}")
 
 
 def _warn_of_late_switches(task: Task, data: TensorDictBase, ahead: int) -> None:

@@ -139,3 +139,12 @@ def test_every_task_s_relations_fit_its_state_and_travel_with_the_planner(name):
     planner.fit_normalizers(windows)
     assert planner.encode_history(windows[:5, :2]).shape == (5, width)
     assert planner.sample(windows[:5, :2]).shape == (5, 14, task.state_dim)
+
+
+def test_a_network_of_another_width_is_named():
+    class Narrow(MLPDenoiser):
+        def denoise(self, x, step, condition):
+            return super().denoise(x, step, condition)[..., :1]
+
+    with pytest.raises(ValueError, match=r"denoise\(\) of Narrow must give \[4, 14, 3\], got \[4, 14, 1\]"):
+        Narrow(3, 6, horizon=14, width=32)(*inputs(4))

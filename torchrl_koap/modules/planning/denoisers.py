@@ -84,7 +84,10 @@ class Denoiser(nn.Module):
         if condition.shape != wanted:
             raise ValueError(f"condition must be {list(wanted)} ([*B, condition_dim]), got {list(condition.shape)}")
         x, condition = sequence.reshape(-1, *sequence.shape[-2:]), condition.reshape(-1, self.condition_dim)
-        return self.denoise(x, self.step_embedding(time.reshape(-1)), condition).reshape(sequence.shape)
+        clean = self.denoise(x, self.step_embedding(time.reshape(-1)), condition)
+        if clean.shape != x.shape:
+            raise ValueError(f"denoise() of {type(self).__name__} must give {list(x.shape)}, got {list(clean.shape)}")
+        return clean.reshape(sequence.shape)
 
 
 class MLPDenoiser(Denoiser):
@@ -133,7 +136,7 @@ class MLPDenoiser(Denoiser):
         x = self.first(torch.cat([x.flatten(1), self.encoder(condition), step], -1))
         for layer in self.layers:
             x = x + layer(x)
-        return self.last(x)
+        return self.last(x).unflatten(-1, (-1, self.state_dim))
 
 
 class RelativePositionFeatures(nn.Module):
