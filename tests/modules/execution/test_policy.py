@@ -149,9 +149,9 @@ def test_wrong_arguments_are_named():
 
 
 def test_a_missing_transform_is_named():
-    with pytest.raises(KeyError, match="reads 'observation_history': append policy_transforms"):
+    with pytest.raises(KeyError, match="reads 'observation_history': use PolicyEnv"):
         EpisodesOfRandomLength(2, LENGTHS).rollout(2, policy_of())
-    with pytest.raises(KeyError, match="reads 'is_init': append policy_transforms"):
+    with pytest.raises(KeyError, match="reads 'is_init': use PolicyEnv"):
         policy_of()(TensorDict({"observation_history": torch.zeros(2, 2, 3)}, [2]))
     with pytest.raises(ValueError, match=r"must be \[2, 2, 'obs'\] .*, got \[2, 4, 3\]"):
         policy_of()(step_input(torch.zeros(2, 4, 3)))

@@ -150,3 +150,11 @@ def test_a_nested_done_is_refused_since_resets_would_not_renew_the_history():
     nested = TransformedEnv(reach(), RenameTransform(in_keys=ends, out_keys=[("arm", end) for end in ends]))
     with pytest.raises(ValueError, match=r"needs the key 'done', got \[\('arm', 'done'\), .*by a RenameTransform"):
         PolicyEnv(nested, feedback())
+
+
+def test_the_name_of_the_observation_is_asked_for_if_it_is_another():
+    renamed = TransformedEnv(reach(), RenameTransform(in_keys=["observation"], out_keys=["joints"]))
+    with pytest.raises(ValueError, match="has no 'observation': name one of .*'joints'.* by observation_key"):
+        PolicyEnv(renamed, feedback())
+    env = PolicyEnv(renamed, feedback(), observation_key="joints")
+    assert env.rollout(2, feedback())["action"].shape == (2, 2)

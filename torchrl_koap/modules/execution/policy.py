@@ -263,7 +263,7 @@ class PlanningPolicy(TensorDictModuleBase):
         observed, begins = tensordict.get(self.in_keys[0], None), tensordict.get(IS_INIT, None)
         for name, value in ((self.in_keys[0], observed), (IS_INIT, begins)):
             if value is None:
-                raise KeyError(f"the policy reads {name!r}: append policy_transforms() to the environment")
+                raise KeyError(f"the policy reads {name!r}: use PolicyEnv(env, policy), or append policy_transforms()")
         batch, kept = tensordict.batch_size, [self._chunk_key, self.receding.counter_key]
         if observed.shape[:-1] != (*batch, self.history):
             raise ValueError(

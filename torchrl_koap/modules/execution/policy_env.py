@@ -127,7 +127,8 @@ class PolicyEnv(TransformedEnv):
         observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
 
     Raises:
-        ValueError: if the policy has ``origins``: only an Agent subtracts and adds them; or if ``done`` is nested.
+        ValueError: if the policy has ``origins``: only an Agent subtracts and adds them; if ``done`` is nested; or if
+            the environment has no such observation.
 
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv
@@ -146,6 +147,10 @@ class PolicyEnv(TransformedEnv):
             raise ValueError("PolicyEnv does not support policies with origins: use an Agent, which applies them")
         if "done" not in env.done_keys:  # TorchRL would renew only the entries beside ``done`` at a reset
             raise ValueError(f"PolicyEnv needs the key 'done', got {env.done_keys}: rename them by a RenameTransform")
+        if observation_key not in (entries := env.observation_spec.keys(True, True)):
+            raise ValueError(
+                f"the environment has no {observation_key!r}: name one of {list(entries)} by observation_key"
+            )
         key = policy.planner.noise_key  # None: the planner draws its own noise
         transforms = policy_transforms(policy.history, observation_key=observation_key, history_key=policy.in_keys[0])
         if key is not None:
