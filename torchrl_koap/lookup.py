@@ -35,6 +35,13 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
     raise ValueError(_unknown(table, name, what))
 
 
+def check_free(table: Collection[str], name: str, what: str, where: str) -> None:
+    """Raises a ValueError if a table, which is called ``where``, has the name already; it says how to free the name."""
+    if name in table:
+        cure = f"choose another name, or first `del {where}[{name!r}]`"
+        raise ValueError(f"another {what} named {name!r} is registered already; {cure}")
+
+
 def unknown(asked: Iterable[str], known: Collection[str], what: str) -> list[str]:
     """Returns the message of :func:`lookup` for every unknown name."""
     return [_unknown(known, name, what) for name in asked if name not in known]

@@ -108,7 +108,9 @@ def test_a_plugin_that_fails_is_named_with_its_error(tmp_path, monkeypatch):
     (tmp_path / "twice_plugin.py").write_text(
         "from torchrl_koap.training import METHODS, register_method; register_method(METHODS['koap'])"
     )
-    with pytest.raises(PluginError, match="plugin 'twice_plugin' failed .*there is a method 'koap' already"):
+    with pytest.raises(
+        PluginError, match="plugin 'twice_plugin' failed .*another method named 'koap' is registered already"
+    ):
         load_plugins(["twice_plugin"])
     with pytest.raises(PluginError, match="there is no plugin 'no_package.inside'; looked for it in"):
         load_plugins(["no_package.inside"])
@@ -137,7 +139,7 @@ def test_a_run_is_read_from_another_folder_than_that_of_its_plugin_file(demonstr
 def test_what_is_no_method_is_refused():
     loss, build = METHODS["dd"].phases[0].loss, METHODS["dd"].build
     register_method(Method("mine", "of mine", build))
-    with pytest.raises(ValueError, match="there is a method 'mine' already"):
+    with pytest.raises(ValueError, match="another method named 'mine' is registered already"):
         register_method(Method("mine", "another", build))
     with pytest.raises(ValueError, match="unknown kind of windows 'labeled'; did you mean 'labelled'"):
         Method("other", "", build, sees="labeled")

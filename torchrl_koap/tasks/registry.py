@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from torchrl_koap.lookup import entry_points_of, lookup
+from torchrl_koap.lookup import check_free, entry_points_of, lookup
 from torchrl_koap.tasks.task import Task
 
 GROUP = "torchrl_koap.tasks"
@@ -33,11 +33,9 @@ def register_task(task: Task) -> Task:
     """
     if not isinstance(task, Task):
         raise TypeError(f"wanted a Task, got {type(task).__name__}")
-    known = TASKS.setdefault(task.name, task)
-    if known != task:
-        cure = f"choose another name, or first `del torchrl_koap.tasks.TASKS[{task.name!r}]`"
-        raise ValueError(f"another task named {task.name!r} is registered already; {cure}")
-    return known
+    if TASKS.get(task.name) != task:
+        check_free(TASKS, task.name, "task", "torchrl_koap.tasks.TASKS")
+    return TASKS.setdefault(task.name, task)
 
 
 def get_task(name: Task | str) -> Task:

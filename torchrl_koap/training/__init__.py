@@ -8,7 +8,7 @@ _OFFERS = {
     "in_memory": ("fit",),
     "method": ("Method", "Phase"),
     "methods": ("METHODS", "register_method"),
-    "networks": ("register_network",),
+    "networks": ("NETWORKS", "register_network"),
     "on_disk": ("TrainConfig", "train"),
     "trained": ("Trained",),
 }

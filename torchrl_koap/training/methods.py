@@ -27,7 +27,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from torchrl_koap.lookup import entry_points_of, lookup
+from torchrl_koap.lookup import check_free, entry_points_of, lookup
 from torchrl_koap.modules import (
     PRESETS,
     LinearInverseDynamics,
@@ -96,15 +96,12 @@ def register_method(method: Method) -> Method:
 
     Examples:
         >>> from torchrl_koap.training.methods import METHODS, register_method
-        >>> register_method(METHODS["koap"])
+        >>> register_method(METHODS["koap"])  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ...
-        ValueError: there is a method 'koap' already ('KOAP'); choose another name
+        ValueError: another method named 'koap' is registered already; choose another name, or first ...
     """
-    if method.name in METHODS:
-        raise ValueError(
-            f"there is a method {method.name!r} already ({METHODS[method.name].title!r}); choose another name"
-        )
+    check_free(METHODS, method.name, "method", "torchrl_koap.training.METHODS")
     if method.teacher and not lookup(METHODS, method.teacher, "teacher").plans:
         raise ValueError(f"the teacher of method {method.name!r} must be a controller, {method.teacher!r} is a policy")
     METHODS[method.name] = method

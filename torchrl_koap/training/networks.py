@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
-from torchrl_koap.lookup import lookup
+from torchrl_koap.lookup import check_free, lookup
 from torchrl_koap.modules import (
     PRESETS,
     DiffusionPolicy,
@@ -56,12 +56,12 @@ def register_network(name: str, build: Callable[..., nn.Module], **defaults: flo
     Examples:
         >>> from torchrl_koap.modules import MLPDenoiser
         >>> from torchrl_koap.training import register_network
-        >>> register_network("mlp", MLPDenoiser)
+        >>> register_network("mlp", MLPDenoiser)  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        ValueError: there is a network 'mlp' already
+        ...
+        ValueError: another network named 'mlp' is registered already; choose another name, or first ...
     """
-    if name in NETWORKS:
-        raise ValueError(f"there is a network {name!r} already")
+    check_free(NETWORKS, name, "network", "torchrl_koap.training.NETWORKS")
     usual = NETWORKS["mlp"]
     for option in defaults:
         lookup(usual, option, "default of a network")
