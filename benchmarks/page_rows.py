@@ -180,13 +180,15 @@ def observation_rate(name: str, method: str, part: float) -> str:
 
 
 def followed_rollouts(labels: int, regimes: Sequence[str]) -> str:
-    """Formats the number of rollouts per entry of :func:`followed_table`."""
+    """Formats the rollouts and seeds per entry of :func:`followed_table`: "180 (3 seeds) or 300 (5 seeds)"."""
     rows = [row for regime in regimes for row in read_rows("unlabelled_rollouts", regime=regime, labels=labels)]
-    sizes: dict[tuple[str, str], int] = {}
+    sizes: dict[tuple[str, str], list[int]] = {}
     for row in rows:
-        cell = row["regime"], row["method"]
-        sizes[cell] = sizes.get(cell, 0) + int(row["n"])
-    return " or ".join(map(str, sorted({size for (_, name), size in sizes.items() if name in FOLLOWED.values()})))
+        if row["method"] in FOLLOWED.values():
+            sizes.setdefault((row["regime"], row["method"]), []).append(int(row["n"]))
+    return " or ".join(
+        f"{n} ({seeds} seeds)" for n, seeds in sorted({(sum(each), len(each)) for each in sizes.values()})
+    )
 
 
 def requirement(name: str) -> str:

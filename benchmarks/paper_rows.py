@@ -238,7 +238,7 @@ def comparison_table() -> str:
         fewest = min((float(row["labels"]) for row in rows), default=0.0)
         found = {row["method"]: row for row in rows if float(row["labels"]) == fewest and row["difference"]}
         if found:
-            body.append([f"`{task}`", *(_points(found[name]) if name in found else "not run" for name in RIVALS)])
+            body.append([f"`{task}`", *(_points(found[name]) if name in found else "not paired" for name in RIVALS)])
     return table(["KOAP minus", *(METHOD_NAMES[method] for method in RIVALS)], body)
 
 
