@@ -88,7 +88,7 @@ register_task(
         label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
         defaults=Defaults(
             demonstrations=96,
-            planner={"steps": 2800, "width": 32},
+            planner={"steps": 5000, "width": 32},
             execution={"candidates": 4},  # plans between two routes collide
             relative=False,
             recovery=0.004,
