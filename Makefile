@@ -3,28 +3,34 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
+LOCKED := --no-deps --require-hashes --requirement requirements-ci.txt
 
 .PHONY: setup demo test slow faults test-matrix lock lint types docs tutorials check-tutorials dist clean
 
 setup: $(VENV)/.ready
 
-# torch first, from the CPU wheel: anything that lets pip choose another torch downloads gigabytes of CUDA packages;
-# HASHES=1 takes the files of requirements-ci.txt and no others (Python 3.11, x86-64 Linux)
-$(VENV)/.ready: pyproject.toml constraints.txt
+# What users need. torch first, from the CPU wheel: anything that lets pip choose another torch downloads gigabytes of
+# CUDA packages; HASHES=1 takes the files of requirements-ci.txt and no others (Python 3.11, x86-64 Linux)
+$(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet $(if $(HASHES),--no-deps) $$(grep '^torch==' constraints.txt)
 ifdef HASHES
-	$(BIN)/python -m pip install --quiet --no-deps --require-hashes --requirement requirements-ci.txt
+	$(BIN)/python -m pip install --quiet $(LOCKED)
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	$(BIN)/python -m pip check
 else
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[hdf5,lerobot,video]'
 	$(BIN)/python -m pip install --quiet --no-deps $$(grep '^dm-control==' constraints.txt)  # all but labmaze
 endif
 	touch $@
 
+# and what tests, types and documentation need
+$(VENV)/.ready: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet $(if $(HASHES),$(LOCKED),--constraint constraints.txt --editable '.[dev]')
+	touch $@
+
 # demonstrations, training with 2 % of the labels, 60 rollouts, report
-demo: setup
+demo: $(VENV)/.installed
 	$(BIN)/koap demos --task avoiding --episodes 96 --seed 0 --out $(OUT)-data
 	$(BIN)/koap train --task avoiding --dataset $(OUT)-data --labels 0.02 --seed 0 --out $(OUT)
 	$(BIN)/koap eval $(OUT) --episodes 60 --seed 100
