@@ -27,6 +27,7 @@ from torchrl_koap.evaluation.closed_loop import choose_contexts
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, Body, get_task
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS
+from torchrl_koap.tasks.modes import Modes
 
 EPISODES = 26
 
@@ -46,7 +47,8 @@ def test_report(recording):
     assert trajectory_lengths(validate(data)).tolist() == [rows - 1 for rows in report.each("rows")]
     assert np.bincount(report.each("mode"), minlength=24).min() == 1 and len(set(report.each("mode")[24:])) == 2
     assert sum(report.each("attempts")) - EPISODES == sum(report.notes["discarded_attempts"].values())
-    assert f"{EPISODES} demonstrations" in str(report)
+    assert f"{EPISODES} demonstrations of avoiding in 24 modes (" in str(report)
+    assert " modes" not in str(replace(report, task=replace(report.task, modes=Modes())))
     done = [call[0] for call in calls]
     assert done == sorted(done) and calls[-1] == (EPISODES, EPISODES)
 

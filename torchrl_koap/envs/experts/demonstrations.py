@@ -83,10 +83,11 @@ class RecordingReport:
     def __str__(self) -> str:
         notes, modes, rows = self.notes, self.each("mode"), self.each("rows")
         discarded = ", ".join(f"{count} {reason}" for reason, count in notes["discarded_attempts"].items() if count)
-        counts = ", ".join(str(modes.count(mode)) for mode in range(self.task.modes.number))
+        counts = [str(modes.count(mode)) for mode in range(self.task.modes.number)]
+        shares = f" in {len(set(modes))} modes ({', '.join(counts)})" if len(counts) > 1 else ""
         said = (
-            f"{len(modes)} demonstrations of {self.task.name} in {len(set(modes))} modes ({counts}), {min(rows)} to"
-            f" {max(rows)} rows, {self.seconds:.1f} s; {notes['attempts'].count(1)} good at the first attempt;"
+            f"{len(modes)} demonstrations of {self.task.name}{shares}, {min(rows)} to {max(rows)} rows,"
+            f" {self.seconds:.1f} s; {notes['attempts'].count(1)} good at the first attempt;"
             f" discarded attempts: {discarded or 'none'}"
         )
         if self.disturbance:
