@@ -78,7 +78,7 @@ def _env_faults(env: EnvBase, task: Task, num_envs: int) -> list[str]:
         return [f"its batch size is {list(env.batch_size)}, wanted [{num_envs}]"]
     if getattr(env, "max_steps", None) is None:
         return ["it has no attribute 'max_steps'"]
-    wanted = [keys.OBSERVATION, keys.SUCCESS, keys.MODE, *([keys.CONTEXT] if task.objects else [])]
+    wanted = [keys.OBSERVATION, keys.SUCCESS, keys.MODE, *([keys.CONTEXT] if task.scene.varies else [])]
     entries = set(env.observation_spec.keys())
     if missing := [name for name in wanted if name not in entries]:
         return [f"its observation_spec has no entry {name!r}" for name in missing]
