@@ -10,7 +10,7 @@ Interface of an environment, D3IL's (:class:`~torchrl_koap.envs.ManipulationEnv`
     set_seed         seeds all that it draws; rollouts and recordings call it with the seed of their first episode
     observation      [n, obs]; success [n, 1] bool, latched until the reset; mode [n, ...], one of Task.modes.leaves
     collision        [n, 1] bool, if an episode can end by one
-    context          [n, bodies, 3], if the task has bodies
+    context          [n, bodies, 3], if bodies of the task start elsewhere in each episode
     reward, done, terminated, truncated
 
 Videos read ``sims.model`` and ``sims.data`` of MuJoCo if they exist.
