@@ -76,14 +76,15 @@ class Score:
         return percent({"successes": self.successes, "n": self.n}, 0)
 
 
-def ground_score(ground: str, method: str) -> Score | None:
-    """Pools the rows of a method on a ground with :func:`usual_labels` and default execution; None without rows.
+def ground_score(ground: str, method: str, labels: int | None = None) -> Score | None:
+    """Pools the rows of a method on a ground with default execution; None without rows.
 
     Args:
         ground (str): its name.
         method (str): a name of ``koap methods``.
+        labels (int, optional): number of labelled demonstrations. Default: :func:`usual_labels`.
     """
-    named = {"ground": ground, "method": method, "execution": "default", "labels": usual_labels(ground)}
+    named = {"ground": ground, "method": method, "execution": "default", "labels": labels or usual_labels(ground)}
     rows = read_rows("proving_grounds", **named)
     if not rows:
         return None
@@ -109,9 +110,9 @@ def usual_labels(ground: str) -> int:
     return counts.most_common(1)[0][0]
 
 
-def ground_text(ground: str, method: str) -> str:
-    """Formats the score of a method on a ground; "not run" if it has none."""
-    score = ground_score(ground, method)
+def ground_text(ground: str, method: str, labels: int | None = None) -> str:
+    """Formats :func:`ground_score`; "not run" if there is none."""
+    score = ground_score(ground, method, labels)
     return "not run" if score is None else score.text
 
 
