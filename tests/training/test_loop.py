@@ -308,3 +308,10 @@ def test_the_average_over_four_updates_has_the_same_decay():
     assert moving_average(module, 90).eps == pytest.approx(0.9**4)
     assert moving_average(module, 10**6).eps == pytest.approx(0.998**4)
     assert moving_average(module, 2).eps == 0.5
+
+
+def test_the_logged_speed_is_that_since_the_last_entry(monkeypatch):
+    clock = iter((5.0, 10.0))
+    monkeypatch.setattr(loop.time, "perf_counter", lambda: next(clock))
+    log, terms = loop._Log("planner", None, None, 100, 0.0), TensorDict({"loss_planner": torch.ones([])})
+    assert [log(step, terms, 0.1, {})["iterations_per_second"] for step in (150, 160)] == [10.0, 2.0]

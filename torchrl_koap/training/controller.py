@@ -97,17 +97,12 @@ def check_lengths(task: Task, config: TrainConfig, data: TensorDictBase) -> None
 
 def _check_actions(task: Task, config: TrainConfig, controller: nn.Module, window: int) -> None:
     """Runs a controller once on a window of zeros; raises a ValueError if it fails or gives another shape."""
-    states, frames = (
-        torch.zeros(1, window, state_reader(task, config.controller).width),
-        controller.valid_frames(window),
-    )
+    states = torch.zeros(1, window, state_reader(task, config.controller).width)
+    batch, frames = TensorDict({controller.in_key: states}, [1]), controller.valid_frames(window)
     calls = {  # in normalised units first: denormalising would broadcast a width of 1
         "gave": (lambda: controller.predict(states), window),
         f"gave for the frames {frames}": (lambda: controller.predict(states, frames), len(frames)),
-        "gave as a module": (
-            lambda: controller(TensorDict({controller.in_key: states}, [1]))[controller.out_key],
-            window,
-        ),
+        "gave as a module": (lambda: controller(batch)[controller.out_key], window),
     }
     for how, (call, count) in calls.items():
         try:
