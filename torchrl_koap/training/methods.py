@@ -16,7 +16,7 @@ the teacher.
 an identified model of how the robot answers commands.
 
 Four controls show what the Koopman model itself adds: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
-none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
+none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales and prior;
 ``koap_untrained``, KOAP with random features, where only the decoder is fitted;
 ``pca``, a ridge on principal components of all windows, labelled or not.
 """
@@ -147,7 +147,12 @@ for _method in (
     ),
     Method("koap_untrained", "KOAP, nothing trained but the decoder", _koap, closed_form=True, presets=_ANY_PRESET),
     Method("pretrain", "KOAP, pre-trained and fine-tuned", _koap, _TWO_STAGES, **_BY_GRADIENTS),
-    Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
+    Method(
+        "linear_steps",
+        "ridge on KOAP's scaled steps",
+        partial(_koap, num_features=0, input_noise=1e-5),  # with 1e-8, as for KOAP, fewer rollouts succeed
+        closed_form=True,
+    ),
     Method(
         "pca",
         "ridge on principal components of unlabelled windows",

@@ -72,6 +72,8 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         lifting (KoopmanLifting or CompactLifting): the networks ``g``.
         operator (KoopmanOperator): the matrix ``K``.
         penalty (float): ridge penalty of the decoder if fewer than three trajectories have labels. Default: ``0.15``.
+        input_noise (float): variance of the errors of plans, in units of the mean square norm of latent actions; it
+            bounds the penalty from below, see :func:`~torchrl_koap.modules.ridge.ridge`. Default: ``1e-8``.
         **kwargs: normalisers, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
@@ -98,6 +100,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         lifting: KoopmanLifting | CompactLifting,
         operator: KoopmanOperator,
         penalty: float = DEFAULT_PENALTY,
+        input_noise: float = INPUT_NOISE,
         **kwargs,
     ):
         if not isinstance(action_decoder, LinearActionDecoder):
@@ -117,7 +120,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         super().__init__(latent_action, action_decoder, lifting, **kwargs)
         self.out_keys = [*latent_action.out_keys, self.out_key]
         self.latent_key = latent_action.out_keys[0]
-        self.operator, self.penalty = operator, penalty
+        self.operator, self.penalty, self.input_noise = operator, penalty, input_noise
 
     def decode(self, latent: Tensor) -> Tensor:
         """Decodes latent actions ``[*B, T, m]`` to actions ``[*B, T, act]`` in normalised units."""
@@ -165,7 +168,7 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
         network, normalizer = self.latent_action, self.action_normalizer
         options = {
             "default_penalty": self.penalty,
-            "input_noise": INPUT_NOISE,
+            "input_noise": self.input_noise,
             "bias": normalizer is not None and bool(normalizer.offset.any()),
             "alike": alike,
         }

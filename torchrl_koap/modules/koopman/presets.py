@@ -18,6 +18,7 @@ from torchrl_koap.modules.koopman.latent_action import (
 )
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
+from torchrl_koap.modules.ridge import INPUT_NOISE
 
 _DEFAULT: dict[str, Any] = {
     "normalization": {"state": "standard", "action": "rms"},  # modes of Normalizer.fit; callers pass the normalisers
@@ -29,6 +30,7 @@ _DEFAULT: dict[str, Any] = {
     "look_ahead": (2, 3, 4, 5),
     "clamped": False,
     "penalty": 0.15,
+    "input_noise": INPUT_NOISE,
 }
 
 _FOURIER: dict[str, Any] = {"num_features": 512, "kernels": {"sharp": FourierKernel()}, "position_weight": 0.0}
@@ -153,6 +155,7 @@ def make_koopman_inverse_dynamics(
         lifting=lifting,
         operator=operator,
         penalty=choice["penalty"],
+        input_noise=choice["input_noise"],
         state_normalizer=state_normalizer,
         action_normalizer=action_normalizer,
     )
