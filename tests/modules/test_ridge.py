@@ -208,6 +208,8 @@ def test_targets_that_are_not_alike_have_a_penalty_each():
         ({"penalties": (1.0, 0.0)}, "penalties must be positive and finite"),
         ({"penalties": ()}, "penalties must be positive and finite"),
         ({"default_penalty": -1.0}, "penalties must be positive and finite"),
+        ({"input_noise": -1e-8}, "input_noise must be a finite number >= 0"),
+        ({"input_noise": float("nan")}, "input_noise must be a finite number >= 0"),
     ],
 )
 def test_bad_input_is_explained(change, message):

@@ -95,7 +95,8 @@ def ridge(
         RidgeFit: weights, the penalty chosen and its held-out errors.
 
     Raises:
-        ValueError: if there is no row, a value is not finite, a penalty is not positive, or shapes disagree.
+        ValueError: if there is no row, a value is not finite, a penalty is not positive, ``input_noise`` is
+            negative, or shapes disagree.
 
     Examples:
         >>> import torch
@@ -114,6 +115,8 @@ def ridge(
     candidates = tuple(penalties) if default_penalty is None else (*penalties, default_penalty)
     if not candidates or not all(0 < penalty < float("inf") for penalty in candidates):
         raise ValueError(f"penalties must be positive and finite, got {candidates}")
+    if not 0 <= input_noise < float("inf"):
+        raise ValueError(f"input_noise must be a finite number >= 0, got {input_noise}")
     if not len(inputs):
         raise ValueError("a ridge regression needs at least one labelled step, there is none")
     x, y = inputs, targets.double()
