@@ -213,9 +213,19 @@ def test_what_cannot_be_done_is_said_in_one_line_before_any_work(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_paper_has_two_tables(tmp_path, capsys):
+def test_the_paper_has_two_tables(tmp_path, capsys, monkeypatch):
     assert "table must be 1 or 2, got 3" in fails(capsys, "bench", "--table", 3, "--out", tmp_path / "bench")
     assert list(tmp_path.iterdir()) == []
+    asked = []
+
+    def note(study, machines):
+        asked.append(study.preset)
+        return run_module.StudyResult([], {"done": 0, "failed": 0, "missing": 0}, study.out)
+
+    monkeypatch.setattr("torchrl_koap.commands.run_commands.run_study", note)
+    for table in (1, 2):
+        koap("bench", "--table", table, "--out", tmp_path / "bench")
+    assert asked == ["table1", "table2"]
 
 
 def test_windows_of_every_seed_must_lie_in_the_trajectories_used(tmp_path, demonstrations, capsys):
