@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.commands.data_commands import Demos
@@ -23,6 +24,7 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import (
     BOWL,
     BOWL_REACH,
+    EMBEDDING_DIM,
     PIECE_RADIUS,
     RIM_RADIUS,
     START_HALF,
@@ -31,6 +33,7 @@ from torchrl_koap.tasks.scooping import (
     scores,
     start_of,
 )
+from torchrl_koap.vision import Backbone, FrozenImageEncoder, Projection
 from torchrl_koap.vision.encoder import projection_of
 
 NEAR = np.array([[*STARTS["near"], 0.4]])
@@ -158,6 +161,20 @@ def test_the_camera_sees_the_embodiments_differ(embodiment, graphics):
     assert picture.shape == (96, 96, 3)
     skin = (picture[..., 0] > 150) & (picture[..., 0] - picture[..., 2] > 50) & (picture[..., 1] < 170)
     assert (skin.sum() > 40) == (embodiment == "hand")
+
+
+def test_frames_are_embedded_in_the_environment_or_by_a_transform(graphics):
+    backbone = Backbone(torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(7), torch.nn.Flatten()), "mean colours", "own")
+    encoder = FrozenImageEncoder(backbone, projection=Projection.fit(torch.rand(200, 147), EMBEDDING_DIM))
+    env = TransformedEnv(ScoopingEnv(2, seed=0, encoder=encoder, pixels=True), encoder)
+    check_env_specs(env)
+    data = env.rollout(2)
+    for frame in (data, data["next"]):
+        torch.testing.assert_close(frame["embedding"], encoder.embed(frame["pixels"]))
+        torch.testing.assert_close(frame["observation"][..., :EMBEDDING_DIM], frame["embedding"])
+    encoder.projection = None
+    with pytest.raises(ValueError, match=f"must have {EMBEDDING_DIM} components, got 0"):
+        ScoopingEnv(2, encoder=encoder)
 
 
 def test_the_embodiment_is_mandatory(tmp_path):
