@@ -219,13 +219,32 @@ def test_next_observations_say_where_episodes_end(name, tmp_path):
     entries = {name: frames[rows], f"next_{name}": frames[rows + 1].astype(np.float32), "actions": np.ones((11, 1))}
     np.savez(tmp_path / "a.npz", terminals=np.arange(11) == 2, **entries)
     found = read_tables(tmp_path, control_hz=20)
-    assert [len(each) for each in found.states] == [3, 3, 5]
-    np.testing.assert_array_equal(np.concatenate(found.states), frames[rows])
-    assert any(said.startswith(f"next_{name} (an episode ends where") for said in found.skipped)
+    assert [len(each) for each in found.states] == [3, 4, 6] and found.num_labels == 10
+    np.testing.assert_allclose(np.concatenate(found.states), frames, atol=1e-6)
+    assert any(said.startswith(f"next_{name} (except the last of episodes, which end") for said in found.skipped)
     shuffled = np.random.default_rng(1).permutation(11)
     np.savez(tmp_path / "a.npz", **{key: values[shuffled] for key, values in entries.items()})
     with pytest.raises(DataError, match=rf"next_{name} is not the next row of {name} in \d+ of 11 rows: sort"):
         read_tables(tmp_path, control_hz=20)
+
+
+def test_the_last_action_of_an_episode_leads_to_its_next_observation(tmp_path):
+    """The added frame goes on with clock and counter, and shows the last picture; its own action is unknown."""
+    frames, rows = np.random.default_rng(0).normal(size=(14, 2)), np.r_[:6, 7:13]
+    entries = {"obs": frames[rows], "next_obs": frames[rows + 1], "actions": rows[:, None], "timeouts": rows % 7 == 5}
+    np.savez(tmp_path / "a.npz", time=rows % 7 / 20, frame_index=rows % 7, **entries)
+    (tmp_path / "a").mkdir()
+    np.save(tmp_path / "a/top.npy", np.zeros((12, 2, 2, 3), np.uint8))
+    found = read_tables(tmp_path)
+    np.testing.assert_array_equal(found.states, frames.reshape(2, 7, 2))
+    assert np.array_equal(found.actions, rows.reshape(2, 6, 1)) and found.control_hz == pytest.approx(20)
+    assert [clip.numbers for clip in found.cameras["top"]] == [(0, 1, 2, 3, 4, 5, 5), (6, 7, 8, 9, 10, 11, 11)]
+    entries["next_obs"][5] = np.nan  # not recorded
+    np.savez(tmp_path / "a.npz", **entries | {"actions": rows[:11, None]})
+    with pytest.raises(DataError, match="it holds 2 episodes and 11 actions for 12 frames"):
+        read_tables(tmp_path, control_hz=20)
+    np.savez(tmp_path / "a.npz", **entries)
+    assert [len(steps) for steps in read_tables(tmp_path, control_hz=20, drop_columns=["top"]).states] == [6, 7]
 
 
 def test_faults_of_all_files_are_named(tmp_path):

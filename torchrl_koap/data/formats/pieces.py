@@ -14,6 +14,7 @@ from torchrl_koap.data.formats.kinds import kind_of
 from torchrl_koap.files import option
 
 SHUFFLED = 0.25  # rows are out of order if their clock goes back, or the next row is another, in more than this share
+NEXT_END = "next.done"  # flags the last frames of episodes that next observations show
 _SAME, _ROUNDED = 1e-3, 1e-6  # rounding errors: share of a column's range, and of its largest number
 
 
@@ -192,6 +193,36 @@ def other_frames(frames: np.ndarray, following: np.ndarray) -> np.ndarray:
     frames, following = (part.reshape(len(part), -1).astype(np.float64) for part in (frames, following))
     room = _SAME * np.ptp(frames, axis=0) + _ROUNDED * np.abs(frames).max() if len(frames) > 1 else 0.0
     return (np.abs(following[:-1] - frames[1:]) > room).any(-1)
+
+
+def with_last_frames(piece: Piece, following: np.ndarray, key: str) -> Piece:
+    """Adds the last frame of every episode, to which its last action leads, from the next observations ``[T, d]``.
+
+    They are those of the first d columns, called ``key``. An episode ends where they are not the next row.
+
+    Raises:
+        ValueError: if they are not in so many rows that the rows are shuffled.
+    """
+    names, length = list(piece.states)[: following.shape[1]], piece.frames
+    off = other_frames(np.stack([piece.states[name] for name in names], 1), following)
+    if off.sum() > SHUFFLED * length:
+        raise ValueError(
+            f"next_{key} is not the next row of {key} in {off.sum()} of {length} rows: sort the rows, as shuffled"
+            f" ones hold no motion, or leave out next_{key} if it is unused"
+        )
+    steps = piece.actions or {}
+    whole = all(len(values) == length for values in steps.values())  # else there are T - 1 actions for T frames
+    ends = np.flatnonzero(np.append(off, whole) & np.isfinite(following).all(1))
+    places = ends + np.arange(1, len(ends) + 1)  # of the added frames
+    found = replace(piece, states=piece.states | {NEXT_END: np.append(off, False).astype(np.float64)})
+    found = found.taken(np.sort(np.r_[np.arange(length), ends]))
+    found.states[NEXT_END][places - 1] = 0
+    for name, values in found.states.items():
+        if name in names:
+            values[places] = following[ends, names.index(name)]
+        elif kind_of(name)[0] in ("clock", "frame"):
+            values[places] += np.median(np.diff(piece.states[name]))
+    return replace(found, actions={name: np.insert(values, ends + 1, np.nan) for name, values in steps.items()} or None)
 
 
 def counted_ends(values: np.ndarray, length: int, kind: str | None) -> np.ndarray | None:

@@ -32,14 +32,13 @@ from torchrl_koap.data.formats.columns import assemble
 from torchrl_koap.data.formats.frames import TIMES, clips_beside
 from torchrl_koap.data.formats.kinds import as_numbers, is_action, kind_of, named_twice, number_of, numbered
 from torchrl_koap.data.formats.parquet import import_pyarrow, number_type, numbers
-from torchrl_koap.data.formats.pieces import SHUFFLED, Piece, counted_ends, other_frames
+from torchrl_koap.data.formats.pieces import NEXT_END, Piece, counted_ends, with_last_frames
 from torchrl_koap.data.formats.recordings import Recordings, wrong_rate
 from torchrl_koap.files import DataError, gathered, option, refuse, some
 from torchrl_koap.lookup import unknown
 
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
-_NEXT_END = "next.done"  # flags the rows whose next observation is not the next row
 _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "frame": "a count of frames"}
 
 
@@ -66,9 +65,7 @@ def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = No
     pieces: list[Piece] = []
     for file in files:
         try:
-            piece = _READERS[file.suffix.lower()](file, action_columns)
-            (clock,) = next(iter(time_stamps([piece.clocks]).values()), [None])
-            pieces.append(replace(piece, cameras=clips_beside(file, clock)))
+            pieces.append(_READERS[file.suffix.lower()](file, action_columns))
         except (ValueError, OSError) as error:
             faults.append((str(file), str(error)))
     refuse(folder, gathered(faults) or _lacking(pieces, action_columns or ()))
@@ -149,7 +146,8 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
     frames, read = entries[key], {key, acting, "state_names", "action_names", "control_hz"}
     if frames.ndim != 2 or frames.dtype.kind not in "fiub":
         raise ValueError(f"{key} must be numbers [T, d], got {frames.dtype} {list(frames.shape)}")
-    states, unclear, unread, steps = _named(frames, entries.get("state_names"), "state"), [], [], None
+    states, unclear, unread = _named(frames, entries.get("state_names"), "state"), [], []
+    steps = following = None
     for name, values in entries.items():
         if name in read:
             continue
@@ -158,8 +156,8 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
         single = whole and values.size == len(frames)
         flags = None if single else counted_ends(values, len(frames), kind)
         if name == f"next_{key}" and values.shape == frames.shape and whole:
-            states[_NEXT_END] = _ends_by_next(frames, values, key)
-            unread.append(f"{name} (an episode ends where it is not the next row: {_NEXT_END})")
+            following = values
+            unread.append(f"{name} (except the last of episodes, which end where it is not the next row: {NEXT_END})")
             continue
         if kind == "other" or kind is None and not single and flags is None:
             joins = whole and kind is None
@@ -178,18 +176,8 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> Piece:
     elif "action_names" in entries:  # no labels, yet known columns
         steps = _named(np.full((len(frames), entries["action_names"].size), np.nan), entries["action_names"], "action")
     rate = _declared(entries.get("control_hz"))
-    return Piece(file.name, states, steps, tuple(unclear), declared_hz=rate, unread=tuple(unread))
-
-
-def _ends_by_next(frames: np.ndarray, following: np.ndarray, key: str) -> np.ndarray:
-    """Returns which rows end an episode by the next observations ``[T, d]``, as 0 or 1 ``[T]``."""
-    off = other_frames(frames, following)
-    if off.sum() > SHUFFLED * len(frames):
-        raise ValueError(
-            f"next_{key} is not the next row of {key} in {off.sum()} of {len(frames)} rows: sort the rows, as shuffled"
-            f" ones hold no motion, or leave out next_{key} if it is unused"
-        )
-    return np.append(off, False).astype(np.float64)
+    piece = _filmed(file, Piece(file.name, states, steps, tuple(unclear), declared_hz=rate, unread=tuple(unread)))
+    return piece if following is None else with_last_frames(piece, following, key)
 
 
 def _declared(entry: np.ndarray | None) -> float | None:
@@ -343,4 +331,10 @@ def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns:
         )
     states = {name: values for name, values in known.items() if name not in acting}
     said = tuple(f"{name} (no numbers)" for name in unread)
-    return Piece(file.name, states, {name: known[name] for name in acting} or None, unread=said)
+    return _filmed(file, Piece(file.name, states, {name: known[name] for name in acting} or None, unread=said))
+
+
+def _filmed(file: Path, piece: Piece) -> Piece:
+    """Adds the cameras beside a table, whose rows are those of the piece."""
+    (clock,) = next(iter(time_stamps([piece.clocks]).values()), [None])
+    return replace(piece, cameras=clips_beside(file, clock))
