@@ -2,6 +2,8 @@
 """Tests the names of `import torchrl_koap`, and that Python and shell do the same."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 from tiny_runs import koap
@@ -29,6 +31,11 @@ PLAIN = {
 def test_every_name_is_there():
     for name in torchrl_koap.__all__:
         assert getattr(torchrl_koap, name) is not None and name in dir(torchrl_koap)
+
+
+def test_subpackages_are_attributes():
+    script = "import sys, torchrl_koap; assert 'torchrl_koap.data' not in sys.modules; torchrl_koap.data.LabelBudget"
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_an_unknown_name_is_named():

@@ -135,7 +135,7 @@ def entry_points_of(group: str) -> list[Any]:
 
 
 def exports(package: str, offers: Mapping[str, Collection[str]]) -> tuple[Callable[[str], Any], list[str]]:
-    """Makes ``__getattr__`` and ``__all__`` of a package that imports its public names at first access.
+    """Makes ``__getattr__`` and ``__all__`` of a package that imports public names and modules at first access.
 
     Args:
         package (str): name of the package.
@@ -144,8 +144,10 @@ def exports(package: str, offers: Mapping[str, Collection[str]]) -> tuple[Callab
     modules = {name: f"{package}.{module}" for module, names in offers.items() for name in names}
 
     def get(name: str) -> Any:
-        if name not in modules:
+        if name in modules:
+            return getattr(importlib.import_module(modules[name]), name)
+        if importlib.util.find_spec(f"{package}.{name}") is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(modules[name]), name)
+        return importlib.import_module(f"{package}.{name}")
 
     return get, list(modules)
