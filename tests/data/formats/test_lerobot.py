@@ -231,7 +231,7 @@ FILES = [
     (lambda t: t.slice(0, 4), "FILE: episode 1 has 4 rows, its description says 6"),
     (edited("frame_index", put(5, 9)), "FILE: column 'frame_index' of episode 1 must count 0, 1, 2, ..."),
     (edited("observation.state", lambda rows: [row[:3] for row in rows]), "'observation.state' has rows of 3 and 7"),
-    (edited("episode_index", put(3, None)), "FILE: column 'episode_index' must hold whole numbers, got nan"),
+    (edited("episode_index", put(3, None)), "FILE: column 'episode_index' must hold whole numbers, got an empty row"),
     (edited("episode_index", put(0, 1.5)), "FILE: column 'episode_index' must hold whole numbers, got 1.5"),
     (lambda t: t.append_column("action", t["action"]), "FILE: two columns are named action"),
 ]

@@ -156,7 +156,8 @@ def _read_rows(
                 problems.append(str(error))
     if EPISODE in columns and (odd := np.flatnonzero(columns[EPISODE][:, 0] % 1 != 0)).size:
         value = columns[EPISODE][odd[0], 0]
-        problems.append(f"{files[odd[0]]}: column {EPISODE!r} must hold whole numbers, got {value:g}")
+        got = "an empty row" if np.isnan(value) else f"{value:g}"
+        problems.append(f"{files[odd[0]]}: column {EPISODE!r} must hold whole numbers, got {got}")
     refuse(root, problems)
     episode, frame = (columns.pop(name)[:, 0] for name in (EPISODE, FRAME))
     found, starts, lengths = np.unique(episode.astype(int), return_index=True, return_counts=True)
