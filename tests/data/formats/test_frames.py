@@ -240,6 +240,7 @@ def test_what_is_missing_is_named(tmp_path):
         (np.zeros((8, 8), np.uint8), r"has shape \[8, 8\], wanted \[H, W, 3\]: save one image as RGB"),
         (np.zeros((8, 8, 4), np.uint8), r"has shape \[8, 8, 4\]"),
         (np.zeros((3, 8, 8), np.uint8), r"has shape \[3, 8, 8\].*the three colours last"),
+        (np.zeros((8, 8, 1), np.float32), r"has shape \[8, 8, 1\].* last \(depth maps are not used\)$"),
         (np.zeros((8, 8, 3)), "is float64, wanted uint8 in 0 to 255: scale and round it"),
         (np.zeros((8, 9, 3), np.uint8), "is 8 x 9, the camera's others are 8 x 8: resize them alike"),
     ],
@@ -255,7 +256,7 @@ def test_a_camera_whose_first_frame_is_none_is_refused_when_it_is_read_in(tmp_pa
     write_tables(tmp_path)
     for file in tmp_path.glob("run_*/wrist.npy"):
         np.save(file, np.load(file).transpose(0, 3, 1, 2) / 255)
-    with pytest.raises(DataError, match=r"run_0.npz: camera 'wrist': frame 0 has shape .*, the three colours last"):
+    with pytest.raises(DataError, match=r"run_0.npz: camera 'wrist': frame 0 has shape .*last .*; or drop .* wrist$"):
         read_recordings(tmp_path)
     assert list(read_recordings(tmp_path, drop_columns=["wrist"]).cameras) == ["top"]
 

@@ -209,21 +209,22 @@ def _other_names(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:
 def _camera_faults(pieces: Sequence[Piece]) -> Iterator[str]:
     """Finds pieces without a camera that others have or without a frame per row, and unreadable first frames."""
     for name in dict.fromkeys(name for piece in pieces for name in piece.cameras):
-        cure = f"record them, or drop the camera with {option('drop_columns')} {name}"
+        drop = f"drop the camera with {option('drop_columns')} {name}"
         absent = [piece.name for piece in pieces if name not in piece.cameras]
         if absent:
-            yield f"camera {name!r} has no frames in {some(absent)}: {cure}"
+            yield f"camera {name!r} has no frames in {some(absent)}: record them, or {drop}"
         for piece in pieces:
             number = len(piece.cameras.get(name, range(piece.frames)))
             if number != piece.frames:
                 times = f"give their times in {name}_times.npy (beside a table with a clock)"
-                yield f"{piece.name}: camera {name!r} has {number} frames for {piece.frames} rows: {times}, {cure}"
+                said = f"camera {name!r} has {number} frames for {piece.frames} rows: {times}, record them, or {drop}"
+                yield f"{piece.name}: {said}"
         where, clip = next((piece.name, piece.cameras[name]) for piece in pieces if name in piece.cameras)
         try:
             with suppress(RuntimeError):  # the extra that reads it is missing; only `koap embed` needs it
                 next(clip.take(range(min(len(clip), 1))).read(), None)
         except ValueError as error:
-            yield f"{where}: camera {name!r}: {error}"
+            yield f"{where}: camera {name!r}: {error}; or {drop}"
 
 
 def _other_lengths(pieces: Sequence[Piece]) -> Iterator[tuple[str, str]]:

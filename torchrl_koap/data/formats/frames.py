@@ -92,7 +92,8 @@ def fault_of(frame: np.ndarray, size: Sequence[int] | None = None) -> str | None
     """Returns a fault of an image and its remedy; None if it is uint8 ``[H, W, 3]`` with the size (H, W)."""
     shape = list(frame.shape)
     if len(shape) != 3 or shape[2] != 3:
-        return f"has shape {shape}, wanted [H, W, 3]: save one image as RGB, the three colours last"
+        said = "save one image as RGB, the three colours last (depth maps are not used)"
+        return f"has shape {shape}, wanted [H, W, 3]: {said}"
     if frame.dtype != np.uint8:
         return f"is {frame.dtype}, wanted uint8 in 0 to 255: scale and round it"
     if size is not None and tuple(shape[:2]) != tuple(size):
