@@ -279,7 +279,7 @@ def test_a_mask_that_chooses_nothing_is_told(file):
     with h5py.File(file, "a") as stream:
         stream["mask/success"] = np.array([b"demo_2"])
     recordings = read_robomimic(file)
-    assert len(recordings.states) == 2 and recordings.skipped == ("mask (every demonstration is read)",)
+    assert len(recordings.states) == 2 and recordings.skipped == ("mask/success (every demonstration is read)",)
     with h5py.File(file, "a") as stream:
         del stream["data/demo_10"]
     assert read_robomimic(file).sources == ("demo_2",)

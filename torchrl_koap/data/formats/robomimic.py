@@ -120,8 +120,8 @@ def _read(
     skipped += sorted(held - {"obs", NEXT, "actions", *seen})
     skipped += [NEXT] if any(NEXT in data[name] for name in {*demos} - with_next) else []
     skipped += [f"data/{name} (no group)" for name in data if name not in demos]
-    said = {"mask": "mask (every demonstration is read)"}
-    skipped += [said.get(name, name) for name in stream if "data" in stream and name != "data"]
+    others = [name for name in _entries(stream) if "data" in stream and not name.startswith("data/")]
+    skipped += [f"{name} (every demonstration is read)" if name.startswith("mask/") else name for name in others]
     return pieces, _control_frequency(getattr(data, "attrs", {}).get("env_args")), skipped
 
 
