@@ -253,9 +253,10 @@ def _listed(values: Any, what: str, wanted: str, source: str) -> list[Any]:
     with contextlib.suppress(TypeError, RuntimeError):  # not a sequence; nested tensors
         if not isinstance(values, (str, Path, Mapping)):
             return list(values)
-    kind = type(values).__name__
-    said = f"{what} must be a sequence of arrays {wanted}, one per trajectory, got {kind}"
-    raise DataError(source, f"{said}: files are read by read_recordings (`koap convert`)")
+    kind, cure = type(values).__name__, "files are read by read_recordings (`koap convert`)"
+    if isinstance(values, Mapping):
+        cure = "give the arrays of its entries as lists, in the arguments states and actions"
+    raise DataError(source, f"{what} must be a sequence of arrays {wanted}, one per trajectory, got {kind}: {cure}")
 
 
 def _by_name(
@@ -286,7 +287,7 @@ def _table(value: Any, what: str, wanted: str, name: str, faults: list[tuple[str
         if array.dtype.kind in "fiubO":
             array = array.astype(np.float64).filled(np.nan)
     except (ValueError, TypeError, RuntimeError):  # ragged lists; other objects; sparse tensors
-        said = f"{what} are no table of numbers, got {type(value).__name__}"
+        said = f"{what} are no table of numbers {wanted}, got {type(value).__name__}"
         if isinstance(value, (list, tuple)) and len(widths := sorted({np.size(row) for row in value})) > 1:
             said = f"{what} are lists of different lengths: rows of {' and '.join(map(str, widths))} numbers"
         faults.append((name, said))
