@@ -100,6 +100,16 @@ def test_a_row_of_empty_fields_between_others_is_a_lost_frame(tmp_path):
     assert read_tables(tmp_path, control_hz=10, action_dim=1).states[0].tolist() == [[1, 2], [3, 4]]
 
 
+@pytest.mark.parametrize("parted", ["1,000", "1.000"])
+def test_thousands_with_a_separator_are_refused(parted, tmp_path):
+    """With semicolons, a comma is a decimal one: 1,000 behind 999 would be 1."""
+    (tmp_path / "run.csv").write_text(f"x;y\n998;1\n999;2\n{parted};3\n")
+    with pytest.raises(DataError, match="run.csv: column 'x' holds 1,000, which may be 1000 or 1: write thousands"):
+        read_tables(tmp_path, control_hz=10, action_dim=1)
+    (tmp_path / "run.csv").write_text(f"x;y\n98;1\n0,999;2\n{parted};3\n")
+    assert read_tables(tmp_path, control_hz=10, action_dim=1).states[0][:, 0].tolist() == [98, 0.999, 1]
+
+
 def test_rows_that_begin_like_comments_are_listed(tmp_path):
     (tmp_path / "run.csv").write_text("# an arm\nrun,x\n#1,2\n#1,3\na,4\na,5\n")
     recordings = read_tables(tmp_path, control_hz=10, action_dim=1)

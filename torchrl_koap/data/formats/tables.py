@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -39,6 +40,7 @@ from torchrl_koap.lookup import unknown
 
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
+_HUNDREDS, _THOUSANDS = re.compile(r"-?[1-9]\d\d"), re.compile(r"-?[1-9]\d{0,2}\.\d{3}")
 _NEEDED = {"start": "the start of episodes", "end": "the end of episodes", "frame": "a count of frames"}
 
 
@@ -279,6 +281,10 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> Piece:
         odd = [row for row, text in enumerate(texts, 1) if number_of(text) is None]
         if columns[name] is None and len(odd) < len(texts):
             raise ValueError(f"line {rows[odd[0]][0]}, column {name!r}: {texts[odd[0] - 1]!r} is no number")
+        parted, whole = [text for text in texts if "." in text], any(map(_HUNDREDS.fullmatch, texts))
+        if separator != "," and parted and whole and all(map(_THOUSANDS.fullmatch, parted)):
+            said = f"{parted[0].replace('.', ',')}, which may be {parted[0].replace('.', '')} or {float(parted[0]):g}"
+            raise ValueError(f"column {name!r} holds {said}: write thousands without a separator")
     piece = _split(file, columns, action_columns)
     return replace(piece, unread=(*piece.unread, *[f"{hidden} rows of {file.name} that begin with #"] * bool(hidden)))
 
