@@ -193,3 +193,14 @@ def test_recordings_without_labels_in_a_smaller_unit_or_with_sensors_off(share, 
     where = "'p', 'q' move less than a tenth as far as in labelled trajectories in 2 of 6 without labels (take 8, take"
     assert [where in said for said in found] == [True] * told
     assert all(said.endswith("leave out these recordings, not columns") for said in found)
+
+
+@pytest.mark.parametrize(("still", "told"), [(1, False), (2, True)])
+def test_a_column_and_its_speed_that_rest_are_one(still, told):
+    """Recordings without labels in which one axis, of which position and speed are recorded, was not needed."""
+    bell = TIME**3 * (10 - 15 * TIME / 2 + 6 * TIME**2 / 4)
+    paths = np.random.default_rng(0).uniform(1, 2, (10, 1, 3)) * bell
+    paths[8:, :, :still] *= 0.01
+    frames = [np.hstack([path, np.gradient(path, axis=0)]) for path in paths]
+    called, known = [f"take {index}" for index in range(10)], [index < 4 for index in range(10)]
+    assert bool(list(unlabelled_warnings(frames, known, called, [*"xyzuvw"]))) == told

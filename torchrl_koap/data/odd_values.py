@@ -14,6 +14,7 @@ MARK_DISTANCE, MARK_COUNT = 10.0, 3  # a mark: this many ranges of the other val
 FILLS = 0.1  # a wrapped counter has at least this share of its values in the middle half of its range
 OTHER = 20.0  # times as far as in most trajectories
 AFAR = 0.1  # warn above this share of unlabelled trajectories that differ from the labelled ones
+SPEED = 0.97  # a speed: correlated more than this with the changes of another column
 LESS = 10.0  # at rest: this many times less motion than with labels, not none, because of sensor noise
 
 
@@ -207,8 +208,8 @@ def unlabelled_warnings(
     """Finds columns of ``[T_i, d]`` in which over 10 % of the unlabelled trajectories differ from the labelled ones.
 
     They differ if most frames lie outside the labelled range, widened by half of it on both sides. They also differ if
-    two or more columns that move in all labelled trajectories move less than a tenth as far. ``known`` says which
-    trajectories have labels.
+    two or more columns that move in all labelled trajectories move less than a tenth as far; a column and its speed
+    count as one. ``known`` says which trajectories have labels.
     """
     labelled, others = (
         [frames for frames, one in zip(trajectories, known, strict=True) if one == has] for has in (True, False)
@@ -222,7 +223,7 @@ def unlabelled_warnings(
     with_labels, without = (np.stack([np.ptp(frames, axis=0) for frames in part]) for part in (labelled, others))
     least = np.median(with_labels, axis=0) / LESS
     rests = (without < least) & (with_labels > least).all(0)
-    rests &= rests.sum(1, keepdims=True) > 1  # one alone may have its goal near
+    rests &= (rests & ~_speeds(labelled)).sum(1, keepdims=True) > 1  # one alone may have its goal near
     unlabelled = [name for name, one in zip(called, known, strict=True) if not one]
     for odd, said, why in (
         (
@@ -243,3 +244,12 @@ def unlabelled_warnings(
                 f"columns {some([repr(names[column]) for column in found])} {said} in {len(where)} of {len(others)}"
                 f" without labels ({some(where)}): {why}"
             )
+
+
+def _speeds(trajectories: Sequence[np.ndarray]) -> np.ndarray:
+    """Returns which columns of ``[T_i, d]`` are the speed of another one, bool ``[d]``."""
+    changes = np.concatenate([np.diff(frames, axis=0) for frames in trajectories])
+    middles = np.concatenate([(frames[1:] + frames[:-1]) / 2 for frames in trajectories])
+    scaled = [(part - part.mean(0)) / np.maximum(part.std(0), np.finfo(float).tiny) for part in (changes, middles)]
+    alike = np.abs(scaled[0].T @ scaled[1]) > SPEED * len(changes)
+    return (alike & ~np.eye(len(alike), dtype=bool)).any(0)
