@@ -93,6 +93,18 @@ def test_constant_and_duplicate_columns_are_named():
     ]
 
 
+def test_noise_alone_is_named_whatever_the_units_of_others():
+    """A frozen height in m beside an angle in degrees; a pose that differs between recordings is no noise."""
+    noise = 1e-5 * np.random.default_rng(0).normal(size=(4, 60, 1))
+    pulses = 1.0 * (np.random.default_rng(1).random((4, 60, 1)) < 0.1)
+    paths = [np.hstack([60 * np.sin(TIME + i), 0.3 + noise[i], 0.1 * i - noise[i], pulses[i]]) for i in range(4)]
+    said = warnings([*paths, paths[0][:3] + 1e-6], columns=["q", "z", "pose", "trigger"], units=())
+    assert [each for each in said if "noise" in each] == [
+        "columns 'z' show noise alone, no motion: they carry no information; leave them out"
+    ]
+    assert not any("noise" in each for each in warnings([path[:3] for path in paths], columns="qzpt", units=()))
+
+
 def test_short_trajectories_are_named():
     (warning,) = warnings([PATH[:17], PATH[:6], PATH[:9]])
     assert "2 of 3 trajectories have fewer steps than a window of 16" in warning

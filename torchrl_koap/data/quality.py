@@ -37,6 +37,7 @@ APART = 50.0  # warn if a column moves this many times as far as a fifth of them
 ROUNDING = 1e-5  # a column that moves less than this share of the farthest one rests
 NOISE = 8.0  # still as well: within this many standard deviations of the noise at that end of the recordings
 CANCELS = 0.25  # noise: -(product of neighbouring steps) / square step above this; 0.5 for noise, 0 for a random walk
+LAGS, UNLIKE = 3, 0.9  # noise alone: frames up to LAGS apart differ by this share of what unrelated ones do
 JITTER = 0.5  # share of its mean step by which a clock's steps may differ
 SELDOM, FEW = 0.05, 3  # a goal changes in less than this share of the steps, and takes more values than this
 AS_FAR = 0.5  # of the mean square distance between any two frames: motions repeat above this
@@ -49,8 +50,9 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
 
     * Trajectories: repeat another one, never move, are shorter than a window, have only zero labels or another unit,
       reach beyond 100 m or rad, lie far from all labelled ones or move much less than these.
-    * State columns: constant, equal to another one, leaping, with marks of missing values, clocks, quaternions that
-      change sign, angles a turn apart, or without unit and moving much farther than others; still frames at both ends.
+    * State columns: constant, noise alone, equal to another one, leaping, with marks of missing values, clocks,
+      quaternions that change sign, angles a turn apart, or without unit and moving much farther than others; still
+      frames at both ends.
     * Actions: another kind than declared, late, constant, leaping for one frame, or with marks of missing values.
     * A command that no action follows; goals that the controller reads; isolated labels; an unlikely rate;
       plans that are short against the motion.
@@ -73,6 +75,7 @@ def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -
         *_trajectory_warnings(data, task, lengths, called),
         *_short(lengths, called),
         *_column_warnings(state, task.state_names),
+        *_noise_alone(frames, task.state_names),
         *leap_warnings(frames, called, task.state_names),
         *quaternion_warnings(frames, task.state_names),
         *turn_warnings(frames, task.state_names),
@@ -142,6 +145,19 @@ def _column_warnings(state: Tensor, names: Sequence[str]) -> Iterator[str]:
             yield f"column {name!r} is {values[0]:g} in all {len(values)} steps: it carries no information"
         elif (same := first.setdefault(_digest(values), name)) is not name:
             yield f"columns {same!r} and {name!r} are the same in every step"
+
+
+def _noise_alone(trajectories: Sequence[np.ndarray], names: Sequence[str]) -> Iterator[str]:
+    """Finds columns without motion: few frames equal the one before, and frames up to ``LAGS`` apart differ alike."""
+    long, spread = [frames for frames in trajectories if len(frames) > LAGS], np.concatenate(trajectories).var(0)
+    if not long:
+        return
+    steps = [np.concatenate([frames[lag:] - frames[:-lag] for frames in long]) for lag in range(1, LAGS + 1)]
+    alone = np.all([np.square(step).mean(0) > 2 * UNLIKE * spread for step in steps], axis=0)
+    alone &= (np.median(np.abs(steps[0]), axis=0) > 0) & (spread > 0)
+    if alone.any():
+        said = some([repr(names[column]) for column in np.flatnonzero(alone)])
+        yield f"columns {said} show noise alone, no motion: they carry no information; leave them out"
 
 
 def _without_units(trajectories: Sequence[np.ndarray], task: Task) -> Iterator[str]:
