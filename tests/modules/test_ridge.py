@@ -178,6 +178,20 @@ def test_rows_that_are_left_out_are_left_out_of_the_shared_filter_too(sizes, bia
     assert found.error == pytest.approx(np.sqrt((residual**2).mean()))
 
 
+@pytest.mark.parametrize(("size", "side"), [(2, 2), (5, 7)])  # six directions and the mean
+def test_a_group_is_left_out_by_the_cheaper_system_with_a_column_per_target(monkeypatch, size, side):
+    module, shapes = sys.modules["torchrl_koap.modules.ridge"], set()
+    solve_system = module._solve
+
+    def watched(hat, right):
+        shapes.add((*hat.shape[1:], right.shape[-1]))
+        return solve_system(hat, right)
+
+    monkeypatch.setattr(module, "_solve", watched)
+    fit(*make_data(), groups=torch.arange(40) // size, prior=shared_filter())
+    assert shapes == {(side, side, 2)}  # the prior's three steps are combined first
+
+
 def test_a_shared_filter_of_axes_that_never_move_is_zero():
     still = shared_filter().fit(torch.zeros(6, 3, 2), torch.ones(6, 2), torch.arange(6) % 3)
     assert list(still.shape) == [4, 3] and not still.any()

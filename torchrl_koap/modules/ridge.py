@@ -244,8 +244,8 @@ def held_out_errors(
     ``U`` ``[N, r]`` are the left singular vectors (``left`` returns some rows), ``projected [r, act]`` the target's
     parts along them, and ``s`` the shrinkages of the directions, a row per regression ``[P, r]``. A ridge predicts
     :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` that are left out have exactly the errors
-    :math:`(I - H_{GG})^{-1} (Y - \hat Y)_G`. If a group has more rows than there are directions, the smaller system is
-    solved (Woodbury's identity, with :math:`V = U_G \mathrm{diag}(s)^{1/2}`):
+    :math:`(I - H_{GG})^{-1} (Y - \hat Y)_G`. If a group has more than half as many rows as there are directions, all
+    regressions share :math:`U_G^T U_G` (Woodbury's identity, with :math:`V = U_G \mathrm{diag}(s)^{1/2}`):
 
     .. math::
         (I - V V^T)^{-1} E = E + V (I - V^T V)^{-1} V^T E
@@ -260,8 +260,8 @@ def held_out_errors(
     if centred and len(target) == 1:
         return target.new_full((len(shrinks), wide), torch.inf)
 
-    def mixed(error: Tensor, group: Tensor) -> Tensor:
-        return (error.unflatten(-1, (-1, wide)) * weights[group].unsqueeze(-1)).sum(-2)
+    def mixed(parts: Tensor, weight: Tensor) -> Tensor:
+        return (parts.unflatten(-1, (-1, wide)) * weight.unsqueeze(-1)).sum(-2)
 
     constant = len(target) ** -0.5 if centred else 0.0  # entry, in every row, of the mean's unit vector
     total = target.new_zeros(len(shrinks), wide)
@@ -271,22 +271,22 @@ def held_out_errors(
             part = left(rows)
             leverage = part.square() @ shrinks.mT + constant**2
             for fit, (c, h) in enumerate(zip(coefficients, leverage.unbind(-1), strict=True)):
-                total[fit] += mixed((target[rows] - part @ c) / (1 - h[:, None]), groups[rows]).square().sum(0)
+                total[fit] += mixed((target[rows] - part @ c) / (1 - h[:, None]), weights[groups[rows]]).square().sum(0)
         return total / len(target)
     if centred:
         shrinks = torch.cat([shrinks, shrinks.new_ones(len(shrinks), 1)], -1)
     roots = shrinks.sqrt().unsqueeze(-1)  # [P, r, 1]
-    for rows in groups.argsort(stable=True).split(sizes.tolist()):
+    for rows, weight in zip(groups.argsort(stable=True).split(sizes.tolist()), weights, strict=True):
         part = left(rows)
-        error = target[rows] - part @ coefficients  # [P, |G|, act]
+        error = mixed(target[rows], weight) - part @ mixed(coefficients, weight)  # [P, |G|, act]
         if centred:
             part = torch.cat([part, part.new_full((len(part), 1), constant)], -1)
-        if len(part) > part.shape[1]:
+        if 2 * len(part) > part.shape[1]:
             inner = roots * (part.mT @ part) * roots.mT
             error = error + part @ (roots * _solve(inner, roots * (part.mT @ error)))
         else:
             error = _solve((part * shrinks.unsqueeze(1)) @ part.mT, error)
-        total += mixed(error, groups[rows]).square().sum(1)
+        total += error.square().sum(1)
     return total / len(target)
 
 
