@@ -138,9 +138,9 @@ def test_a_run_is_read_from_another_folder_than_that_of_its_plugin_file(demonstr
 
 def test_what_is_no_method_is_refused():
     loss, build = METHODS["dd"].phases[0].loss, METHODS["dd"].build
-    register_method(Method("mine", "of mine", build))
+    register_method(Method("mine", "of mine", build, closed_form=True))
     with pytest.raises(ValueError, match="another method named 'mine' is registered already"):
-        register_method(Method("mine", "another", build))
+        register_method(Method("mine", "another", build, closed_form=True))
     with pytest.raises(ValueError, match="unknown kind of windows 'labeled'; did you mean 'labelled'"):
         Method("other", "", build, sees="labeled")
     for name in ("a/b", "..", ""):
@@ -161,7 +161,9 @@ def test_what_is_no_method_is_refused():
     with pytest.raises(ValueError, match="unknown kind of windows 'labeled'; did you mean 'labelled'"):
         Phase("x", loss, "labeled")
     with pytest.raises(ValueError, match="the teacher of method 'other' must be a controller, 'dp' is a policy"):
-        register_method(Method("other", "", build, teacher="dp"))
+        register_method(Method("other", "", build, closed_form=True, teacher="dp"))
+    with pytest.raises(ValueError, match="method 'other' trains nothing: give it phases, closed_form or fit"):
+        Method("other", "", build)
     assert "other" not in METHODS
 
 
@@ -170,7 +172,7 @@ def test_installed_packages_announce_methods(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "announced_method.py").write_text(
         "from torchrl_koap.training import METHODS, Method, register_method\n"
-        "register_method(Method('announced', 'from a package', METHODS['dd'].build))\n"
+        "register_method(Method('announced', 'from a package', METHODS['dd'].build, METHODS['dd'].phases))\n"
     )
     about = tmp_path / "announced-1.0.dist-info"
     about.mkdir()

@@ -102,8 +102,8 @@ class Method:
         phases_by_preset (mapping): phases of presets that are trained differently.
 
     Raises:
-        ValueError: for a name that cannot be a folder name, two phases of one name, a phase ``"planner"``, or an
-            unknown default.
+        ValueError: for a name that cannot be a folder name, two phases of one name, a phase ``"planner"``, an unknown
+            default, or if nothing would be trained.
 
     Examples:
         >>> from torchrl_koap.modules import LinearInverseDynamics
@@ -145,6 +145,8 @@ class Method:
             lookup(PRESETS, preset, "preset")
         ControllerConfig(steps=self.updates, columns=self.columns)
         Execution().replaced(**self.execution)
+        if not (names or self.closed_form or self.fit or self.phases_by_preset):
+            raise ValueError(f"method {self.name!r} trains nothing: give it phases, closed_form or fit")
 
     def check_execution(self, asked: Execution | ExecutionConfig, usual: Execution) -> None:
         """Raises a ValueError if a method without plans is given plan options other than the usual ones."""
