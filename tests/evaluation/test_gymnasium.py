@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from offline_runs import record
+from safetensors.numpy import load_file
 from tiny_runs import koap
 from toy_gym import NAMES
 
@@ -117,6 +118,14 @@ def test_an_environment_that_fails_loses_its_own_episode_alone(arm_run):
     assert [row["outcome"] for row in found["episode"]] == ["success", "error", "success"]
     assert found["errors"] == [{"seed": 11, "step": 1, "error": "reset: RuntimeError: no place"}]
     assert any("failed by an error of the environment: seed 11, step 1" in fault for fault in found["faults"])
+
+
+def test_an_episode_that_an_error_ended_is_drawn_up_to_its_last_observation(arm_run):
+    for at, frames in ((4, 4), (99, 7)):  # the start, and what three or all six steps led to
+        asked = EvalConfig(episodes=1, env="toy_gym:ToyBreaks-v0", env_kwargs=(f"at={at}",), threads=1)
+        evaluate(arm_run, asked)
+        drawn = load_file(arm_run / "rollouts.safetensors")
+        assert [len(drawn[name][0]) for name in ("state", "position")] == [frames, frames]
 
 
 def test_an_error_of_the_environment_is_the_first_finding_of_an_inspection(arm_run):

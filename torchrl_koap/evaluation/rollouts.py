@@ -104,8 +104,9 @@ def device_of(module: nn.Module) -> torch.device:
 
 
 def observations_of(episode: TensorDict) -> Tensor:
-    """Returns the observations of an episode ``[T]`` and the one after its last step: ``[T + 1, obs]``."""
-    return torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]])
+    """Returns the observations of an episode ``[T]`` and, unless an error ended it, the one after its last step."""
+    frames = torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]])  # [T + 1, obs]
+    return frames[:-1] if outcome_of(episode) == "error" else frames
 
 
 def rollouts_to_tensors(episodes: Sequence[TensorDict], task: Task, *, interval: int) -> dict[str, Tensor]:
