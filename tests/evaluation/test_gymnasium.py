@@ -70,8 +70,9 @@ def test_step_limit_success_and_arguments_are_said(arm_run, capsys):
     printed = " ".join(capsys.readouterr().out.split())
     found = json.loads((arm_run / "eval.json").read_text())
     assert found["step_limit"] == "46 steps (that of task 'data': the environment has none)"
-    assert found["success"] == "success: an end with more than twice any earlier reward, or a later report in info"
-    assert "mean return 0" in printed and "no episode ended with more than twice any earlier reward" in printed
+    ends = "else an end with more than twice any earlier reward"
+    assert found["success"] == f"success: info['is_success'] or info['success'] if there is one, {ends}"
+    assert "mean return 0" in printed and "no episode reported success in info or ended with more than" in printed
 
 
 def test_rollouts_that_do_not_leave_their_start_are_told(arm_run, monkeypatch):
@@ -126,6 +127,14 @@ def test_an_episode_that_an_error_ended_is_drawn_up_to_its_last_observation(arm_
         evaluate(arm_run, asked)
         drawn = load_file(arm_run / "rollouts.safetensors")
         assert [len(drawn[name][0]) for name in ("state", "position")] == [frames, frames]
+
+
+def test_success_of_an_environment_that_breaks_at_its_first_step_is_not_called_the_reward(arm_run):
+    asked = EvalConfig(episodes=2, env="toy_gym:ToyBreaks-v0", env_kwargs=("at=1",), threads=1)
+    found = evaluate(arm_run, asked)
+    assert found["success"].startswith("success: info['is_success'] or info['success'] if there is one, else")
+    assert "2 episodes failed by an error" in found["faults"][0]
+    assert not any("info has no success entry" in fault for fault in found["faults"])
 
 
 def test_an_error_of_the_environment_is_the_first_finding_of_an_inspection(arm_run):

@@ -113,8 +113,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
             result["faults"] += start_faults(sound, data, task) if failed else []
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
-                "no episode ended with more than twice any earlier reward, and info has no success entry at the first"
-                " step: name the entry with --success-key, or compare mean returns"
+                "no episode reported success in info or ended with more than twice any earlier reward: name the entry"
+                " with --success-key, or compare mean returns"
             )
     rollouts = rollouts_to_tensors(
         episodes,
@@ -254,5 +254,8 @@ def find_environment(
             stacklevel=2,
         )
     if probe.success_key is None:
-        facts["success"] = "success: an end with more than twice any earlier reward, or a later report in info"
+        facts["success"] = (  # the first step had no entry, or the environment raised an error there
+            "success: info['is_success'] or info['success'] if there is one, else an end with more than twice any"
+            " earlier reward"
+        )
     return RolloutEnvironment(make_env, probe.max_steps, Modes(), record=record, facts=facts)
