@@ -61,7 +61,7 @@ def test_step_limit_success_and_arguments_are_said(arm_run, capsys):
     asked = ("--env", "toy_gym:ToyReach-v0", "--env-kwargs", "max_episode_steps=4", "length=9", "--no-animate")
     assert koap("eval", arm_run, "--episodes", 2, "--threads", 1, *asked) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "at most 4 steps (the environment's own); success: info['is_success']" in printed
+    assert "at most 4 steps (--env-kwargs); success: info['is_success']" in printed
     result = json.loads((arm_run / "eval.json").read_text())
     assert {row["steps"] for row in result["episode"]} == {4}
     assert "--env-kwargs max_episode_steps=4 length=9" in (arm_run / "index.html").read_text()
@@ -73,6 +73,8 @@ def test_step_limit_success_and_arguments_are_said(arm_run, capsys):
     ends = "else an end with more than twice any earlier reward"
     assert found["success"] == f"success: info['is_success'] or info['success'] if there is one, {ends}"
     assert "mean return 0" in printed and "no episode reported success in info or ended with more than" in printed
+    assert koap("eval", arm_run, "--episodes", 1, "--env", "toy_gym:ToyLimited-v0", "--no-report") == 0
+    assert "at most 5 steps (the environment's own); success" in " ".join(capsys.readouterr().out.split())
 
 
 def test_rollouts_that_do_not_leave_their_start_are_told(arm_run, monkeypatch):

@@ -78,6 +78,7 @@ for _id, _options in {
     "ToyReachFell-v0": {"terminates": "fell"},  # a reward in every step, as for walking robots
 }.items():
     gymnasium.register(_id, entry_point=Reach, kwargs=_options)
+gymnasium.register("ToyLimited-v0", Reach, max_episode_steps=5)
 gymnasium.register("ToyBreaks-v0", Breaks)
 gymnasium.register("ToyDrawn-v0", Drawn)
 

@@ -238,7 +238,8 @@ def find_environment(
     )
     probe = make_env(1)
     probe.close()
-    limit = "the environment's own" if probe.own_limit else f"that of task {task.name!r}: the environment has none"
+    own = "--env-kwargs" if "max_episode_steps" in environment_arguments(config.env_kwargs) else "the environment's own"
+    limit = own if probe.own_limit else f"that of task {task.name!r}: the environment has none"
     facts = {
         "env": config.env,
         "env_kwargs": list(config.env_kwargs),
