@@ -166,3 +166,13 @@ def test_picture(graphics):
     picture = env.render()
     assert picture.shape == (48, 64, 3) and picture.std() > 5
     env.close()
+
+
+def test_the_camera_of_the_task_draws_the_picture(graphics):
+    task = get_task("avoiding")
+    task = replace(task, scene=replace(task.scene, camera="wrist"))
+    env = ManipulationGymEnv(task, render_mode="rgb_array", width=64, height=48)
+    env.reset()
+    np.testing.assert_array_equal(env.render(), env.batched.render(0, 64, 48, "wrist"))
+    np.testing.assert_array_equal(env.batched.render(0, 64, 48), env.batched.render(0, 64, 48, "front"))
+    env.close()

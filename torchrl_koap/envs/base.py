@@ -78,7 +78,6 @@ class ManipulationEnv(EnvBase):
     MODE_ENTRIES: int | None = 1  # number of entries of ``mode``; None: one per object
     MODE_VALUES: int | None = None  # its entries are int64, -1 (undecided) to this - 1; None: bool flags
     COLLIDES = False  # whether an episode can end by a collision
-    CAMERA = "cage"  # default of render()
     SUBSTEPS = 35  # physics steps (1 ms) per control step
     COMMAND_DIM = 7  # numbers that make up a command
     RESET_WIDTH = controller.FINGER_RESET  # finger target during the reset's substep (m)
@@ -314,7 +313,7 @@ class ManipulationEnv(EnvBase):
         return self._success | self._collision | (self._steps >= self.max_steps)
 
     def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str | None = None) -> np.ndarray:
-        """Draws one environment, uint8 [height, width, 3], by default with the class's ``CAMERA``.
+        """Draws one environment, uint8 [height, width, 3], by default with the task's ``scene.camera`` or ``"cage"``.
 
         Cameras are ``"front"``, ``"cage"`` (D3IL's) and ``"wrist"``; Scooping's ``"third_person"`` and ``"front"``.
 
@@ -328,7 +327,7 @@ class ManipulationEnv(EnvBase):
             if self._renderer is not None:
                 self._renderer.close()
             self._renderer = renderer
-        return self._renderer.render(self.sims.data[index], camera or self.CAMERA)
+        return self._renderer.render(self.sims.data[index], camera or self.task.scene.camera or "cage")
 
     def close(self, **kwargs) -> None:
         """Frees graphics memory, if any was used, and the threads."""

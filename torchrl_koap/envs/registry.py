@@ -167,7 +167,8 @@ class ManipulationGymEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Draws the scene, uint8 [height, width, 3]; None without ``render_mode``."""
-        return self.batched.render(**self._size, camera="front") if self.render_mode == "rgb_array" else None
+        camera = self.task.scene.camera
+        return self.batched.render(**self._size, camera=camera) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Frees graphics memory."""

@@ -63,8 +63,6 @@ class ScoopingEnv(ManipulationEnv):
         torch.Size([2, 3, 99])
     """
 
-    CAMERA = CAMERA
-
     def __init__(
         self,
         *args: Any,
