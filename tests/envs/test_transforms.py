@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_koap.envs import SortingEnv
+from torchrl_koap.envs import AvoidingEnv, SortingEnv
 from torchrl_koap.envs.transforms import EndEffectorNoise, PartialObservation
 from torchrl_koap.tasks import get_task
 
@@ -51,6 +51,28 @@ def test_noise_is_independent_unless_seeds_are_given():
     assert torch.equal(both, second(zeros.copy())["observation"])
     first.seed_episodes([4])  # an episode depends on its own seed alone
     assert torch.equal(first(zeros[1:].copy())["observation"], both[1:]) and not torch.equal(both[0], both[1])
+
+
+@pytest.mark.parametrize("seeds", [(3, 4), None])
+def test_an_environment_that_a_mask_leaves_out_keeps_its_noise(seeds):
+    """Else its episode would depend on when the others of the batch begin or wait."""
+    noise = EndEffectorNoise("avoiding", sigma=1.0)
+    env, stay = TransformedEnv(AvoidingEnv(2), noise), torch.zeros(2, 2)
+    if seeds:
+        noise.seed_episodes(seeds)
+    data = env.reset()
+    first = [data["observation"].clone()]
+    data["_reset"] = torch.tensor([[True], [False]])
+    data = env.reset(data)
+    assert torch.equal(data["observation"][1], first[0][1]) and not torch.equal(data["observation"][0], first[0][0])
+    data.update({"action": stay, "_step": torch.tensor([False, True])})
+    waited = env.step(data)["next", "observation"]
+    assert torch.equal(waited[0], data["observation"][0]) and not torch.equal(waited[1], data["observation"][1])
+    if seeds:
+        noise.seed_episodes(seeds)
+        data = env.reset()
+        alone = env.step(data.set("action", stay))["next", "observation"]
+        assert torch.equal(waited[1], alone[1])
 
 
 @pytest.mark.parametrize("sigma", [-1, float("nan")])

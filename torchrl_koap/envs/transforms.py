@@ -51,7 +51,8 @@ class PartialObservation(ObservationTransform):
 class EndEffectorNoise(ObservationTransform):
     """Adds Gaussian noise to the measured end effector, at random unless :meth:`seed_episodes` gives seeds.
 
-    The seed of the environment does not affect the noise.
+    The seed of the environment does not affect the noise. An environment that a mask of TorchRL (``_reset``, ``_step``)
+    leaves out draws nothing and keeps its noise.
 
     Args:
         task (Task or str): the task; noise is added to its part ``Task.position``.
@@ -79,22 +80,28 @@ class EndEffectorNoise(ObservationTransform):
         self.sigma, self.part = sigma, task.observation[task.position]
         self._generators = [torch.Generator()]
         self._generators[0].seed()  # at random
+        self._noise = torch.zeros(0)  # of the last observation
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
         """Gives every environment its own noise, so that an episode does not depend on the batch it runs in."""
         self._generators = [torch.Generator().manual_seed(int(seed)) for seed in seeds]
 
-    def _apply_transform(self, observation: Tensor) -> Tensor:
+    def _apply_transform(self, observation: Tensor, mask: Tensor | None = None) -> Tensor:
         observation = observation.clone()
         measured = observation[..., self.part]
-        kind = {"dtype": observation.dtype}
-        if len(self._generators) == 1:
-            noise = torch.randn(measured.shape, generator=self._generators[0], **kind)
-        else:
-            size = measured.shape[1:]
-            noise = torch.stack([torch.randn(size, generator=generator, **kind) for generator in self._generators])
-        observation[..., self.part] = measured + self.sigma * noise.to(observation.device)
+        if mask is None or len(self._noise) != len(measured):
+            mask, self._noise = torch.ones(len(measured), dtype=torch.bool), torch.zeros_like(measured, device="cpu")
+        generators = self._generators * (len(measured) if len(self._generators) == 1 else 1)
+        for generator, noise, draws in zip(generators, self._noise, mask.flatten().tolist(), strict=True):
+            if draws:
+                noise.copy_(torch.randn(noise.shape, generator=generator, dtype=noise.dtype))
+        observation[..., self.part] = measured + self.sigma * self._noise.to(observation.device)
         return observation
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
+        seen = tensordict_reset[OBSERVATION]
+        return tensordict_reset.set(OBSERVATION, self._apply_transform(seen, tensordict.get("_reset", None)))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        seen = next_tensordict[OBSERVATION]
+        return next_tensordict.set(OBSERVATION, self._apply_transform(seen, tensordict.get("_step", None)))
