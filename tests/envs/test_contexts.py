@@ -153,6 +153,10 @@ def test_contexts_that_a_task_never_draws_are_named():
     between[1, 3, 0] = 0.525
     with pytest.raises(ValueError, match="context 1 puts 'blue_2'"):
         check_contexts(get_task("sorting"), between)
+    crowded = draw_contexts("sorting", 3, 0)
+    crowded[2, 1] = crowded[2, 3]  # one box upon another
+    with pytest.raises(ValueError, match=r"context 2 puts 2 objects into one region: x 0.\d+..0.\d+, y "):
+        check_contexts(get_task("sorting"), crowded)
     rounded = np.array([[(0.4, -0.25, 0.0), (0.6, 0.35, 0.0)]], dtype=np.float32)  # D3IL's precision at the very edge
     assert check_contexts(task, rounded).shape == (1, 2, 3)
 

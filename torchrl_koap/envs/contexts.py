@@ -59,7 +59,10 @@ def evaluation_contexts(task: Task | str) -> np.ndarray:
 
 
 def check_contexts(task: Task, contexts) -> np.ndarray:
-    """Returns contexts ``[C, objects, 3]`` in float64; raises a ValueError for objects outside their regions."""
+    """Returns contexts ``[C, objects, 3]`` in float64.
+
+    Raises a ValueError for objects outside their regions, or in the same one of ``Scene.shared_starts``.
+    """
     scene, contexts = _scene(task), np.asarray(contexts, dtype=np.float64)
     if contexts.ndim != 3 or contexts.shape[1:] != (len(task.objects), 3) or not len(contexts):
         raise ValueError(
@@ -68,16 +71,24 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
         )
     if not np.isfinite(contexts).all():
         raise ValueError(f"contexts must be finite; row {int(np.argwhere(~np.isfinite(contexts))[0][0])} is not")
+    taken = np.zeros((len(contexts), len(scene.shared_starts)), int)  # objects that lie in this region alone
     for index, name in enumerate(task.objects):
         regions = scene.starts_of(index)
         low, high = (np.array([[bound[side] for bound in region] for region in regions]) for side in (0, 1))
         xy = contexts[:, None, index, :2]
-        inside = ((xy >= low - _SLACK) & (xy <= high + _SLACK)).all(-1).any(-1)
-        if not inside.all():
-            row = int(np.flatnonzero(~inside)[0])
+        inside = ((xy >= low - _SLACK) & (xy <= high + _SLACK)).all(-1)  # [C, regions]
+        if not inside.any(-1).all():
+            row = int(np.flatnonzero(~inside.any(-1))[0])
             x, y = contexts[row, index, :2]
             ranges = " or ".join(f"x {r[0][0]}..{r[0][1]}, y {r[1][0]}..{r[1][1]}" for r in regions)
             raise ValueError(f"context {row} puts {name!r} at ({x:.4g}, {y:.4g}) m, outside its region: {ranges}")
+        if scene.shared_starts:
+            taken += inside & (inside.sum(-1, keepdims=True) == 1)
+    if (taken > 1).any():
+        row, region = np.argwhere(taken > 1)[0]
+        x, y = scene.shared_starts[region]
+        ranges = f"x {x[0]}..{x[1]}, y {y[0]}..{y[1]}"
+        raise ValueError(f"context {row} puts {taken[row, region]} objects into one region: {ranges}")
     return contexts
 
 
