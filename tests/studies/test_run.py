@@ -124,8 +124,10 @@ def test_a_finished_cell_without_a_log_stays_in_the_table(curve, demonstrations)
     assert rows_of(curve) == before
 
 
-def test_part_of_the_demonstrations_has_a_planner_of_its_own(curve, demonstrations):
+def test_part_of_the_demonstrations_has_a_planner_of_its_own(curve, demonstrations, capsys):
     assert run(curve, demonstrations, methods=("linear",), demonstrations=(0.5,))["done"] == 3
+    shown = capsys.readouterr().err
+    assert "trainings: 100%" in shown and "2/2" in shown and "cells:" not in shown  # the planner is no cell
     cell = curve / "cells/avoiding/linear-0.25-0.5-seed0"
     planners = [folder / "planner.safetensors" for folder in (cell, curve / "planners/avoiding/0.5-seed0")]
     one, other = (file.read_bytes() for file in planners)

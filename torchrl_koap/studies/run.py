@@ -231,7 +231,7 @@ def _work(study: Study, cells: Sequence[Cell], results: dict[Cell, Result], mach
         with suppress(OSError):
             prepare_cell(folder, study.train_config(cell), study.eval_config(cell))
     places = {study.out / cell.folder: cell for cell in cells}
-    with progress_bar(len(planners) + len(jobs), "cells", unit="cell", smoothing=0.1) as bar:
+    with progress_bar(len(planners) + len(jobs), "trainings", unit="training", smoothing=0.1) as bar:
         with closing(launch(run_cell, [*planners.values(), *jobs], machines)) as ended:
             for job, reason in ended:
                 bar.update()
