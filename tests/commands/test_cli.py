@@ -185,7 +185,7 @@ def test_two_trainings_in_one_folder(copied_run, capsys):
     with RunDirectory(copied_run).locked("koap train"):
         before = contents(copied_run)
         line = fails(capsys, "train", "--out", copied_run, "--resume")
-        assert f"another `koap train` is working in {copied_run}" in line
+        assert f"another command is working in {copied_run}: call `koap train` again" in line
         assert contents(copied_run) == before
 
 

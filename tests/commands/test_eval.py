@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from command_calls import contents, fails
 from tiny_runs import koap
 from torchrl.envs import TransformedEnv
 
@@ -14,6 +15,7 @@ from torchrl_koap.evaluation import EvalConfig, closed_loop, evaluate, latency
 from torchrl_koap.evaluation.closed_loop import choose_contexts, find_environment
 from torchrl_koap.evaluation.data_errors import AFTER
 from torchrl_koap.evaluation.statistics import rate
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import get_task
 
@@ -39,6 +41,15 @@ def test_what_an_evaluation_writes(copied_run, capsys):
     lines = dict(line.split("  ", 1) for line in out.splitlines() if "  " in line)
     assert re.fullmatch(r" *\d+\.\d %; 95 % interval .* %, \d of 3 rollouts", lines["success"])
     assert "always the mean action" in lines["action error, 2 columns"] and "{" not in out
+
+
+@pytest.mark.parametrize("command", ["eval", "inspect"])
+def test_a_folder_in_which_another_command_works_is_left_alone(command, copied_run, capsys):
+    before = contents(copied_run)
+    with RunDirectory(copied_run).locked("koap train"):
+        line = fails(capsys, command, copied_run, "--episodes", 2)
+    assert f"another command is working in {copied_run}: call `koap {command}` again when it has ended" in line
+    assert contents(copied_run) == before
 
 
 def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstrations, no_report, tmp_path):

@@ -239,7 +239,9 @@ def test_windows_of_every_seed_must_lie_in_the_trajectories_used(tmp_path, demon
 
 def test_two_curves_do_not_work_in_one_folder(curve, demonstrations, capsys):
     with one_at_a_time(curve / "lock", busy=""):
-        assert f"another `koap curve` is working in {curve}" in fails(capsys, *command_of(curve, demonstrations))
+        assert f"another command is working in {curve}: call `koap curve` again" in fails(
+            capsys, *command_of(curve, demonstrations)
+        )
 
 
 def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations, capsys):

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -64,6 +66,15 @@ def _how_to_resume(out: Path) -> str:
     return f"`koap train --out {shlex.quote(str(out))} --resume` {effect}"
 
 
+@contextlib.contextmanager
+def _folder_of(run: str, config: EvalConfig, command: str) -> Iterator[Path]:
+    """Yields the folder that a command writes to; if it is a run, no other command can work there meanwhile."""
+    folder = Path(run) if config.out is None else config.out
+    is_run = (folder / "config.json").exists()
+    with RunDirectory(folder).locked(command) if is_run else contextlib.nullcontext():
+        yield folder
+
+
 @dataclass(kw_only=True)
 class Eval(Command):
     """Evaluate a run by rollouts or on recorded data; write its report.
@@ -90,19 +101,19 @@ class Eval(Command):
     def __call__(self) -> dict[str, str]:
         """Evaluates and reports."""
         check_logger(self.logger)
-        result = evaluate(self.run, self.config)
-        folder = Path(self.run) if self.config.out is None else self.config.out
-        report = {}
-        if self.report:
-            report["report"] = str(write_report(folder, animation=self.animate))
-        else:
-            (folder / "index.html").unlink(missing_ok=True)  # it tells the numbers of an earlier evaluation
-        with open_logger(self.logger, folder, {"run": self.run} | to_json(self.config)) as logger:
-            if logger is not None:
-                rates = {f"{name}_rate": values["rate"] for name, values in result.get("rates", {}).items()}
-                log_scores(logger, result | rates)
-        faults = {f"FAULT {number}": fault for number, fault in enumerate(result.get("faults", ()), 1)}
-        return as_text(evaluation_rows(RunFacts.read(folder))) | faults | report
+        with _folder_of(self.run, self.config, "koap eval") as folder:
+            result = evaluate(self.run, self.config)
+            report = {}
+            if self.report:
+                report["report"] = str(write_report(folder, animation=self.animate))
+            else:
+                (folder / "index.html").unlink(missing_ok=True)  # it tells the numbers of an earlier evaluation
+            with open_logger(self.logger, folder, {"run": self.run} | to_json(self.config)) as logger:
+                if logger is not None:
+                    rates = {f"{name}_rate": values["rate"] for name, values in result.get("rates", {}).items()}
+                    log_scores(logger, result | rates)
+            faults = {f"FAULT {number}": fault for number, fault in enumerate(result.get("faults", ()), 1)}
+            return as_text(evaluation_rows(RunFacts.read(folder))) | faults | report
 
 
 @dataclass(kw_only=True)
@@ -123,14 +134,14 @@ class Inspect(Command):
 
     def __call__(self) -> dict[str, Any]:
         """Inspects and draws."""
-        result = inspect(self.run, self.config)
-        folder = Path(self.run) if self.config.out is None else self.config.out
-        draw_pictures(folder, names=("inspect.png", "latent.png"))
-        if (folder / "index.html").exists():
-            write_report(folder, draw=False)
-        # findings summarise the latent space; a policy that follows no plans has no distances to them
-        shown = {name: value for name, value in result.items() if name != "latent" and value != {}}
-        return shown | {"all numbers": str(folder / "inspect.json")}
+        with _folder_of(self.run, self.config, "koap inspect") as folder:
+            result = inspect(self.run, self.config)
+            draw_pictures(folder, names=("inspect.png", "latent.png"))
+            if (folder / "index.html").exists():
+                write_report(folder, draw=False)
+            # findings summarise the latent space; a policy that follows no plans has no distances to them
+            shown = {name: value for name, value in result.items() if name != "latent" and value != {}}
+            return shown | {"all numbers": str(folder / "inspect.json")}
 
 
 @dataclass(kw_only=True)

@@ -162,7 +162,8 @@ class RunDirectory:
         """
         with contextlib.ExitStack() as held:
             try:
-                held.enter_context(one_at_a_time(self.path / name, busy=f"another `{what}` is working in {self.path}"))
+                busy = f"another command is working in {self.path}: call `{what}` again when it has ended"
+                held.enter_context(one_at_a_time(self.path / name, busy=busy))
             except LockedError as error:
                 raise RunDirectoryError(error) from None
             for partial in (self.path / "checkpoints").glob(".*.tmp"):  # only the holder of the lock writes there
