@@ -192,6 +192,25 @@ def test_a_group_is_left_out_by_the_cheaper_system_with_a_column_per_target(monk
     assert shapes == {(side, side, 2)}  # the prior's three steps are combined first
 
 
+@pytest.mark.parametrize("alike", [True, False])
+@pytest.mark.parametrize("sizes", [1, 5])
+@pytest.mark.parametrize("right", [True, False])
+def test_a_guessed_prior_is_used_only_where_it_lowers_the_held_out_error(right, sizes, alike):
+    latent, action = map(torch.from_numpy, make_data(noise=3.0))
+    shared, options = shared_filter(), {"groups": torch.arange(40) // sizes, "alike": alike}
+    if right:  # the axes share a filter
+        action = (
+            torch.einsum("nm,sam,s->na", latent, shared.basis, torch.tensor([1.0, -1.0, 0.5]).double()) + action / 9
+        )
+    known, none = (ridge(latent, action, prior=prior, **options) for prior in (shared, None))
+    guessed = ridge(latent, action, prior=shared, guessed=True, **options)
+    assert (known.error < none.error) == right
+    wanted = known if right else none
+    torch.testing.assert_close((guessed.weight, guessed.bias), (wanted.weight, wanted.bias))
+    assert (guessed.penalty, guessed.error) == pytest.approx((wanted.penalty, wanted.error))
+    assert guessed.errors == pytest.approx(wanted.errors)
+
+
 def test_a_shared_filter_of_axes_that_never_move_is_zero():
     still = shared_filter().fit(torch.zeros(6, 3, 2), torch.ones(6, 2), torch.arange(6) % 3)
     assert list(still.shape) == [4, 3] and not still.any()

@@ -68,6 +68,7 @@ def ridge(
     input_noise: float = 0.0,
     bias: bool = True,
     prior: SharedFilter | None = None,
+    guessed: bool = False,
     alike: bool = True,
 ) -> RidgeFit:
     r"""Fits ``targets ~ D inputs + b``, in float64.
@@ -89,6 +90,7 @@ def ridge(
         bias (bool): fit ``b``; otherwise it is 0. Defaults to ``True``.
         prior (SharedFilter, optional): the penalty shrinks ``D`` towards a filter that all targets share, fitted to
             the rows that are not left out. Defaults to 0.
+        guessed (bool): the prior is used only if it lowers the held-out error. Defaults to ``False``.
         alike (bool): all targets share one penalty; otherwise each has its own. Defaults to ``True``.
 
     Returns:
@@ -152,10 +154,17 @@ def ridge(
     if mix is None:
         squares = held_out_errors(left, shrinks, projected, target, groups, centred=bias)
     else:  # residuals are linear in the target: those of each group are combined with the filter fitted without it
-        parts = given - given.mean(0) * bias
+        parts, act = given - given.mean(0) * bias, y.shape[-1]
         along = torch.stack([left(some).mT @ parts[some] for some in rows.split(ROWS)]).sum(0)
         without = torch.cat([torch.ones_like(mix[1:, :1]), -mix[1:]], -1)
-        squares = held_out_errors(left, shrinks, along, parts, groups, centred=bias, mix=without)
+        plain = torch.eye(1, without.shape[-1]).to(without).expand_as(without)
+        both = torch.stack([without, plain] if guessed else [without], 1)
+        squares, *others = held_out_errors(left, shrinks, along, parts, groups, centred=bias, mix=both).split(act, -1)
+        for other in others:
+            least = [part.mean(-1).amin() if alike else part.amin(0).mean() for part in (other, squares)]
+            if least[0] <= least[1]:
+                squares, projected, mean_y = other, along[:, :act], given[:, :act].mean(0) * bias
+                mean_weight = torch.zeros_like(mean_weight)
     errors = dict(zip(tried, squares.mean(-1).sqrt().tolist(), strict=True))
     best = squares.mean(-1).argmin()
     each = best.expand(y.shape[-1]) if alike else squares.argmin(0)
@@ -252,19 +261,20 @@ def held_out_errors(
 
     If the mean is fitted too (``centred``), it is one more direction, without shrinkage, and already subtracted from
     the target ``[N, act]``. ``groups`` are int64 ``[N]``. With a single row and a mean, errors are infinite. With
-    ``mix [G, S]``, the target has ``S`` parts, ``[N, S * act]``, whose errors are summed with the weights of the group.
+    ``mix [G, K, S]``, the target has ``S`` parts, ``[N, S * act]``, which are summed with the weights of the group in
+    ``K`` ways: errors are ``[P, K * act]``.
     """
     coefficients = shrinks.unsqueeze(-1) * projected  # [P, r, act]
-    weights = target.new_ones(int(groups.max()) + 1, 1) if mix is None else mix
-    wide = target.shape[1] // weights.shape[1]
+    weights = target.new_ones(int(groups.max()) + 1, 1, 1) if mix is None else mix
+    wide = target.shape[1] // weights.shape[2]
     if centred and len(target) == 1:
-        return target.new_full((len(shrinks), wide), torch.inf)
+        return target.new_full((len(shrinks), weights.shape[1] * wide), torch.inf)
 
     def mixed(parts: Tensor, weight: Tensor) -> Tensor:
-        return (parts.unflatten(-1, (-1, wide)) * weight.unsqueeze(-1)).sum(-2)
+        return torch.einsum("...sa,...ks->...ka", parts.unflatten(-1, (-1, wide)), weight).flatten(-2)
 
     constant = len(target) ** -0.5 if centred else 0.0  # entry, in every row, of the mean's unit vector
-    total = target.new_zeros(len(shrinks), wide)
+    total = target.new_zeros(len(shrinks), weights.shape[1] * wide)
     sizes = groups.bincount()
     if int(sizes.max()) == 1:  # for single rows the leverages suffice
         for rows in torch.arange(len(target), device=target.device).split(ROWS):

@@ -192,17 +192,14 @@ class KoopmanInverseDynamics(LiftedInverseDynamics):
     def _fit_decoder(
         self, latent: Tensor, action: Tensor, axes: Sequence[int], guessed: bool, **options: Any
     ) -> RidgeFit:
-        """Fits with the shared filter of the axes as prior; for guessed axes only if that lowers the held-out error."""
+        """Fits with the shared filter of the axes as prior."""
         features = self.latent_action.axis_features(axes) if axes else None
         if features is None:
             return ridge(latent, action, **options)
         if len(axes) != action.shape[-1]:
             raise ValueError(f"axes must be one state column per action entry ({action.shape[-1]}), got {list(axes)}")
-        fit = ridge(latent, action, prior=self._shared_filter(latent.shape[-1], axes, *features), **options)
-        if not guessed:
-            return fit
-        plain = ridge(latent, action, **options)
-        return plain if plain.error <= fit.error else fit
+        prior = self._shared_filter(latent.shape[-1], axes, *features)
+        return ridge(latent, action, prior=prior, guessed=guessed, **options)
 
     def _shared_filter(self, latent_dim: int, axes: Sequence[int], entries: Tensor, factors: Tensor) -> SharedFilter:
         """Returns the filter of the steps of every axis, with a decoder ``[act, m]`` for each of its ``S`` weights."""
