@@ -75,6 +75,14 @@ def test_an_environment_that_a_mask_leaves_out_keeps_its_noise(seeds):
         assert torch.equal(waited[1], alone[1])
 
 
+def test_a_mask_of_an_environment_without_batch_is_no_mask_of_its_columns():
+    noise, seen = EndEffectorNoise("avoiding", sigma=1.0), TensorDict({"observation": torch.zeros(4)})
+    for _ in range(2):
+        before = seen["observation"]
+        noise._reset(TensorDict({"_reset": torch.tensor([True])}), seen)
+        assert (seen["observation"] != before)[noise.part].all()
+
+
 @pytest.mark.parametrize("sigma", [-1, float("nan")])
 def test_a_negative_sigma_is_refused(sigma):
     with pytest.raises(ValueError, match=f"sigma must be >= 0, got {sigma}"):

@@ -89,7 +89,7 @@ class EndEffectorNoise(ObservationTransform):
     def _apply_transform(self, observation: Tensor, mask: Tensor | None = None) -> Tensor:
         observation = observation.clone()
         measured = observation[..., self.part]
-        if mask is None or len(self._noise) != len(measured):
+        if mask is None or not len(self._noise) == len(measured) == mask.numel():
             mask, self._noise = torch.ones(len(measured), dtype=torch.bool), torch.zeros_like(measured, device="cpu")
         generators = self._generators * (len(measured) if len(self._generators) == 1 else 1)
         for generator, noise, draws in zip(generators, self._noise, mask.flatten().tolist(), strict=True):

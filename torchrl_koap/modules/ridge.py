@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -147,6 +148,9 @@ def ridge(
     unit = singular.square().sum() / len(x)
     unit = torch.where(unit > 0, unit, 1.0)  # for constant inputs any positive unit works
 
+    def lowest(squares: Tensor) -> float:  # mean square held-out error ``[P, act]`` at the best penalty or penalties
+        return float(squares.mean(-1).amin() if alike else squares.amin(0).mean())
+
     smallest = input_noise * len(x)
     tried = sorted({max(float(penalty), smallest) for penalty in penalties})
     shrinks = torch.stack([singular.square() / (singular.square() + penalty * unit) for penalty in tried])
@@ -157,21 +161,19 @@ def ridge(
         parts, act = given - given.mean(0) * bias, y.shape[-1]
         along = torch.stack([left(some).mT @ parts[some] for some in rows.split(ROWS)]).sum(0)
         without = torch.cat([torch.ones_like(mix[1:, :1]), -mix[1:]], -1)
-        plain = torch.eye(1, without.shape[-1]).to(without).expand_as(without)
-        both = torch.stack([without, plain] if guessed else [without], 1)
-        squares, *others = held_out_errors(left, shrinks, along, parts, groups, centred=bias, mix=both).split(act, -1)
-        for other in others:
-            least = [part.mean(-1).amin() if alike else part.amin(0).mean() for part in (other, squares)]
-            if least[0] <= least[1]:
-                squares, projected, mean_y = other, along[:, :act], given[:, :act].mean(0) * bias
-                mean_weight = torch.zeros_like(mean_weight)
+        ways = [without, torch.eye(1, without.shape[-1]).to(without).expand_as(without)]  # with and without the filter
+        ways = torch.stack(ways[: 1 + guessed], 1)
+        squares, *plain = held_out_errors(left, shrinks, along, parts, groups, centred=bias, mix=ways).split(act, -1)
+        if guessed and lowest(plain[0]) <= lowest(squares):
+            squares, projected, mean_y = plain[0], along[:, :act], given[:, :act].mean(0) * bias
+            mean_weight = torch.zeros_like(mean_weight)
     errors = dict(zip(tried, squares.mean(-1).sqrt().tolist(), strict=True))
     best = squares.mean(-1).argmin()
     each = best.expand(y.shape[-1]) if alike else squares.argmin(0)
     own = singular.new_tensor(tried)[each]
     weight = right.mT @ (singular[:, None] / (singular.square()[:, None] + own * unit) * projected)  # [m, act]
-    error = float(squares.gather(0, each[None]).mean().sqrt())
-    return RidgeFit(mean_weight + weight.mT, mean_y - mean_x @ weight, tried[int(best)], errors, error, len(x))
+    weight, offset, error = mean_weight + weight.mT, mean_y - mean_x @ weight, math.sqrt(lowest(squares))
+    return RidgeFit(weight, offset, tried[int(best)], errors, error, len(x))
 
 
 class SharedFilter(NamedTuple):
