@@ -6,8 +6,8 @@
     python benchmarks/latency.py --loop-steps 800   # plans between control steps, and in a thread
 
 Each export is first compared with the eager policy. All are then called in turn, so that a busy machine slows them
-alike. ``--write`` writes ``benchmarks/results/exported_policy.csv``. torch.compile and AOTInductor need a C++ compiler,
-ONNX the extra ``onnx``; an export that cannot be made is skipped with a message.
+alike. ``--write`` writes ``benchmarks/results/exported_policy.csv``. torch.compile needs a C++ compiler, ONNX the
+extra ``onnx``; an export that cannot be made is skipped with a message.
 """
 
 from __future__ import annotations

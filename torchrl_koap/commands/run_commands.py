@@ -199,7 +199,7 @@ class Latency(Command):
 
 @dataclass(kw_only=True)
 class Export(Command):
-    """Write a policy for torch.export, ONNX, AOTInductor or LeRobot.
+    """Write a policy for torch.export, ONNX or LeRobot.
 
     It is compared with the original (1e-5); policy.json describes how to call it.
 
@@ -208,8 +208,8 @@ class Export(Command):
     Attributes:
         run: run directory of `koap train`, or pretrained:NAME.
         out: folder to write (default: RUN/exported).
-        format: "torch" (torch.export), "onnx" (ONNX Runtime), "aoti" (AOTInductor, needs a C++ compiler) or "lerobot"
-            (a folder for lerobot-eval and lerobot-record).
+        format: "torch" (torch.export), "onnx" (ONNX Runtime) or "lerobot" (a folder for lerobot-eval and
+            lerobot-record).
         plugins: modules that register task or method, or define a camera's network, at their present paths.
     """
 

@@ -160,14 +160,6 @@ def test_facts_are_in_the_file_of_torch_export(exported):
     assert facts["steps_per_plan"] == 4 and "open loop between plans" in facts["note"]
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(1800)  # minutes of g++
-def test_aotinductor(tmp_path):
-    what = exportable(policy(), columns=COLUMNS)
-    loaded = export_policy(what, tmp_path / "policy.aoti.pt2", kind="aoti")
-    assert loaded.get_metadata()["steps_per_plan"] == "4"
-
-
 @pytest.mark.parametrize("off", [2e-5, float("nan")])
 def test_a_file_that_differs_in_one_number_for_several_robots_is_refused(off, tmp_path, monkeypatch):
     what = exportable(policy(), columns=COLUMNS)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Exports policies to files that run without this library: ``torch.export``, ONNX, AOTInductor.
+"""Exports policies to files that run without this library: ``torch.export`` or ONNX.
 
 A file holds :meth:`~torchrl_koap.modules.PlanningPolicy.decode_ahead`, which maps observations and start noise to the
 next actions. Gain and command limits are included; the solver's loop is unrolled. The caller stores the last
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.policy import PlanningPolicy
 
-SUFFIXES = {"torch": ".pt2", "onnx": ".onnx", "aoti": ".aoti.pt2"}
+SUFFIXES = {"torch": ".pt2", "onnx": ".onnx"}
 FACTS = "facts.json"  # name inside a file of torch.export
 _BATCHES = (1, 3)  # batch sizes that a written file is tested with
 _OUTPUTS = ("actions", "limited")
@@ -118,12 +118,11 @@ def export_policy(
     """Writes a policy of :func:`exportable`, compares the file with the original and returns the loaded program.
 
     The file's batch size is dynamic; it is tested with one robot and with three. The file holds the facts: read them by
-    ``torch.export.load(file, extra_files={"facts.json": ""})``, from the metadata of an ONNX model (JSON per entry), or
-    by ``get_metadata()`` of an AOTInductor package.
+    ``torch.export.load(file, extra_files={"facts.json": ""})``, or from an ONNX model's metadata (JSON per entry).
 
-    Kinds are ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) and ``"aoti"`` (AOTInductor;
-    needs a C++ compiler). The tolerance is relative to the largest number of the original's output. Raises an
-    ExportError if a package or compiler is missing, or if the numbers differ; the file is then removed.
+    Kinds are ``"torch"`` (``torch.export``) and ``"onnx"`` (ONNX Runtime; extra ``onnx``). The tolerance is relative to
+    the largest number of the original's output. Raises an ExportError if a package is missing, or if the numbers
+    differ; the file is then removed.
     """
     write, read = lookup(_KINDS, kind, "export format")
     file = Path(file)
@@ -179,13 +178,9 @@ def _write_onnx(what: Exportable, file: Path) -> None:
         dynamo=True,
         verbose=False,
     )
-    program.model.metadata_props.update(_texts(what.facts))
+    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in what.facts.items()}
+    program.model.metadata_props.update(texts)  # it stores only strings
     program.save(str(file))
-
-
-def _texts(facts: Mapping[str, Any]) -> dict[str, str]:
-    """Converts facts for a format that stores only strings: other values become JSON."""
-    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}
 
 
 def _read_onnx(what: Exportable, file: Path) -> Callable[..., Outputs]:
@@ -208,18 +203,7 @@ def _read_onnx(what: Exportable, file: Path) -> Callable[..., Outputs]:
     return run
 
 
-def _write_aoti(what: Exportable, file: Path) -> None:
-    options = {"aot_inductor.metadata": _texts(what.facts)}
-    try:
-        torch._inductor.aoti_compile_and_package(_program(what), package_path=str(file), inductor_configs=options)
-    except Exception as error:  # many places raise for a missing compiler, with different types
-        if "compiler" in str(error).lower():
-            raise ExportError(f"AOTInductor needs a C++ compiler such as g++: {str(error).splitlines()[0]}") from error
-        raise
-
-
 _KINDS = {
     "torch": (_write_torch, lambda what, file: torch.export.load(file).module()),
     "onnx": (_write_onnx, _read_onnx),
-    "aoti": (_write_aoti, lambda what, file: torch._inductor.aoti_load_package(str(file))),
 }
