@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import make_demonstrations
-from torchrl_koap.evaluation.rollout_faults import standing_faults, start_faults
+from torchrl_koap.evaluation.rollout_faults import stall_faults, standing_faults, start_faults
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +31,18 @@ def test_rollouts_of_noise_stand_still_and_short_ones_are_not_judged(recorded):
     assert said.startswith("1 of 3 failed rollouts get less than 0.2 times as far")
     assert standing_faults(failed[1:], data) == standing_faults([], data) == []
     assert standing_faults(failed, data[data["episode"] == 0][:5]) == []  # nor do short recordings judge
+
+
+def test_rollouts_that_stop_on_their_way_for_longer_than_recordings_stall():
+    way = np.linspace(0, 1, 60)[:, None] ** [1.1, 1.2]
+    pause = np.concatenate([way[:30], way[30:31].repeat(8, 0), way[30:]])  # some demonstrations wait for 8 steps
+    data, _ = make_demonstrations([way, pause], [np.diff(rows, axis=0) for rows in (way, pause)], control_hz=10)
+    hovering = way[30] + 0.05 * np.sin(np.arange(90))[:, None]
+    stalled, waits = np.concatenate([way[:30], hovering]), np.concatenate([way[:30], hovering[:15], way[30:]])
+    (said,) = stall_faults([rollout(torch.tensor(rows)) for rows in (stalled, waits, way)], data)
+    assert said.startswith("1 of 3 failed rollouts stall: they stay near one observation for 9")
+    assert "(median), demonstrations for at most 1" in said
+    assert stall_faults([rollout(torch.tensor(rows)) for rows in (waits, way)], data) == stall_faults([], data) == []
 
 
 def test_a_column_that_starts_elsewhere_is_named(recorded):

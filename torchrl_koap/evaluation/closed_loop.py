@@ -20,7 +20,7 @@ from torchrl_koap.evaluation.config import EvalConfig, environment_arguments
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
-from torchrl_koap.evaluation.rollout_faults import limited_commands, standing_faults, start_faults
+from torchrl_koap.evaluation.rollout_faults import limited_commands, stall_faults, standing_faults, start_faults
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import outcome_of, score, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval
@@ -106,16 +106,18 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if where.record is not None:
         result |= {"clipped_actions": where.record.clipped, "errors": where.record.errors} | _returns(episodes, rows)
         result["faults"] = [*result.get("faults", ()), *where.record.faults()]
-        if data is not None:
-            sound = [episode for episode in episodes if outcome_of(episode) != "error"]
-            failed = [episode for episode in sound if outcome_of(episode) != "success"]
-            result["faults"] += standing_faults(failed, data)
-            result["faults"] += start_faults(sound, data, task) if failed else []
         if where.facts["success_key"] is None and not result["rates"]["success"]["rate"]:
             result["faults"].append(
                 "no episode reported success in info or ended with more than twice any earlier reward: name the entry"
                 " with --success-key, or compare mean returns"
             )
+    if data is not None:
+        sound = [episode for episode in episodes if outcome_of(episode) != "error"]
+        failed = [episode for episode in sound if outcome_of(episode) != "success"]
+        found = stall_faults(failed, data)
+        if where.record is not None:
+            found = (standing_faults(failed, data) or found) + (start_faults(sound, data, task) if failed else [])
+        result |= {"faults": [*result.get("faults", ()), *found]} if found else {}
     rollouts = rollouts_to_tensors(
         episodes,
         replace(task, modes=where.modes),

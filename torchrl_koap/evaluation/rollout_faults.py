@@ -1,11 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Says what is odd in rollouts: commands that were limited, policies that stand still, starts that no recording has."""
+"""Says what is odd in rollouts: limited commands, policies that stand still or stall, starts that no recording has."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -19,6 +20,7 @@ from torchrl_koap.tasks import Task
 
 _MIN_ROLLOUTS, _START_MARGIN = 5, 0.02  # to compare starts; tolerance, as a share of the range of the column
 _SMOOTH = 8  # frames that are averaged before distances from the start are measured
+_NEAR, _LONGER, _COMPARED = 0.5, 2.0, 200  # stalls: spreads of a column; times as long; recordings that are compared
 
 
 def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
@@ -47,6 +49,32 @@ def standing_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> l
     stay = sum(bool(each[usual > 0].median() < STAYS) for each in ways)
     said = f"{stay} of {len(failed)} failed rollouts get less than {STAYS:g} times as far from their start as"
     return [f"{said} demonstrations; {LEAVES}"] if stay else []
+
+
+def stall_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> list[str]:
+    """Reports failed rollouts ``[T]`` that stay near one observation twice as long as the slowest demonstration."""
+    observed = data[OBSERVATION].double()
+    spread = torch.where(observed.std(0) > 0, observed.std(0), torch.inf)
+
+    def longest(rows: Tensor) -> int:
+        """Counts the most steps in which no column leaves its value by half of its spread."""
+        places, first, most = (rows / spread).numpy(), 0, 0
+        while first < len(places):
+            away = (np.abs(places[first:] - places[first]) > _NEAR).any(1)
+            steps = int(away.argmax()) if away.any() else len(away)
+            first, most = first + steps, max(most, steps)
+        return most
+
+    recorded = observed.split(trajectory_lengths(data).tolist())
+    usual = max(map(longest, recorded[:: -(-len(recorded) // _COMPARED)]))
+    stalls = [steps for episode in failed if (steps := longest(episode[OBSERVATION].double())) > _LONGER * usual]
+    if not stalls:
+        return []
+    said = f"{len(stalls)} of {len(failed)} failed rollouts stall: they stay near one observation for"
+    return [
+        f"{said} {int(np.median(stalls))} steps (median), demonstrations for at most {usual}: none shows how to go"
+        " on from there; record some that start there"
+    ]
 
 
 def start_faults(rollouts: Sequence[TensorDictBase], data: TensorDictBase, task: Task) -> list[str]:
