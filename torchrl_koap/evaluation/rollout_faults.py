@@ -73,7 +73,7 @@ def stall_faults(failed: Sequence[TensorDictBase], data: TensorDictBase) -> list
     said = f"{len(stalls)} of {len(failed)} failed rollouts stall: they stay near one observation for"
     return [
         f"{said} {int(np.median(stalls))} steps (median), demonstrations for at most {usual}: none shows how to go"
-        " on from there; record some that start there"
+        " on from there; record some that start there or shortly before"
     ]
 
 
