@@ -91,10 +91,13 @@ class EndEffectorNoise(ObservationTransform):
         measured = observation[..., self.part]
         if mask is None or not len(self._noise) == len(measured) == mask.numel():
             mask, self._noise = torch.ones(len(measured), dtype=torch.bool), torch.zeros_like(measured, device="cpu")
-        generators = self._generators * (len(measured) if len(self._generators) == 1 else 1)
-        for generator, noise, draws in zip(generators, self._noise, mask.flatten().tolist(), strict=True):
-            if draws:
-                noise.copy_(torch.randn(noise.shape, generator=generator, dtype=noise.dtype))
+        rows, kind = mask.flatten().nonzero().flatten().tolist(), {"dtype": self._noise.dtype}
+        size = measured.shape[1:]
+        if len(self._generators) == 1:
+            self._noise[rows] = torch.randn((len(rows), *size), generator=self._generators[0], **kind)
+        else:
+            for row in rows:
+                self._noise[row] = torch.randn(size, generator=self._generators[row], **kind)
         observation[..., self.part] = measured + self.sigma * self._noise.to(observation.device)
         return observation
 
