@@ -101,10 +101,11 @@ class EndEffectorNoise(ObservationTransform):
         observation[..., self.part] = measured + self.sigma * self._noise.to(observation.device)
         return observation
 
+    def _measured(self, tensordict: TensorDictBase, mask: Tensor | None) -> TensorDictBase:
+        return tensordict.set(OBSERVATION, self._apply_transform(tensordict[OBSERVATION], mask))
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        seen = tensordict_reset[OBSERVATION]
-        return tensordict_reset.set(OBSERVATION, self._apply_transform(seen, tensordict.get("_reset", None)))
+        return self._measured(tensordict_reset, tensordict.get("_reset", None))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        seen = next_tensordict[OBSERVATION]
-        return next_tensordict.set(OBSERVATION, self._apply_transform(seen, tensordict.get("_step", None)))
+        return self._measured(next_tensordict, tensordict.get("_step", None))

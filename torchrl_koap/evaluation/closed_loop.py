@@ -111,12 +111,12 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
                 "no episode reported success in info or ended with more than twice any earlier reward: name the entry"
                 " with --success-key, or compare mean returns"
             )
-    if data is not None:
-        sound = [episode for episode in episodes if outcome_of(episode) != "error"]
-        failed = [episode for episode in sound if outcome_of(episode) != "success"]
+    sound = [episode for episode in episodes if outcome_of(episode) != "error"]
+    failed = [episode for episode in sound if outcome_of(episode) != "success"]
+    if data is not None and failed:
         found = stall_faults(failed, data)
         if where.record is not None:
-            found = (standing_faults(failed, data) or found) + (start_faults(sound, data, task) if failed else [])
+            found = (standing_faults(failed, data) or found) + start_faults(sound, data, task)
         result |= {"faults": [*result.get("faults", ()), *found]} if found else {}
     rollouts = rollouts_to_tensors(
         episodes,
