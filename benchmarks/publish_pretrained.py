@@ -164,7 +164,7 @@ def disturbance_of(dataset: Path) -> float:
     for about in (dataset / "about.json", dataset / "ted" / "about.json"):
         if about.is_file():
             notes = json.loads(about.read_text(encoding="utf-8")).get("notes") or {}
-            return float(notes.get("disturbance", {}).get("share", 0.0))
+            return float(notes.get("disturbance", 0.0))
     return 0.0
 
 
