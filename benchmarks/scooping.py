@@ -78,7 +78,7 @@ def run_cell(
 ) -> tuple[object, ...]:
     """Trains and rolls out one cell; trains its shared planner if that does not exist."""
     dataset = str(data_set(folder, unlabelled, labels, task))
-    planner = PlannerConfig(steps=steps)
+    planner = PlannerConfig(steps=steps, held_out=0.0)  # every demonstration trains the planner, as in all rows
     if get_method(method).plans:
         source = folder / f"planner_{_name(unlabelled, labels)}_{seed}"
         if not (source / "planner.safetensors").is_file():

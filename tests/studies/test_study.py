@@ -122,7 +122,7 @@ def test_presets_name_methods_tasks_and_levels_that_exist(name, tmp_path):
 
 def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
     study = complete(Study(out=tmp_path, preset="table1", tasks=("aligning", "sorting"), methods=("koap",), seeds=1))
-    assert (study.label_unit, study.labels, study.planner) == ("window", (), PlannerConfig())
+    assert (study.label_unit, study.labels, study.planner) == ("window", (), PlannerConfig(held_out=0.0))
     shares = {task: [cell.labels for cell in study.cells() if cell.task == task] for task in study.tasks}
     assert shares == {"aligning": [0.02, 0.05, 0.1, 0.25, 0.5], "sorting": [0.01, 0.02, 0.05, 0.1, 0.25]}
     assert [config.split("=")[0] for config in study.datasets] == []

@@ -87,7 +87,7 @@ class TestThePlanner:
         )
         found = [(each.network, each.width, each.batch_size, each.learning_rate) for each in (aligning, named)]
         assert found == [("mlp", 512, 512, 1e-3), ("unet", 64, 128, 3e-3)]
-        assert named.steps == aligning.steps == 8000 and named.frames == aligning.frames == 1
+        assert named.steps == aligning.steps == 16000 and named.frames == aligning.frames == 1
         assert resolved(planner=PlannerConfig(network="mlp")).planner.width == 512
         assert resolved("stacking", planner=PlannerConfig(width=64)).planner.width == 64
         assert resolved().planner.width == 32
@@ -97,15 +97,15 @@ class TestThePlanner:
     def test_lends_its_network_but_not_its_frames_to_methods_that_sample_actions(self):
         actions, plans = (resolved("sorting", method).planner for method in ("dp", "koap"))
         assert (plans.frames, plans.network, plans.batch_size) == (1, "objects", 256)
-        assert actions == replace(plans, frames=2)
+        assert actions == replace(plans, frames=2, held_out=0.0)
         for name, value in {"source": "run", "held_out": 0.5, "frames": 1}.items():
             with pytest.raises(ValueError, match=f"planner.{name}: method 'dp' samples actions and has no planner"):
                 resolved(method="dp", planner=PlannerConfig(**{name: value}))
 
-    def test_is_kept_from_a_tenth_of_the_data_where_there_is_no_environment(self):
+    def test_is_kept_from_a_tenth_of_the_data_and_smaller_where_there_is_no_environment(self):
         _, task = make_demonstrations([[[0.0, 0.0]] * 20], control_hz=30, action_dim=2)
         config = resolve(TrainConfig(out="run"), task)
-        assert config.planner.held_out == 0.1 and resolved().planner.held_out == 0.0
+        assert config.planner.held_out == resolved().planner.held_out == 0.1
         assert (config.planner.network, config.planner.width, config.planner.octaves) == ("mlp", 512, 0)
         unet = resolve(TrainConfig(out="run", planner=PlannerConfig(network="unet")), task).planner
         assert (unet.network, unet.width, unet.octaves, unet.steps) == ("unet", 64, 4, 3000)

@@ -75,8 +75,8 @@ class PlannerConfig:
         learning_rate: peak learning rate.
         frames: observed frames that it reads, 1 or 2 (default for own data: as `koap convert` says).
         held_out: share of the trajectories that it is not trained on, those without labels first. Training keeps the
-            weights that plan them best, and `koap eval` evaluates plans on them (default: 0.1 for a task without an
-            environment, else 0).
+            weights that plan them best, and `koap eval` without an environment evaluates plans on them (default: 0.1;
+            0 for a method that samples actions).
         source: run whose planner is used instead of training one, or pretrained:NAME.
 
     Raises:

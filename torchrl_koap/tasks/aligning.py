@@ -72,7 +72,7 @@ register_task(
         defaults=Defaults(
             demonstrations=1000,
             disturbance=0.5,
-            planner={"steps": 8000, "network": "mlp", "frames": 1},
+            planner={"steps": 16000, "network": "mlp", "frames": 1},
             execution={"lead": COMMAND_LEAD},
             recovery=0.004,
         ),

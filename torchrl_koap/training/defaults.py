@@ -25,10 +25,11 @@ from torchrl_koap.training.networks import NETWORKS
 from torchrl_koap.training.policy_facts import tells_commands
 
 CONTROLLER_UPDATES = 500
+HELD_OUT = 0.1  # share of the trajectories that choose the weights of a planner
 PLACES = "absolute"  # default preset if decoded actions are positions
 FOLLOWED = "delayed"  # default preset if they are targets of state columns, which a robot reaches with a delay
 # planner options for recorded data, usually a hundred demonstrations or so: they avoid overfitting
-OWN_DATA: dict[str, Any] = {"steps": LEAST_UPDATES, "network": "mlp", "octaves": 0, "held_out": 0.1}
+OWN_DATA: dict[str, Any] = {"steps": LEAST_UPDATES, "network": "mlp", "octaves": 0}
 OWN_TEMPERATURE = 0.4  # of plans in tasks without an environment, where no modes are counted
 PLAN_SECONDS = 0.1  # between plans with feedback, within limits: a new plan starts where the robot lags behind the last
 
@@ -76,7 +77,7 @@ def _planner(asked: PlannerConfig, method: Method, task: Task) -> PlannerConfig:
     theirs = own.get("network", usual["network"])
     network = asked.network or theirs
     layers = [own if network == theirs else _unsized(own), usual if network == usual["network"] else _unsized(usual)]
-    library = {"steps": 12000, "frames": HISTORY, "held_out": 0.0, "network": network}
+    library = {"steps": 12000, "frames": HISTORY, "held_out": HELD_OUT, "network": network}
     return reduce(fill_in, [*layers, lookup(NETWORKS, network, "planner.network"), library], asked)
 
 
