@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from publish_pretrained import publish
+from publish_pretrained import disturbance_of, publish
 from tiny_runs import koap
 
 from torchrl_koap.commands import run_commands
@@ -111,3 +111,9 @@ def test_another_run_is_not_overwritten(trained_run, tmp_path):
 def test_objects_that_are_not_paths_raise_errors():
     with pytest.raises(TypeError, match=r"must be named by its folder, got dict: train\(TrainConfig"):
         find_run({})
+
+
+def test_a_card_tells_the_share_of_disturbed_demonstrations(tmp_path):
+    for task, share in (("aligning", 0.5), ("avoiding", 0.0)):
+        assert koap("demos", "--task", task, "--episodes", 2, "--out", tmp_path / task) == 0
+        assert disturbance_of(tmp_path / task) == share
