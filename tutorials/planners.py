@@ -115,6 +115,6 @@ figure.savefig("planners.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# One solver step gives the *mean* of all modes; with ten the plans differ. In closed loop, few steps lower success and
+# One solver step gives the *mean* of all modes; with ten the plans differ. In closed loop, one step lowers success and
 # entropy. The two solvers hardly differ. 24 rollouts are too few to compare temperature and candidates: their intervals
 # overlap. Times are those of the machine that made this page.
