@@ -27,7 +27,7 @@ def test_a_training_in_five_rows():
         "labels": "20 of 40 steps; in 1 of 2 recordings",
         "planner": "500 updates in 22 s, 1 observed frame; kept update 500, with plan score 0.263 on held-out"
         " recordings (smaller is better)",
-        "training ended": "with its last update; no overfitting: more updates may help (--steps 1000)",
+        "training ended": "with its last update; plans improved until late: more updates may help (--steps 1000)",
         "controller": "koap, 500 updates in 11 s; fitted to 18 labels",
     }
 
@@ -37,7 +37,7 @@ def test_a_training_in_five_rows():
     [
         (300, 100, "early, before update 500; plans stopped improving at update 100"),
         (500, 350, "with its last update; plans stopped improving at update 350"),
-        (500, 450, "with its last update; no overfitting: more updates may help (--steps 1000)"),
+        (500, 450, "with its last update; plans improved until late: more updates may help (--steps 1000)"),
     ],
 )
 def test_why_a_training_ended(updates, kept, said):

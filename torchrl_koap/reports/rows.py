@@ -81,7 +81,7 @@ def _ending(updates: float, kept: float, most: float | None) -> tuple[str, str]:
         return f"early, before update {most:,.0f}", f"plans stopped improving at update {kept:,.0f}"
     if kept < _LATE * updates:
         return "with its last update", f"plans stopped improving at update {kept:,.0f}"
-    return "with its last update", f"no overfitting: more updates may help (--steps {2 * updates:.0f})"
+    return "with its last update", f"plans improved until late: more updates may help (--steps {2 * updates:.0f})"
 
 
 def _controller(run: RunFacts) -> Row | None:
