@@ -46,7 +46,8 @@ def test_columns_have_names_and_units():
     assert columns.state_names == ("tool_0", "tool_1", "box_tan_yaw_cos_2yaw", "box_tan_yaw_sin_2yaw")
     assert columns.state_units == ("m", "m", "", "") and columns.state_dim == 4
     named = Columns(name="arm", observation_parts={"joints": 2, "hand_position": ("x",), "cup_xy": 1, "grip": 1})
-    assert named.known_units == ("rad", "rad", "m", "m", "")
+    assert named.known_units == named.state_units == ("rad", "rad", "m", "m", "")
+    assert get_task("aligning").state_units == ("m",) * 5 + ("", "") + ("m", "m", "", ""), "metres, angles apart"
     assert [thousandths(unit) for unit in ("m", "rad", "")] == [("mm", 1e3), ("mrad", 1e3), ("", 1.0)]
 
 

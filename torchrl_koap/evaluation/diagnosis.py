@@ -24,7 +24,6 @@ from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.columns import unit_groups
 
-_WITH_UNITS = ("plain", "plane")  # features that keep the units of their columns
 _MOST_STATES = 4000  # largest number of states whose distances are measured
 _ELSEWHERE = 0.2  # share of the range of a column: noise is below, independent draws of a goal are above
 RECORDED_FUTURE = "recorded_future"
@@ -161,8 +160,7 @@ def _columns_by_unit(task: Task) -> dict[str, list[int]]:
     return {
         f"{name} ({unit or 'no unit'})": [columns.start + place for place in places]
         for name, columns in task.state_slices.items()
-        for units in (task.known_units[task.observation[name]] if task.state_parts[name] in _WITH_UNITS else ("", ""),)
-        for unit, places in unit_groups(units[: columns.stop - columns.start]).items()
+        for unit, places in unit_groups(task.state_units[columns]).items()
     }
 
 

@@ -42,6 +42,7 @@ FEATURES: dict[str, tuple[Callable[[Tensor], Tensor], tuple[str, ...]]] = {
     "tan_yaw": (double_yaw, ("cos_2yaw", "sin_2yaw")),
     "quaternion": (yaw_of, ("cos_yaw", "sin_yaw")),
 }
+_WITH_UNITS = ("plain", "plane")  # features that keep the units of their columns
 _THOUSANDTHS = {"m": "mm", "rad": "mrad", "s": "ms", "N": "mN"}  # units in which small values are shown
 
 
@@ -137,12 +138,11 @@ class Columns:
 
     @property
     def state_units(self) -> tuple[str, ...]:
-        """Unit of every state column: that of its observation column if the part is plain, else ``""``."""
-        given = self.observation_units or ("",) * self.observation_dim
+        """Unit of every state column, by :attr:`known_units`; ``""`` for features of angles."""
         units: list[str] = []
         for part, kind in self.state_parts.items():
-            names = self._feature_names(part, kind)
-            units += given[self.observation[part]] if kind == "plain" else [""] * len(names)
+            width = len(self._feature_names(part, kind))
+            units += self.known_units[self.observation[part]][:width] if kind in _WITH_UNITS else ("",) * width
         return tuple(units)
 
     def state_of(self, observation: Tensor) -> Tensor:
