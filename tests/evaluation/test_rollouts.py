@@ -19,13 +19,17 @@ from toy_policies import (
     wandering_planner,
 )
 
+from torchrl_koap import EvalConfig, evaluate
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.transforms import EndEffectorNoise
+from torchrl_koap.evaluation import InspectConfig, inspect
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.modules import make_policy
+from torchrl_koap.runs.device import torch_as_before
 from torchrl_koap.tasks import Action, get_task
+from torchrl_koap.training.trained import Trained
 
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
 KEYS = ({}, {"history_key": "frames"})
@@ -194,3 +198,17 @@ def test_latency_is_measured_per_plan_and_per_step():
     assert result["plan_ms"] > 0 and result["control_ms"] > 0
     assert result["control_hz"] == pytest.approx(1e3 / (result["control_ms"] + result["plan_ms"] / 4))
     assert math.isfinite(result["control_hz"])
+
+
+@pytest.mark.parametrize(("run", "options"), [(evaluate, EvalConfig), (inspect, InspectConfig)])
+@pytest.mark.parametrize(("given", "known", "taken"), [(None, None, 1), (3, None, 3), (None, "2", 2)])
+def test_one_thread_is_the_default(run, options, given, known, taken, tmp_path, monkeypatch):
+    """Two threads beside another program took twenty times as long."""
+    threads = torch.get_num_threads()
+    monkeypatch.setenv("OMP_NUM_THREADS", known) if known else monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    seen = []
+    monkeypatch.setattr(Trained, "load", lambda *_, **__: seen.append(torch.get_num_threads()) or 1 / 0)
+    with torch_as_before(), pytest.raises(ZeroDivisionError):
+        torch.set_num_threads(2)
+        run(str(tmp_path), options(threads=given))
+    assert seen == [taken] and torch.get_num_threads() == threads

@@ -27,7 +27,7 @@ from torchrl_koap.evaluation.statistics import bootstrap_interval
 from torchrl_koap.files import read_json
 from torchrl_koap.runs.config import given_options
 from torchrl_koap.runs.config_files import to_json
-from torchrl_koap.runs.device import set_up_torch, torch_as_before
+from torchrl_koap.runs.device import default_threads, set_up_torch, torch_as_before
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, find_run, writable_folder
@@ -71,7 +71,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         2
     """
     config = given_options(config, EvalConfig)
-    set_up_torch(config.threads, config.device)
+    set_up_torch(config.threads or default_threads(), config.device)
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task
     if task.env is None and config.env is None:

@@ -31,7 +31,7 @@ class EvalConfig:
             them, an episode that terminates with more than twice any earlier reward succeeds).
         num_envs: environments at a time, each in a process of its own (default: all in this process).
         dataset: where the data set of the training is now (default: where it was).
-        threads: torch and simulator threads (default: as many as torch has).
+        threads: torch and simulator threads (default: OMP_NUM_THREADS where it is set, else 1).
         device: "cpu" or "cuda".
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
         rollouts_per_context: rollouts in each context (place of the objects); from 2 on the report has the entropy of

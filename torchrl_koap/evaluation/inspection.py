@@ -32,7 +32,7 @@ from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.config import given_options
-from torchrl_koap.runs.device import set_up_torch, torch_as_before
+from torchrl_koap.runs.device import default_threads, set_up_torch, torch_as_before
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, writable_folder
 from torchrl_koap.training.trained import Trained
@@ -79,7 +79,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, A
         >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
     """
     config = given_options(config, InspectConfig)
-    set_up_torch(config.threads, config.device)
+    set_up_torch(config.threads or default_threads(), config.device)
     trained = Trained.load(run, plugins=config.plugins)
     task = trained.task
     if task.env is None and config.env is None and not config.latent_only:
