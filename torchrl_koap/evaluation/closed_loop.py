@@ -219,7 +219,7 @@ def find_environment(
     if config.env is None:
         from torchrl_koap.envs.registry import make_env  # takes seconds
 
-        options = {"num_threads": config.threads or torch.get_num_threads(), "max_steps": task.max_steps}
+        options = {"num_threads": torch.get_num_threads(), "max_steps": task.max_steps}
         make = partial(make_env, task, noisy=True, **options)
         return RolloutEnvironment(make, task.max_steps, task.modes, numbers, contexts)
     from torchrl_koap.envs.gymnasium_batch import EpisodeRecord, GymnasiumBatch
