@@ -79,10 +79,6 @@ def test_the_robot_counts_a_third_of_the_loss_or_more(columns, robot, share):
         assert len(weights.unique()) == 2
 
 
-def test_columns_of_tasks_with_a_simulator_count_alike():
-    assert column_weights(get_task("aligning")) is None
-
-
 def test_a_planner_learns_with_these_weights(monkeypatch):
     paths = [np.random.default_rng(seed).normal(size=(30, 5)).cumsum(0) for seed in range(3)]
     data, task = make_demonstrations(paths, [path[1:, :1] for path in paths], control_hz=10, robot=(0,))

@@ -96,10 +96,10 @@ def planned_windows(data: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
 def column_weights(task: Task) -> Tensor | None:
     """Returns weights ``[d]`` of state columns in a planner's loss: the executed ones of the robot have 1/3 of the sum.
 
-    None, all columns alike, if the robot has no column, or a share of 1/3 or more, or the task has an environment.
+    None, all columns alike, if the robot has no column, or a share of 1/3 or more.
     """
     columns, robot = task.state_dim, len(task.robot)
-    if task.env is not None or not 0 < 3 * robot < columns:
+    if not 0 < 3 * robot < columns:
         return None
     weights = torch.full([columns], 2 / (columns - robot))
     weights[list(task.robot)] = 1 / robot
