@@ -68,14 +68,26 @@ def test_standing_still_scores_one_and_the_distance_from_recordings_counts_squar
         assert score(planner) == pytest.approx(distance**2)
 
 
-@pytest.mark.parametrize(("columns", "robot", "share"), [(9, (3, 4), 1 / 3), (5, (0, 1, 2), None), (6, (0, 1), None)])
-def test_the_robot_counts_a_third_of_the_loss_or_more(columns, robot, share):
+def own_task(columns, robot):
     paths = [np.random.default_rng(seed).normal(size=(20, columns)).cumsum(0) for seed in range(3)]
-    _, task = make_demonstrations(paths, [path[1:, :2] for path in paths], control_hz=10, robot=robot)
+    return make_demonstrations(paths, [path[1:, :2] for path in paths], control_hz=10, robot=robot)[1]
+
+
+@pytest.mark.parametrize(
+    ("task", "share"),
+    [
+        (own_task(9, (3, 4)), 1 / 3),
+        (own_task(5, (0, 1, 2)), None),
+        (own_task(6, (0, 1)), None),
+        (get_task("sorting"), 1 / 3),
+        (get_task("avoiding"), None),
+    ],
+)
+def test_the_robot_counts_a_third_of_the_loss_or_more(task, share):
     weights = column_weights(task)
     assert (weights is None) == (share is None)
     if share is not None:
-        assert weights[list(robot)].sum().item() == pytest.approx(share * weights.sum().item())
+        assert weights[list(task.robot)].sum().item() == pytest.approx(share * weights.sum().item())
         assert len(weights.unique()) == 2
 
 
